@@ -21,8 +21,7 @@ from fantwin.pipeline.outputs.web.config import GatewayConfig
 from fantwin.pipeline.outputs.web.live_feed import LiveFeed
 from fantwin.pipeline.recordings.clips.clip import clip_folder
 from fantwin.pipeline.runtime.stage import BuiltStage, Context, Stage
-from fantwin.pipeline.site.alarm_rates import AlarmRates
-from fantwin.pipeline.site.alarm_store import HISTORY, AlarmStore
+from fantwin.pipeline.site.alarm_history import FILE, AlarmHistory
 from fantwin.pipeline.site.fan_history import curves_of
 from fantwin.pipeline.site.fleet import Fan
 from fantwin.pipeline.site.other_stages import VIEWER, configured, recordings_of, viewer_urls
@@ -46,7 +45,8 @@ class GatewayCore(SiteCore):
     """Collects what the server shows, and sends what operators ask."""
 
     def __init__(self, model: SiteModel, feed: LiveFeed, desk: RequestDesk, serve: Server) -> None:
-        super().__init__(model, desk)
+        super().__init__(model)
+        self._desk = desk
         self._feed = feed
         self._server = serve
         self._is_small = sum(tray.fans for tray in model.trays) <= ALL_FOLLOWED
@@ -171,11 +171,10 @@ def build(context: Context) -> BuiltStage:
     Raises:
         UserError: the port is taken, or a file cannot be read or written.
     """
-    path = context.own_file(Path(HISTORY))
-    store = AlarmStore(path)
+    alarms = AlarmHistory(context.own_file(FILE))
     if context.started_t_ns:
-        store.begins(context.started_t_ns)
-    model = SiteModel(context.site, context.trays, store, rates=AlarmRates(path))
+        alarms.begins(context.started_t_ns)
+    model = SiteModel(context.site, context.trays, alarms, keeps_curves=True, keeps_rates=True)
     feed, desk = LiveFeed(), RequestDesk(context.producer)
     site = configured(context, RECORDER)
     clip_folders = tuple(dict.fromkeys(map(clip_folder, recordings_of(site) if site else ())))

@@ -10,7 +10,6 @@ sent when the broker has room. After each connection all retained topics are pub
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence, Set
-from pathlib import Path
 
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.extras import require
@@ -24,7 +23,7 @@ from fantwin.pipeline.outputs.mqtt.requests import Requests
 from fantwin.pipeline.outputs.mqtt.topics import Topics, do_overlap
 from fantwin.pipeline.outputs.mqtt.transition_queue import TransitionQueue
 from fantwin.pipeline.runtime.stage import BuiltStage, Context, Stage, StageError
-from fantwin.pipeline.site.alarm_store import AlarmStore
+from fantwin.pipeline.site.alarm_history import FILE, AlarmHistory
 from fantwin.pipeline.site.fleet import Fan
 from fantwin.pipeline.site.request_desk import RequestDesk
 from fantwin.pipeline.site.shown import stages_json, transition_json
@@ -38,7 +37,6 @@ from fantwin.schemas.messages import Alarm, Message
 from fantwin.schemas.topics import ALL_TRAYS
 from fantwin.schemas.units import NS_PER_S
 
-HISTORY = "mqtt-alarms.sqlite"
 SETTLED_AFTER_NS = 2 * NS_PER_S
 """time after the start in which alarms of before are heard again, and nothing is published"""
 KNOWN_AFTER_NS = 10 * NS_PER_S
@@ -53,15 +51,16 @@ class MqttCore(SiteCore):
     """Knows what the broker should have, and what it has."""
 
     def __init__(
-        self, context: Context, model: SiteModel, store: AlarmStore, desk: RequestDesk, topics: Topics, link: Link
+        self, context: Context, model: SiteModel, alarms: AlarmHistory, desk: RequestDesk, topics: Topics, link: Link
     ) -> None:
         config: MqttConfig = context.config
-        super().__init__(model, desk)
+        super().__init__(model)
+        self._desk = desk
         self._config, self._topics, self._link = config, topics, link
         self._is_whole = context.instance == ALL_TRAYS
         self._states = FanStates(model)
         self._outbox = Outbox()
-        self._store, self._queue = store, TransitionQueue(store, config.most_waiting)
+        self._history, self._queue = alarms, TransitionQueue(alarms, config.most_waiting)
         self._requests = Requests(topics, model.trays, config.accept, config.operator_name, desk)
         self._home_assistant = HomeAssistant(config, topics, model.trays)
         self._devices = self._home_assistant.messages() if config.home_assistant == "publish" else {}
@@ -82,8 +81,8 @@ class MqttCore(SiteCore):
 
     def add_alarm(self, alarm: Alarm) -> None:
         """Keep it; a new transition waits to be published."""
-        if self._model.add_alarm(alarm):
-            self._queue.notice_new()
+        self._model.add_alarm(alarm)
+        self._queue.notice_new()
         self._desk.add(alarm)
         self._changed_alarms.add(Fan(alarm.header.tray, alarm.fan))
 
@@ -119,7 +118,7 @@ class MqttCore(SiteCore):
             "connections": self._link.sessions,
             "waiting_transitions": self._queue.waiting,
             "waiting_topics": len(self._outbox),
-            "lost_transitions": self._queue.lost + self._store.lost,
+            "lost_transitions": self._queue.lost + self._history.lost,
             "refused_scores": self._model.refused_scores,
             "dropped_requests": self._link.dropped_requests,
             **self._counts,
@@ -180,8 +179,8 @@ class MqttCore(SiteCore):
         is_full = abs(now_ns - self._full_ns) >= self._config.period_s * NS_PER_S
         if is_full:
             self._model.notice_silence()
-            if self._store.save_again():
-                self._queue.notice_new()
+            self._history.save_again()
+            self._queue.notice_new()
         is_due = self._has_news and abs(now_ns - self._changes_ns) >= CHANGES_PERIOD_NS
         if is_full or is_due or self._changed_alarms:
             self._full_ns = now_ns if is_full else self._full_ns
@@ -240,8 +239,8 @@ def build(context: Context) -> BuiltStage:
     if overlapping := overlaps(context):
         raise StageError(overlapping[0])
     topics = Topics(config.prefix, context.site, context.instance)
-    store = AlarmStore(context.own_file(Path(HISTORY)))
-    model = SiteModel(context.site, context.trays, store, keeps_curves=False)
+    alarms = AlarmHistory(context.own_file(FILE))
+    model = SiteModel(context.site, context.trays, alarms)
     link = BrokerLink(
         config,
         context.folder,
@@ -250,7 +249,7 @@ def build(context: Context) -> BuiltStage:
         [topics.requests(tray.name) for tray in context.trays] if config.accept else [],
         patterns_of_retained(config, topics, HomeAssistant(config, topics, context.trays)),
     )
-    core = MqttCore(context, model, store, RequestDesk(context.producer), topics, link)
+    core = MqttCore(context, model, alarms, RequestDesk(context.producer), topics, link)
     link.start()
     return BuiltStage(core)
 

@@ -14,10 +14,10 @@ from pathlib import Path
 
 from fantwin.pipeline.errors import refusals
 from fantwin.pipeline.extras import missing_extra, require
-from fantwin.pipeline.outputs.opcua.conditions import Condition, ConditionBook
+from fantwin.pipeline.outputs.opcua.conditions import Condition
 from fantwin.pipeline.outputs.opcua.config import OpcuaConfig
 from fantwin.pipeline.runtime.stage import BuiltStage, Context, Stage
-from fantwin.pipeline.site.alarm_store import AlarmStore
+from fantwin.pipeline.site.alarm_history import FILE, AlarmHistory
 from fantwin.pipeline.site.fleet import Fan
 from fantwin.pipeline.site.request_desk import RequestDesk
 from fantwin.pipeline.site.site_core import SiteCore
@@ -28,7 +28,6 @@ from fantwin.schemas.messages import Alarm, Message
 from fantwin.schemas.units import NS_PER_S
 
 SILENCE_PERIOD_NS = NS_PER_S
-HISTORY = Path("opcua-alarms.sqlite")
 CERTIFICATE, KEY = Path("opcua-certificate.der"), Path("opcua-key.pem")
 
 
@@ -53,9 +52,9 @@ class Server:
 class OpcuaCore(SiteCore):
     """Collects what the server shows, and sends what operators ask."""
 
-    def __init__(self, model: SiteModel, book: ConditionBook, desk: RequestDesk, server: Server) -> None:
-        super().__init__(model, desk)
-        self._book = book
+    def __init__(self, model: SiteModel, desk: RequestDesk, server: Server) -> None:
+        super().__init__(model)
+        self._desk = desk
         self._server = server
         self._silence_ns = 0
 
@@ -66,11 +65,10 @@ class OpcuaCore(SiteCore):
     def add_alarm(self, alarm: Alarm) -> None:
         """Keep it; a transition becomes an event."""
         is_new = self._model.add_alarm(alarm)
-        current = self._model.current_alarm(Fan(alarm.header.tray, alarm.fan))
-        if current is not None:
-            condition = self._book.add(alarm, current)
-            if is_new and alarm.transition != Transition.REFUSED:
-                self._server.publish(condition)
+        fan = Fan(alarm.header.tray, alarm.fan)
+        current = self._model.current_alarm(fan)
+        if is_new and current is not None and alarm.transition != Transition.REFUSED:
+            self._server.publish(Condition(fan, current))
         self._desk.add(alarm)
 
     def tick(self, now_ns: int) -> Sequence[Message]:
@@ -106,7 +104,7 @@ class OpcuaCore(SiteCore):
 
 
 class _Running(Server):
-    def __init__(self, context: Context, model: SiteModel, book: ConditionBook, desk: RequestDesk) -> None:
+    def __init__(self, context: Context, model: SiteModel, desk: RequestDesk) -> None:
         from fantwin.pipeline.certificates import check_pair, make_self_signed, require_valid  # noqa: PLC0415  slow to import
         from fantwin.pipeline.outputs.opcua.log_in import LogIn, TrustedClients  # noqa: PLC0415
         from fantwin.pipeline.outputs.opcua.server import Listening, OpcuaServer, application_uri  # noqa: PLC0415
@@ -132,7 +130,6 @@ class _Running(Server):
                 config.is_loopback,
             ),
             model,
-            book,
             desk,
             LogIn(users, is_open=config.is_loopback),
             TrustedClients(context.resolve(config.trusted) if config.trusted else None),
@@ -164,9 +161,9 @@ def build(context: Context) -> BuiltStage:
         StageError: the extra is not installed, the port is taken, or a file cannot be read or written.
     """
     require("stage opcua", "outputs", "asyncua")
-    model = SiteModel(context.site, context.trays, AlarmStore(context.own_file(HISTORY)))
-    book, desk = ConditionBook(), RequestDesk(context.producer)
-    return BuiltStage(OpcuaCore(model, book, desk, _Running(context, model, book, desk)))
+    model = SiteModel(context.site, context.trays, AlarmHistory(context.own_file(FILE)))
+    desk = RequestDesk(context.producer)
+    return BuiltStage(OpcuaCore(model, desk, _Running(context, model, desk)))
 
 
 def check(context: Context) -> list[str]:

@@ -4,9 +4,8 @@ Reads `score`, `alarm`, `twin`, `health` and `snapshot`; writes nothing. One cor
 the unit of the tray. Samples are collected and drawn twice a second, because a call into Rerun is expensive and a row
 in it is cheap.
 
-With few fans, every sample is drawn. With more than `fleet_above`, an overview has a cell for every fan, and only some
-fans are drawn sample by sample: those in alarm, as far as there is room, and those in `show`. Of the other trays the
-newest score is asked for once a second, and the rest never arrives.
+With more fans than `fleet_above`, only some are drawn: those in alarm, as far as there is room, and those in `show`. Of
+the other trays the newest score is asked for once a second, and the rest never arrives.
 
 Only samples and alarms are on the time line, at the time of the sample; wear has a timeline of its own. Reports in host
 time go to a page without time; otherwise, in a replay of an old recording, these reports would be the newest data,
@@ -59,7 +58,9 @@ class ViewerConfig(StageConfig):
         default="256MB", pattern=r"^\d+(MB|GB|MiB|GiB)$", description="history kept for viewers that join late"
     )
     fleet_above: int = Field(
-        default=64, ge=0, description="with more fans than this on the site, an overview and few plots are shown"
+        default=64,
+        ge=0,
+        description="with more fans than this on the site, only those in alarm and those in `show` are drawn",
     )
     show: tuple[str, ...] = Field(
         default=(), max_length=64, description='fans of a fleet that always have a plot: ["tray1/3", "tray2/0"]'

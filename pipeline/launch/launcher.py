@@ -25,7 +25,6 @@ from fantwin.pipeline.prediction.tray_twin import load_tray_twin, twin_path
 from fantwin.pipeline.recordings.parts import part_files, part_path
 from fantwin.pipeline.runtime.stage import load_stage
 from fantwin.pipeline.site.loss_accounting import Launched
-from fantwin.pipeline.site.site_state import site_states
 from fantwin.pipeline.site.site_watcher import SiteWatcher
 from fantwin.pipeline.site.stage_notes import note_lines
 from fantwin.pipeline.timebase.host_clock import HOST_CLOCK
@@ -140,7 +139,7 @@ class Launcher:
             if problem := bus.certificate_warning():
                 self._say(problem)
             before = set(self._parts())
-            self._watcher = SiteWatcher(bus, self._config.site, roles_of(self._config))
+            self._watcher = SiteWatcher(bus, self._config.site, roles_of(self._config), self._config.trays)
             try:
                 self._start_all(stop)
                 for line in self._when_started if self._is_started else ():
@@ -312,7 +311,7 @@ class Launcher:
             for slot in self._slots
             if slot.child and slot.was_seen
         }
-        self._report.stages(site_states(self._watcher, [slot.row for slot in self._slots]), processes)
+        self._report.stages(self._watcher.states(slot.row for slot in self._slots), processes)
         self._report.alarms(self._watcher.current_alarms())
 
     def _plan_restart(self, slot: _Slot, status: int, now: float) -> None:

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 from fantwin.pipeline.runtime.figures import without_figures
 from fantwin.pipeline.runtime.latencies import LATENCY_WINDOW_S
-from fantwin.pipeline.site.site_state import OFF_THE_BUS, WHY_SILENT, StageState, Word
-from fantwin.pipeline.site.site_watcher import StageView
+from fantwin.pipeline.site.site_state import OFF_THE_BUS, WHY_SILENT, StageState, StageView, Word
 from fantwin.pipeline.site.stage_notes import note_lines
 from fantwin.schemas.enums import Severity
 from fantwin.schemas.health import Health

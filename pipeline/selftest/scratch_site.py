@@ -19,7 +19,8 @@ from fantwin.pipeline.config.loading import load_config
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.selftest.line_relay import LineRelay
 from fantwin.pipeline.selftest.stepped_clock import VARIABLE, set_offset_ns
-from fantwin.pipeline.site.site_watcher import SiteWatcher, StageView
+from fantwin.pipeline.site.site_state import StageView
+from fantwin.pipeline.site.site_watcher import SiteWatcher
 from fantwin.schemas.codec import decode
 from fantwin.schemas.enums import Transition
 from fantwin.schemas.messages import Alarm, Score

@@ -1,6 +1,6 @@
-"""Which alarms were raised while fans were judged, and what operators said of them: the rate that really was.
+"""Which alarms were raised while fans were judged, and what operators said of them: the observed rate.
 
-In the file of the history of alarms, beside its transitions, so that it goes on after a restart.
+It is kept in the file of the history of alarms, and goes on after a restart.
 """
 
 from __future__ import annotations
@@ -8,10 +8,9 @@ from __future__ import annotations
 import sqlite3
 from collections.abc import Sequence
 from dataclasses import astuple
-from pathlib import Path
 
 from fantwin.pipeline.errors import UserError
-from fantwin.pipeline.site.alarm_store import AlarmStore
+from fantwin.pipeline.site.alarm_history import AlarmHistory
 from fantwin.pipeline.site.judged_time import JudgedStretch
 from fantwin.schemas.enums import Feedback, Transition
 from fantwin.schemas.messages import Alarm
@@ -25,26 +24,6 @@ NS_PER_HOUR = 3600 * NS_PER_S
 _GIVEN = dict(GIVES_FEEDBACK.values())
 _AT_ONCE = 1000
 _READER = "rates"
-_SCHEMA = """
-CREATE TABLE IF NOT EXISTS alarm (
-    tray TEXT NOT NULL,
-    fan INTEGER NOT NULL,
-    onset_t_ns INTEGER NOT NULL,
-    raised_t_ns INTEGER NOT NULL DEFAULT 0,
-    feedback INTEGER NOT NULL DEFAULT 0,
-    marked_t_ns INTEGER NOT NULL DEFAULT 0,
-    PRIMARY KEY (tray, fan, onset_t_ns)
-);
-CREATE TABLE IF NOT EXISTS judged (
-    tray TEXT NOT NULL,
-    twin TEXT NOT NULL,
-    first_t_ns INTEGER NOT NULL,
-    last_t_ns INTEGER NOT NULL,
-    fan_ns INTEGER NOT NULL,
-    declared_per_day REAL,
-    PRIMARY KEY (tray, first_t_ns)
-);
-"""
 _GROW = """
 INSERT INTO judged (tray, twin, first_t_ns, last_t_ns, fan_ns, declared_per_day) VALUES (?, ?, ?, ?, ?, ?)
 ON CONFLICT DO UPDATE SET
@@ -64,43 +43,27 @@ SELECT feedback, COUNT(*) FROM alarm WHERE tray = :tray AND :twin = (
 
 
 class AlarmRates:
-    """Not thread-safe, like the store."""
+    """In the file of a history; not thread-safe, like it."""
 
-    def __init__(self, path: Path, *, read_only: bool = False) -> None:
-        """path: of the store, which exists. read_only: of another process.
-
-        Raises:
-            UserError: it cannot be read or written.
-        """
-        self._path = path
+    def __init__(self, history: AlarmHistory) -> None:
+        self._history, self._store = history, history.store
         self.problem = ""
         """why the last ones could not be kept; empty if they were"""
-        try:
-            if read_only:
-                self._file = sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)
-                self._file.execute("SELECT 1 FROM alarm, judged LIMIT 1")
-            else:
-                self._file = sqlite3.connect(path, check_same_thread=False, isolation_level=None)
-                self._file.executescript(f"PRAGMA journal_mode = WAL; PRAGMA synchronous = NORMAL; {_SCHEMA}")
-        except sqlite3.Error as error:
-            raise UserError(f"{path}: it has no rates of alarms: {error}") from error
 
-    def catch_up(self, store: AlarmStore, stretches: Sequence[JudgedStretch]) -> None:
-        """Take what has come to the store, and when fans were judged; a stretch that has grown replaces itself. What
+    def catch_up(self, stretches: Sequence[JudgedStretch]) -> None:
+        """Take what has come to the history, and when fans were judged; a stretch that has grown replaces itself. What
         the disk has no room for is taken the next time."""
         try:
-            position, is_behind = store.position(_READER), True
+            position, is_behind = self._history.position(_READER) or 0, True
             while is_behind:
-                new = store.after(position, _AT_ONCE)
-                self._keep([alarm for _, alarm in new], stretches)
-                is_behind, stretches = len(new) == _AT_ONCE, ()
-                if new:
-                    position = new[-1][0]
-                    store.set_position(_READER, position)  # not kept: they are taken again, and nothing changes
+                new = self._history.after(position, _AT_ONCE)
+                is_behind = len(new) == _AT_ONCE
+                position = new[-1][0] if new else position
+                if new or stretches:
+                    self._keep([alarm for _, alarm in new], stretches, position)
+                stretches = ()
         except (sqlite3.Error, UserError) as error:
-            if self._file.in_transaction:
-                self._file.execute("ROLLBACK")
-            self.problem = f"{self._path}: {error}: the rate of false alarms does not go on"
+            self.problem = f"{self._store.path}: {error}: the rate of false alarms does not go on"
             return
         self.problem = ""
 
@@ -110,13 +73,10 @@ class AlarmRates:
         Raises:
             UserError: the file cannot be read.
         """
-        try:
-            newest = self._file.execute(
-                "SELECT tray, twin, declared_per_day, MAX(last_t_ns) FROM judged GROUP BY tray ORDER BY tray"
-            ).fetchall()
-            return {tray: self._observed(tray, twin, declared) for tray, twin, declared, _ in newest}
-        except sqlite3.Error as error:
-            raise UserError(f"{self._path}: the rate of alarms cannot be read: {error}") from error
+        newest = self._store.read(
+            "SELECT tray, twin, declared_per_day, MAX(last_t_ns) FROM judged GROUP BY tray ORDER BY tray"
+        )
+        return {tray: self._observed(tray, twin, declared) for tray, twin, declared, _ in newest}
 
     def feedback(self, tray: str, fan: int, onset_t_ns: int) -> Feedback:
         """What operators said of an alarm.
@@ -124,23 +84,14 @@ class AlarmRates:
         Raises:
             UserError: the file cannot be read.
         """
-        try:
-            row = self._file.execute(
-                "SELECT feedback FROM alarm WHERE tray = ? AND fan = ? AND onset_t_ns = ?", (tray, fan, onset_t_ns)
-            ).fetchone()
-        except sqlite3.Error as error:
-            raise UserError(f"{self._path}: feedback on alarms cannot be read: {error}") from error
-        return Feedback.known(row[0]) if row else Feedback.NONE
-
-    def close(self) -> None:
-        """Leave a complete file."""
-        self._file.close()
+        query = "SELECT feedback FROM alarm WHERE tray = ? AND fan = ? AND onset_t_ns = ?"
+        rows = self._store.read(query, (tray, fan, onset_t_ns))
+        return Feedback.known(rows[0][0]) if rows else Feedback.NONE
 
     def _observed(self, tray: str, twin: str, declared_per_day: float | None) -> ObservedRate:
-        since_t_ns, fan_ns = self._file.execute(
-            "SELECT MIN(first_t_ns), SUM(fan_ns) FROM judged WHERE tray = ? AND twin = ?", (tray, twin)
-        ).fetchone()
-        rows = self._file.execute(_COUNT_WHILE_JUDGED, {"tray": tray, "twin": twin})
+        query = "SELECT MIN(first_t_ns), SUM(fan_ns) FROM judged WHERE tray = ? AND twin = ?"
+        ((since_t_ns, fan_ns),) = self._store.read(query, (tray, twin))
+        rows = self._store.read(_COUNT_WHILE_JUDGED, {"tray": tray, "twin": twin})
         counts = {Feedback.known(feedback): count for feedback, count in rows}
         return ObservedRate(
             since_t_ns=since_t_ns,
@@ -151,26 +102,27 @@ class AlarmRates:
             declared_per_day=declared_per_day,
         )
 
-    def _keep(self, alarms: Sequence[Alarm], stretches: Sequence[JudgedStretch]) -> None:
-        self._file.execute("BEGIN")
-        for alarm in alarms:
-            self._add(alarm)
-        self._file.executemany(_GROW, map(astuple, stretches))
-        for table in ("alarm", "judged"):
-            self._file.execute(f"DELETE FROM {table} WHERE rowid <= (SELECT MAX(rowid) FROM {table}) - {MOST_KEPT}")
-        self._file.execute("COMMIT")
+    def _keep(self, alarms: Sequence[Alarm], stretches: Sequence[JudgedStretch], position: int) -> None:
+        with self._store.transaction():
+            for alarm in alarms:
+                self._add(alarm)
+            self._store.write_many(_GROW, list(map(astuple, stretches)))
+            for table in ("alarm", "judged"):
+                oldest = f"SELECT MAX(rowid) FROM {table}"
+                self._store.write(f"DELETE FROM {table} WHERE rowid <= ({oldest}) - {MOST_KEPT}")
+            self._history.set_position(_READER, position)
 
     def _add(self, alarm: Alarm) -> None:
         """Messages may come in any order: after a restart, those of the bus do."""
         fan = (alarm.header.tray, alarm.fan)
         if alarm.transition == Transition.RAISED:
-            self._file.execute(
+            self._store.write(
                 "INSERT INTO alarm (tray, fan, onset_t_ns, raised_t_ns) VALUES (?, ?, ?, ?)"
                 " ON CONFLICT DO UPDATE SET raised_t_ns = excluded.raised_t_ns",
                 (*fan, alarm.onset_t_ns, alarm.t_ns),
             )
         if feedback := _GIVEN.get(alarm.transition):
-            self._file.execute(
+            self._store.write(
                 "INSERT INTO alarm (tray, fan, onset_t_ns, feedback, marked_t_ns) VALUES (?, ?, ?, ?, ?)"
                 " ON CONFLICT DO UPDATE SET feedback = excluded.feedback, marked_t_ns = excluded.marked_t_ns"
                 " WHERE excluded.marked_t_ns >= alarm.marked_t_ns",

@@ -8,6 +8,8 @@ from dataclasses import replace
 from fantwin.schemas.health import Health
 from fantwin.schemas.messages import Alarm
 
+LONGEST_TEXT, MOST_CAUSES = 2000, 20
+"""of an alarm: the rest is cut off"""
 _NOT_SHOWN = re.compile(r"[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069]")
 """characters that end a line, move the cursor of a terminal, or turn the direction of what follows"""
 
@@ -17,17 +19,22 @@ def one_line(text: str) -> str:
     return _NOT_SHOWN.sub(" ", text)
 
 
+def _short_line(text: str) -> str:
+    return one_line(text[:LONGEST_TEXT])
+
+
 def readable_alarm(alarm: Alarm) -> Alarm:
-    """The alarm with texts that are safe to show: whoever may publish on the bus chooses them."""
+    """The alarm with texts that are safe to show and to keep: whoever may publish on the bus chooses them."""
     return replace(
         alarm,
-        message=one_line(alarm.message),
-        operator_name=one_line(alarm.operator_name),
-        comment=one_line(alarm.comment),
-        feedback_by=one_line(alarm.feedback_by),
-        feedback_reason=one_line(alarm.feedback_reason),
+        message=_short_line(alarm.message),
+        operator_name=_short_line(alarm.operator_name),
+        comment=_short_line(alarm.comment),
+        feedback_by=_short_line(alarm.feedback_by),
+        feedback_reason=_short_line(alarm.feedback_reason),
         causes=tuple(
-            replace(each, cause=one_line(each.cause), evidence=one_line(each.evidence)) for each in alarm.causes
+            replace(each, cause=_short_line(each.cause), evidence=_short_line(each.evidence))
+            for each in alarm.causes[:MOST_CAUSES]
         ),
     )
 

@@ -11,9 +11,8 @@ import numpy as np
 
 from fantwin.pipeline.config.models import TrayConfig
 from fantwin.pipeline.recordings.clips.clip import Clip
-from fantwin.pipeline.site.fan_groups import SHOWN_CLASSES, FanGroup
 from fantwin.pipeline.site.fan_history import Curves
-from fantwin.pipeline.site.fleet import Fan, FanNow
+from fantwin.pipeline.site.fleet import SHOWN_CLASSES, Fan, FanGroup, FanNow
 from fantwin.pipeline.site.site_model import SiteModel
 from fantwin.pipeline.site.site_state import StageState
 from fantwin.schemas.channels import CHANNELS

@@ -1,4 +1,4 @@
-"""What the cores have in common that show a site to operators and pass on what they ask."""
+"""What the cores of all outputs have in common: they keep in a model of the site what arrives."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from collections.abc import Sequence
 
 from fantwin.pipeline.runtime.stage import Core
 from fantwin.pipeline.site.one_line import readable_alarm, readable_health
-from fantwin.pipeline.site.request_desk import RequestDesk
 from fantwin.pipeline.site.site_model import SiteModel
 from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.health import Health
@@ -18,8 +17,8 @@ from fantwin.schemas.messages import Alarm, Message, ModelCard, ScorerSnapshot
 class SiteCore(Core):
     """Keeps in a model what arrives. Scores arrive as envelopes."""
 
-    def __init__(self, model: SiteModel, desk: RequestDesk) -> None:
-        self._model, self._desk = model, desk
+    def __init__(self, model: SiteModel) -> None:
+        self._model = model
         self._counts: Counter[str] = Counter()
 
     def step(self, item: Message | Envelope) -> Sequence[Message]:

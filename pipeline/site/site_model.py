@@ -1,6 +1,7 @@
-"""What the gateway knows about its site now: the newest sample and the alarm of every fan, the stages, the twins.
+"""The model of a site now: the newest sample and the alarm of every fan, the stages, the twins.
 
-The stage fills it in, and the web server reads it, each in a thread of its own.
+Every output has one and reads from it, and so do the commands that watch a site. It is filled in one thread and read in
+others.
 """
 
 from __future__ import annotations
@@ -16,17 +17,15 @@ import numpy as np
 
 from fantwin.pipeline.config.models import TrayConfig
 from fantwin.pipeline.config.registry import STAGES
+from fantwin.pipeline.site.alarm_book import AlarmBook
+from fantwin.pipeline.site.alarm_history import AlarmHistory
 from fantwin.pipeline.site.alarm_rates import AlarmRates
-from fantwin.pipeline.site.alarm_store import AlarmStore
-from fantwin.pipeline.site.fan_groups import SHOWN_CLASSES, FanGroup, classes_of, counts_of
 from fantwin.pipeline.site.fan_history import COLUMNS, Curves, FanHistory, channels_of, values_of
-from fantwin.pipeline.site.fleet import Fan, FanNow, Fleet, last_sample
+from fantwin.pipeline.site.fleet import SHOWN_CLASSES, Fan, FanGroup, FanNow, Fleet, last_sample
 from fantwin.pipeline.site.judged_time import LEARNED, JudgedTime
-from fantwin.pipeline.site.site_state import StageState, stage_states
-from fantwin.pipeline.site.site_watcher import StageView
-from fantwin.pipeline.site.watched_alarms import WatchedAlarms
-from fantwin.schemas.codec import CodecError, decode_columns, encode
-from fantwin.schemas.enums import Feedback, StageStatus, Transition
+from fantwin.pipeline.site.site_state import HeardHealth, StageState, stage_states
+from fantwin.schemas.codec import CodecError, decode_columns
+from fantwin.schemas.enums import Feedback, InvalidReason, StageStatus, Transition
 from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.health import Health
 from fantwin.schemas.messages import Alarm, Array, ModelCard, Score, ScorerSnapshot
@@ -36,7 +35,10 @@ from fantwin.scoring.calibration.observed_rate import ObservedRate, declared_per
 from fantwin.scoring.wear.recorded_wear import wear_in, wear_rows
 
 SILENT_AFTER_S = 5.0
-"""a tray without a score for so long is silent; and so is a stage without a health, which may have left the bus"""
+"""a tray without a score for so long is silent; and so is a stage without a health, which may have left the bus. A fan
+is judged now if it was this recently"""
+_SAMPLED_S = 0.1
+"""scores of a tray that are watched by a command are looked at this often: a fast line sends hundreds a second"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,13 +66,6 @@ class TrayNow:
     channels: tuple[str, ...] = ()
 
 
-@dataclass(slots=True)
-class _Heard:
-    health: Health
-    previous: Health | None
-    heard_s: float
-
-
 class SiteModel:
     """Thread-safe."""
 
@@ -78,20 +73,28 @@ class SiteModel:
         self,
         site: str,
         trays: Sequence[TrayConfig],
-        store: AlarmStore,
+        alarms: AlarmHistory | None = None,
         *,
-        keeps_curves: bool = True,
-        rates: AlarmRates | None = None,
+        keeps_curves: bool = False,
+        keeps_rates: bool = False,
         now_s: Callable[[], float] = time.monotonic,
     ) -> None:
-        """keeps_curves: of the last hour of every fan, for `history`; of 5,000 fans they take 86 MB.
-        rates: takes for how long fans are judged, for `observed_rates`. now_s: a clock that is never set."""
+        """An empty model.
+
+        Args:
+            site: its name.
+            trays: whose fans it knows.
+            alarms: the history that alarms are added to, for `past_alarms`; None: none is kept.
+            keeps_curves: of the last hour of every fan, for `history`; of 5,000 fans they take 86 MB.
+            keeps_rates: in the history, for how long fans are judged, for `observed_rates`.
+            now_s: a clock that is never set.
+        """
         self._now_s = now_s
         self.site = site
         self.trays = tuple(trays)
         self._by_name = {tray.name: tray for tray in trays}
         self._lock = threading.Lock()
-        self._fleet = Fleet(trays, has_all_alarms=True)
+        self._fleet = Fleet(trays)
         self._history = FanHistory(trays) if keeps_curves else None
         self._heard_s: dict[str, float] = {}
         self._newest: dict[str, Score] = {}
@@ -100,53 +103,68 @@ class SiteModel:
         """by tray, fan and severity"""
         self._counted: dict[tuple[str, int], tuple[int, int]] = {}
         """by tray and fan: the onset of the alarm that was counted last, and its worst severity"""
-        fans = sum(tray.fans for tray in trays)
-        self._alarms = WatchedAlarms(lambda _producer: True, most_fans=fans)
-        self._store = store
-        self._stages: dict[tuple[str, str], _Heard] = {}
+        self._alarms = AlarmBook()
+        self._history_of_alarms = alarms
+        self._stages: dict[tuple[str, str], HeardHealth] = {}
         self._twins: dict[str, ModelCard] = {}
         self._wear: dict[str, tuple[int, Sequence[Mapping[str, Any]]]] = {}
         """by tray: the time of the snapshot, and its rows"""
-        self._rates = rates
+        self._rates = AlarmRates(alarms) if keeps_rates and alarms else None
         self._judged = JudgedTime()
         self._judging: dict[str, tuple[str, float | None]] = {}
         """by tray, the name of its twin for the judged time, and the rate that it declares"""
         self.refused_scores = 0
         """with another number of fans than the configuration says, or not to be decoded"""
+        self.wrong_fans: dict[str, int] = {}
+        """by tray, how many fans its last score had, if they are not those of the configuration"""
 
-    def add_score(self, envelope: Envelope) -> Score | None:
-        """A score of a known tray has arrived; returns it, or None if it cannot be shown."""
-        tray = self._by_name[envelope.header.tray]
+    def add_score(self, envelope: Envelope, columns: Sequence[str] = COLUMNS) -> Score | None:
+        """A score of a known tray has arrived; returns it with these columns, or None if it cannot be shown."""
         try:
-            score = decode_columns(Score, envelope.payload, COLUMNS)
+            score = decode_columns(Score, envelope.payload, columns)
         except CodecError:
             self.refused_scores += 1
             return None
+        return self.add_decoded_score(envelope.header.tray, score)
+
+    def wants_score(self, tray: str) -> bool:
+        """Whether a known tray's last score was some time ago."""
+        with self._lock:
+            return self._now_s() - self._heard_s.get(tray, -np.inf) >= _SAMPLED_S
+
+    def add_decoded_score(self, name: str, score: Score) -> Score | None:
+        """The same for one that has been decoded, of the tray whose key it came on."""
+        tray = self._by_name[name]
         if score.fans != tray.fans or not len(score.t_ns):
             self.refused_scores += score.fans != tray.fans
+            self.wrong_fans[name] = score.fans
             return None
         with self._lock:
-            self._heard_s[tray.name] = self._now_s()
-            self._newest[tray.name] = last_sample(score, COLUMNS)
-            self._fleet.update(score)
+            self.wrong_fans.pop(name, None)
+            now_s = self._heard_s[name] = self._now_s()
+            self._newest[name] = last_sample(score, COLUMNS)
+            self._fleet.update(name, score, now_s)
             if self._history is not None:
                 self._history.add(score)
             if self._rates is not None and tray.name in self._judging:
                 stretches = self._judged.add(score, *self._judging[tray.name])
                 if stretches:
-                    self._rates.catch_up(self._store, stretches)
+                    self._rates.catch_up(stretches)
         return score
 
     def add_alarm(self, alarm: Alarm) -> bool:
-        """A transition has arrived; returns whether it is new."""
+        """A transition of a fan of the site has arrived; returns whether it is new."""
         with self._lock:
-            self._alarms.add(alarm, len(encode(alarm)))
-            current = self._alarms.of(alarm.header.tray, alarm.fan)
-            self._fleet.add_alarm(current.newest if current else alarm)  # this one may be late
-            is_new = self._store.add(alarm)
+            self._fleet.add_alarm(self._alarms.add(alarm).newest)  # this one may be late
+            is_new = self._history_of_alarms is None or self._history_of_alarms.add(alarm)
             if is_new and alarm.transition in (Transition.RAISED, Transition.SEVERITY):
                 self._count(alarm)
             return is_new
+
+    def drop_alarms(self, is_dropped: Callable[[Alarm], bool]) -> None:
+        """Forget the alarm messages to which this applies."""
+        with self._lock:
+            self._alarms.drop(is_dropped)
 
     def _count(self, alarm: Alarm) -> None:
         """Once for each severity that it reaches."""
@@ -162,7 +180,7 @@ class SiteModel:
         with self._lock:
             before = self._stages.get(name)
             previous = before.health if before and before.health.header.producer == health.header.producer else None
-            self._stages[name] = _Heard(health, previous, self._now_s())
+            self._stages[name] = HeardHealth(health, previous, self._now_s())
 
     def add_twin(self, card: ModelCard) -> None:
         """A tray has another twin."""
@@ -180,6 +198,25 @@ class SiteModel:
                 if heard_s < before_s:
                     self._fleet.silence(tray, int(self._newest[tray].t_ns[-1]))
 
+    def is_silent(self, tray: str) -> bool:
+        """Whether a tray has sent no score for long, or never."""
+        with self._lock:
+            return self._heard_s.get(tray, -np.inf) < self._now_s() - SILENT_AFTER_S
+
+    def not_judged(self, tray: str) -> dict[InvalidReason, tuple[int, ...]] | None:
+        """The fans of a tray that are not judged now, by reason; None: no score of it comes."""
+        silent = self.is_silent(tray)
+        with self._lock:
+            found = self._fleet.not_judged(tray, self._now_s() - SILENT_AFTER_S)
+        return None if found and silent else found
+
+    def at_rest(self, tray: str) -> dict[InvalidReason, tuple[int, ...]]:
+        """The fans of a tray that are stopped or starting now."""
+        if self.is_silent(tray):
+            return {}
+        with self._lock:
+            return self._fleet.at_rest(tray)
+
     def tray(self, name: str) -> TrayConfig | None:
         """None: there is no such tray."""
         return self._by_name.get(name)
@@ -187,7 +224,7 @@ class SiteModel:
     def fans_now(self) -> FleetNow:
         """All fans at a glance."""
         with self._lock:
-            return FleetNow(classes_of(self._fleet), self._fleet.scores())
+            return FleetNow(self._fleet.classes(), self._fleet.scores())
 
     def every_fan(self) -> list[FanNow]:
         """All fans in words, the worst first."""
@@ -202,19 +239,24 @@ class SiteModel:
     def groups(self) -> dict[Fan, FanGroup]:
         """The group of each fan."""
         with self._lock:
-            classes = classes_of(self._fleet).tolist()
+            classes = self._fleet.classes().tolist()
             return {fan: SHOWN_CLASSES[each].group for fan, each in zip(self._fleet.fans, classes, strict=True)}
 
     def words_now(self, fans: Sequence[Fan]) -> list[str]:
         """Words for each: that it is stopped, starting or like a healthy fan again; empty: none of these."""
+        heard = {tray: not self.is_silent(tray) for tray in {fan.tray for fan in fans}}
         with self._lock:
-            classes = classes_of(self._fleet)
-            return [SHOWN_CLASSES[classes[self._fleet.index(fan)]].now for fan in fans]
+            return [self._fleet.words_now(fan) if heard[fan.tray] else "" for fan in fans]
+
+    def in_alarm(self) -> list[Fan]:
+        """The fans in an alarm that no operator has silenced, the highest score first."""
+        with self._lock:
+            return self._fleet.alarms()
 
     def counts(self) -> dict[str, int]:
         """How many fans are in alarm, suspect, not judged, and in an alarm that an operator has silenced."""
         with self._lock:
-            found = counts_of(classes_of(self._fleet))
+            found = self._fleet.counts()
         return {
             "in_alarm": found[FanGroup.ALARM],
             "suspect": found[FanGroup.SUSPECT],
@@ -260,31 +302,36 @@ class SiteModel:
     def current_alarms(self) -> list[CurrentAlarm]:
         """The alarm of each fan that had one, by tray and fan."""
         with self._lock:
-            return self._alarms.current()
+            return self._alarms.all()
 
     def current_alarm(self, fan: Fan) -> CurrentAlarm | None:
         """That of one fan; None: it had none."""
         with self._lock:
-            return self._alarms.of(fan.tray, fan.number)
+            return self._alarms.of(fan)
 
     def past_alarms(
         self, most: int, *, tray: str = "", fan: int = -1, before: int | None = None
     ) -> Sequence[tuple[int, Alarm]]:
-        """The last transitions: `AlarmStore.newest`."""
+        """The last transitions: `AlarmHistory.newest`."""
         with self._lock:
-            return self._store.newest(most, tray=tray, fan=fan, before=before)
+            return self._past.newest(most, tray=tray, fan=fan, before=before)
 
     def alarms_between(
         self, begin_ns: int, end_ns: int, most: int, *, tray: str = "", fan: int = -1, is_backwards: bool = False
     ) -> Sequence[Alarm]:
-        """The transitions of a stretch of time: `AlarmStore.between`."""
+        """The transitions of a stretch of time: `AlarmHistory.between`."""
         with self._lock:
-            return self._store.between(begin_ns, end_ns, most, tray=tray, fan=fan, is_backwards=is_backwards)
+            return self._past.between(begin_ns, end_ns, most, tray=tray, fan=fan, is_backwards=is_backwards)
 
     def history_begins_t_ns(self) -> int | None:
         """How far back the history of alarms reaches; None: nobody has said it."""
         with self._lock:
-            return self._store.begins_t_ns()
+            return self._past.begins_t_ns()
+
+    @property
+    def _past(self) -> AlarmHistory:
+        assert self._history_of_alarms is not None, "no history is kept"
+        return self._history_of_alarms
 
     def add_snapshot(self, snapshot: ScorerSnapshot) -> None:
         """A scorer has sent its state, of which the wear is kept."""
@@ -309,7 +356,7 @@ class SiteModel:
         if self._rates is None:
             return [alarm.feedback for alarm in alarms]
         with self._lock:
-            self._rates.catch_up(self._store, ())
+            self._rates.catch_up(())
             return [self._rates.feedback(alarm.header.tray, alarm.fan, alarm.onset_t_ns) for alarm in alarms]
 
     def observed_rates(self) -> dict[str, ObservedRate]:
@@ -317,7 +364,7 @@ class SiteModel:
         if self._rates is None:
             return {}
         with self._lock:
-            self._rates.catch_up(self._store, self._judged.growing())
+            self._rates.catch_up(self._judged.growing())
             return self._rates.observed()
 
     def twin(self, tray: str) -> ModelCard | None:
@@ -328,22 +375,20 @@ class SiteModel:
         """The stages that have been heard. One that is silent for long may have left the bus."""
         now_s = self._now_s()
         with self._lock:
-            views = [
-                StageView(each.health, each.previous, each.health.status != StageStatus.STOPPED, now_s - each.heard_s)
-                for each in self._stages.values()
-            ]
+            heard = list(self._stages.values())
+        views = [each.view(now_s, alive=each.health.status != StageStatus.STOPPED) for each in heard]
         alive = {(view.health.stage, view.health.instance) for view in views if view.alive}
         rank = {name: number for number, name in enumerate(STAGES)}
         return sorted(stage_states(views, alive, ()), key=lambda state: rank.get(state.stage, len(rank)))
 
     def problem(self) -> str:
         """What is wrong with the history of alarms; empty if nothing is."""
-        return "; ".join(filter(None, (self._store.problem, self._rates.problem if self._rates else "")))
+        return "; ".join(each.problem for each in (self._history_of_alarms, self._rates) if each and each.problem)
 
     def close(self) -> None:
         """Leave complete files."""
         with self._lock:
             if self._rates is not None:
-                self._rates.catch_up(self._store, self._judged.growing())
-                self._rates.close()
-            self._store.close()
+                self._rates.catch_up(self._judged.growing())
+            if self._history_of_alarms is not None:
+                self._history_of_alarms.close()

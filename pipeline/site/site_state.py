@@ -7,14 +7,13 @@ age of its outputs.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
 from fantwin.pipeline.config.registry import STAGES
 from fantwin.pipeline.config.shards import StageProcess
 from fantwin.pipeline.site.loss_accounting import label, trays_of
-from fantwin.pipeline.site.site_watcher import SiteWatcher, StageView
 from fantwin.pipeline.timebase.stage_clock import REPLAY
 from fantwin.schemas.enums import StageStatus
 from fantwin.schemas.health import Health
@@ -49,6 +48,45 @@ class Word(StrEnum):
 OFF_THE_BUS = {Word.GONE, Word.MISSING}
 AT_WORK = {Word.OK, Word.STARTING, Word.DEGRADED, Word.WAITING}
 """in any other state a stage does not do what the configuration asks for"""
+
+
+@dataclass(frozen=True)
+class StageView:
+    """A stage session as seen from outside."""
+
+    health: Health
+    previous: Health | None
+    alive: bool
+    age_s: float = 0.0
+    """since the health was heard here: clocks of other hosts may differ"""
+
+    @property
+    def rate_in_hz(self) -> float:
+        """Messages received a second between the last two healths."""
+        return self._rate(sum(i.received for i in self.health.inputs), lambda h: sum(i.received for i in h.inputs))
+
+    @property
+    def rate_out_hz(self) -> float:
+        """Messages published a second between the last two healths."""
+        return self._rate(sum(o.published for o in self.health.outputs), lambda h: sum(o.published for o in h.outputs))
+
+    def _rate(self, now: int, count: Callable[[Health], int]) -> float:
+        if self.previous is None or self.health.t_ns <= self.previous.t_ns:
+            return 0.0
+        return (now - count(self.previous)) / ((self.health.t_ns - self.previous.t_ns) / NS_PER_S)
+
+
+@dataclass(frozen=True, slots=True)
+class HeardHealth:
+    """The last health of a session, the one before, and when the last was heard, of a monotonic clock in s."""
+
+    health: Health
+    previous: Health | None
+    heard_s: float
+
+    def view(self, now_s: float, *, alive: bool) -> StageView:
+        """The session as it is seen now."""
+        return StageView(self.health, self.previous, alive, now_s - self.heard_s)
 
 
 @dataclass(frozen=True)
@@ -89,11 +127,6 @@ class StageState:
     def is_fault(self) -> bool:
         """Whether the site lacks a stage that the configuration asks for, or its work."""
         return self.is_expected and self.word not in AT_WORK
-
-
-def site_states(watcher: SiteWatcher, expected: Iterable[StageProcess]) -> list[StageState]:
-    """The states as a watcher sees them now."""
-    return stage_states(watcher.stages(), watcher.alive(), expected)
 
 
 def stage_states(

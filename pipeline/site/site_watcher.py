@@ -1,17 +1,16 @@
-"""Watches a running site from outside: the last health of each session, and the alarms."""
+"""Watches a running site from outside: the last health of each session, and a model of its fans."""
 
 from __future__ import annotations
 
-import re
 import threading
 import time
-from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from itertools import chain
 
 from fantwin.pipeline.bus.session import Bus
-from fantwin.pipeline.config.models import NAME_PATTERN
+from fantwin.pipeline.config.models import TrayConfig
 from fantwin.pipeline.config.roles import Role, roles_of_stages
+from fantwin.pipeline.config.shards import StageProcess
 from fantwin.pipeline.runtime.believed_outputs import BelievedOutputs
 from fantwin.pipeline.runtime.lost_sessions import LostSessions
 from fantwin.pipeline.runtime.sessions import Session, this_host
@@ -19,12 +18,12 @@ from fantwin.pipeline.site.known_sessions import KnownSessions
 from fantwin.pipeline.site.loss_accounting import Launched, label, losses
 from fantwin.pipeline.site.one_line import readable_alarm, readable_health
 from fantwin.pipeline.site.refused_input import refused, unusable_lines
-from fantwin.pipeline.site.watched_alarms import WatchedAlarms
+from fantwin.pipeline.site.site_model import SiteModel
+from fantwin.pipeline.site.site_state import HeardHealth, StageState, StageView, stage_states
 from fantwin.schemas.codec import CodecError, decode
 from fantwin.schemas.health import Health
-from fantwin.schemas.messages import Alarm
+from fantwin.schemas.messages import Alarm, Score
 from fantwin.schemas.topics import alive_key, health_key, sessions_key, tray_key
-from fantwin.schemas.units import NS_PER_S
 from fantwin.scoring.alarms.current_alarms import CurrentAlarm
 
 MOST_WATCHED_SESSIONS = 1000
@@ -33,71 +32,60 @@ MOST_UNKNOWN_SESSIONS = 64
 """producers without a token of a session whose health is kept; those heard longest ago are forgotten first"""
 
 
-@dataclass(frozen=True)
-class StageView:
-    """A stage session as seen from outside."""
-
-    health: Health
-    previous: Health | None
-    alive: bool
-    age_s: float = 0.0
-    """since the health was heard here: clocks of other hosts may differ"""
-
-    @property
-    def rate_in_hz(self) -> float:
-        """Messages received a second between the last two healths."""
-        return self._rate(sum(i.received for i in self.health.inputs), lambda h: sum(i.received for i in h.inputs))
-
-    @property
-    def rate_out_hz(self) -> float:
-        """Messages published a second between the last two healths."""
-        return self._rate(sum(o.published for o in self.health.outputs), lambda h: sum(o.published for o in h.outputs))
-
-    def _rate(self, now: int, count: Callable[[Health], int]) -> float:
-        if self.previous is None or self.health.t_ns <= self.previous.t_ns:
-            return 0.0
-        return (now - count(self.previous)) / ((self.health.t_ns - self.previous.t_ns) / NS_PER_S)
-
-
-@dataclass(frozen=True, slots=True)
-class _Heard:
-    """The last health of a session, the one before, and when the last was heard, of a monotonic clock in s."""
-
-    health: Health
-    previous: Health | None
-    heard_s: float
-
-
 class SiteWatcher:
-    """Keeps the last health of each session, and the last alarm of each fan. Thread-safe.
+    """Keeps the last health of each session, and in `model` what is known of the fans. Thread-safe.
 
     Whoever is no session of the site is not shown and not counted: `pipeline.site.known_sessions`.
     """
 
-    def __init__(self, bus: Bus, site: str, roles: Mapping[str, Role] | None = None) -> None:
-        """roles: those of the site, each with the trays to which it is limited. None: the roles of all stages, not
-        limited to trays."""
+    def __init__(
+        self,
+        bus: Bus,
+        site: str,
+        roles: Mapping[str, Role] | None = None,
+        trays: Sequence[TrayConfig] = (),
+        *,
+        has_scores: bool = False,
+        hear_alarm: Callable[[Alarm], None] = lambda _alarm: None,
+    ) -> None:
+        """Subscribe.
+
+        Args:
+            bus: of the site.
+            site: its name.
+            roles: those of the site, each with the trays to which it is limited. None: the roles of all stages, not
+                limited to trays.
+            trays: whose alarms are followed; none: no alarms.
+            has_scores: their scores are followed, too.
+            hear_alarm: is called with each alarm message of the site.
+        """
         self._believed_outputs = BelievedOutputs(roles_of_stages() if roles is None else roles)
         self._bus = bus
         self._site = site
+        self._hear_alarm = hear_alarm
         self._lock = threading.Lock()
         self._sessions = KnownSessions()
         self._lost = LostSessions(this_host())
-        self._healths: dict[str, _Heard] = {}
+        self._healths: dict[str, HeardHealth] = {}
         """by producer, in the order heard: of the sessions that have shown their token"""
-        self._unknown: dict[str, _Heard] = {}
+        self._unknown: dict[str, HeardHealth] = {}
         """the same of others: their token may still be on its way"""
-        self._alarms = WatchedAlarms(self._sessions.is_known)
+        self.model = SiteModel(site, trays)
         bus.watch_alive(alive_key(site, "*", "*"), self._on_liveness)
         bus.watch_alive(sessions_key(site), self._on_session)
         bus.subscribe(health_key(site, "*", "*"), self._on_health)
-        bus.subscribe(tray_key(site, "*", "alarm"), self._on_alarm)
+        self._alarm_keys = tray_key(site, "*", "alarm")
+        if trays:
+            bus.subscribe(self._alarm_keys, self._on_alarm)
+        for tray in trays if has_scores else ():
+            bus.subscribe(tray_key(site, tray.name, "score"), self._on_score)
 
     def ask_for_past_alarms(self) -> None:
-        """Fetch the alarms that were raised before this watcher started."""
-        key = tray_key(self._site, "*", "alarm")
-        for its_key, payload in self._bus.recover(key):
-            self._on_alarm(its_key, payload)
+        """Fetch the alarms that were raised before this watcher started: those of several scorers by their time."""
+        found = [(key, payload, _decoded(Alarm, payload)) for key, payload in self._bus.recover(self._alarm_keys)]
+        known = [(alarm.t_ns, key, payload) for key, payload, alarm in found if isinstance(alarm, Alarm)]
+        for _, key, payload in sorted(known):
+            self._on_alarm(key, payload)
 
     def ask_for_health(self, stage: str, instance: str) -> None:
         """Fetch the last health of a stage, instead of waiting for its next one."""
@@ -119,9 +107,12 @@ class SiteWatcher:
                 if self._sessions.is_replaced(each.health.header.producer):
                     continue
                 name = (each.health.stage, each.health.instance)
-                age_s = time.monotonic() - each.heard_s
-                latest[name] = StageView(each.health, each.previous, name in at_work, age_s)
+                latest[name] = each.view(time.monotonic(), alive=name in at_work)
             return [latest[name] for name in sorted(latest)]
+
+    def states(self, expected: Iterable[StageProcess]) -> list[StageState]:
+        """The state of each stage that is expected, and of each other that was heard."""
+        return stage_states(self.stages(), self.alive(), expected)
 
     def alive(self) -> set[tuple[str, str]]:
         """Stage and instance of each session that is on the bus now."""
@@ -142,15 +133,11 @@ class SiteWatcher:
         with self._lock:
             return self._sessions.owner(stage, tray)
 
-    def alarms(self) -> list[Alarm]:
-        """The last alarm message of every fan that had one, oldest first."""
-        return sorted((current.newest for current in self.current_alarms()), key=lambda alarm: alarm.t_ns)
-
     def current_alarms(self) -> list[CurrentAlarm]:
         """The current alarm of each fan that had one, by tray and fan."""
         with self._lock:
-            self._alarms.drop(self._is_of_stranger)  # the session that publishes there may have been heard after it
-            return self._alarms.current()
+            self.model.drop_alarms(self._is_of_stranger)  # the session that publishes there may have come after it
+        return self.model.current_alarms()
 
     def add_launched(self, session: Launched) -> None:
         """Register a session that this process has started: a flood of others does not displace what it lost."""
@@ -180,12 +167,12 @@ class SiteWatcher:
         with self._lock:
             return unusable_lines((each.health for each in self._believed()), launched)
 
-    def _believed(self) -> list[_Heard]:
+    def _believed(self) -> list[HeardHealth]:
         every = chain(self._unknown.values(), self._healths.values())
         return [each for each in every if self._sessions.is_health_of_stage(each.health)]
 
     def _is_of_stranger(self, alarm: Alarm) -> bool:
-        return self._sessions.is_stranger(_alarm_key(self._site, alarm.header.tray), alarm.header.producer)
+        return self._sessions.is_stranger(tray_key(self._site, alarm.header.tray, "alarm"), alarm.header.producer)
 
     def _on_liveness(self, key: str, alive: bool) -> None:
         with self._lock:
@@ -205,9 +192,9 @@ class SiteWatcher:
             with self._lock:
                 self._sessions.add_health(health)
                 before = self._healths.get(health.header.producer) or self._unknown.get(health.header.producer)
-                self._keep(_Heard(health, before.health if before else None, time.monotonic()))
+                self._keep(HeardHealth(health, before.health if before else None, time.monotonic()))
 
-    def _keep(self, heard: _Heard) -> None:
+    def _keep(self, heard: HeardHealth) -> None:
         producer = heard.health.header.producer
         if not self._sessions.is_known(producer):
             self._unknown.pop(producer, None)
@@ -224,17 +211,27 @@ class SiteWatcher:
     def _on_alarm(self, key: str, payload: bytes) -> None:
         """A message without a producer (empty bytes decode as one), or of another tray than its key, is ignored."""
         alarm = _decoded(Alarm, payload)
-        if isinstance(alarm, Alarm) and alarm.header.producer and key == _alarm_key(self._site, alarm.header.tray):
-            with self._lock:
-                if self._sessions.counts(key, alarm.header.producer):
-                    self._alarms.add(readable_alarm(alarm), len(payload))
+        if not isinstance(alarm, Alarm) or not self._is_of_site(key, alarm):
+            return
+        if self.counts(key, alarm.header.producer):
+            alarm = readable_alarm(alarm)
+            self.model.add_alarm(alarm)
+            self._hear_alarm(alarm)
+
+    def _on_score(self, key: str, payload: bytes) -> None:
+        tray = key.split("/")[2]
+        if self.model.wants_score(tray):
+            score = _decoded(Score, payload)
+            if isinstance(score, Score) and self.counts(key, score.header.producer):
+                self.model.add_decoded_score(tray, score)
+
+    def _is_of_site(self, key: str, alarm: Alarm) -> bool:
+        tray = self.model.tray(alarm.header.tray)
+        is_there = tray is not None and 0 <= alarm.fan < tray.fans and bool(alarm.header.producer)
+        return is_there and key == tray_key(self._site, alarm.header.tray, "alarm")
 
 
-def _alarm_key(site: str, tray: str) -> str:
-    return tray_key(site, tray, "alarm") if re.fullmatch(NAME_PATTERN, tray) else ""
-
-
-def _decoded(kind: type[Health] | type[Alarm], payload: bytes) -> object | None:
+def _decoded(kind: type[Health] | type[Alarm] | type[Score], payload: bytes) -> object | None:
     """None for undecodable bytes: the stages count those."""
     try:
         return decode(kind, payload)

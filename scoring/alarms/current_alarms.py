@@ -6,7 +6,7 @@ the same occurrence, which tray, fan and onset identify.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
@@ -25,6 +25,7 @@ _DESCRIBES_THE_FAN = {
     Transition.CLEARED,
     Transition.REPUBLISHED,
 }
+_SAYS_HOW_FAR = {Transition.RAISED, Transition.SEVERITY}
 _NAMES_WHO_ACKNOWLEDGED = {Transition.ACKNOWLEDGED, Transition.REPUBLISHED}
 
 
@@ -39,6 +40,10 @@ class CurrentAlarm:
     acknowledged_by: str
     message_t_ns: int = 0
     """time of the sample that the message describes; 0 where it describes none"""
+    raised: Alarm | None = None
+    """the last message of the occurrence that says how far the fan is from its twin"""
+    commented: Alarm | None = None
+    """the last message of the occurrence with a comment of an operator"""
 
     def about(self) -> str:
         """The message without the fan and with its time: commands and speeds in it are those of then."""
@@ -106,47 +111,32 @@ class CurrentAlarm:
         }
 
 
-def current_alarms(messages: Iterable[Alarm]) -> list[CurrentAlarm]:
-    """The alarm of each fan with a message, by tray and fan. messages: in the order received."""
-    by_fan: dict[tuple[str, int], list[Alarm]] = {}
-    for alarm in messages:
-        by_fan.setdefault((alarm.header.tray, alarm.fan), []).append(alarm)
-    return [_current(in_sequence(by_fan[fan])) for fan in sorted(by_fan)]
-
-
-def in_sequence(messages: Iterable[Alarm]) -> list[Alarm]:
-    """The messages in the order received, but those of each producer by sequence: some may be late, sent again.
-
-    They are not ordered by time: a scorer's times go back when it is fed an old recording.
-    """
-    received = list(messages)
-    of_producer: dict[str, list[Alarm]] = {}
-    for alarm in sorted(received, key=lambda alarm: alarm.header.sequence, reverse=True):
-        of_producer.setdefault(alarm.header.producer, []).append(alarm)
-    return [of_producer[alarm.header.producer].pop() for alarm in received]
-
-
 def needed(messages: Sequence[Alarm]) -> list[Alarm]:
-    """Select, of the messages about a fan in sequence, the few from which its current alarm follows; the others never
-    matter again, whatever is published next."""
+    """Of the messages about a fan, in the order sent, the few from which its current alarm follows.
+
+    The others never matter again, whatever is published next.
+    """
     parts = _parts(messages)
     return [alarm for alarm in messages if alarm in parts]
 
 
-def _current(messages: Sequence[Alarm]) -> CurrentAlarm:
-    newest, describing, with_causes, acknowledging = _parts(messages)
+def current_alarm(messages: Sequence[Alarm]) -> CurrentAlarm:
+    """The alarm of a fan after these messages, in the order sent."""
+    newest, describing, with_causes, acknowledging, raised, commented = _parts(messages)
     return CurrentAlarm(
         newest,
         message=describing.message if describing else "",
         causes=with_causes.causes if with_causes else (),
         acknowledged_by=acknowledging.operator_name if acknowledging and newest.acknowledged else "",
         message_t_ns=describing.t_ns if describing and describing.transition != Transition.REPUBLISHED else 0,
+        raised=raised,
+        commented=commented,
     )
 
 
-def _parts(messages: Sequence[Alarm]) -> tuple[Alarm, Alarm | None, Alarm | None, Alarm | None]:
-    """The newest message, and of its occurrence the last that describes the fan, the last with causes, and the last
-    that says who acknowledged it."""
+def _parts(messages: Sequence[Alarm]) -> tuple[Alarm, *tuple[Alarm | None, ...]]:
+    """The newest message, and of its occurrence the last that describes the fan, the last with causes, the last that
+    says who acknowledged it, the last that says how far the fan is off, and the last with a comment on it."""
     newest = messages[-1]
     occurrence = [alarm for alarm in messages if alarm.onset_t_ns == newest.onset_t_ns]
 
@@ -158,7 +148,15 @@ def _parts(messages: Sequence[Alarm]) -> tuple[Alarm, Alarm | None, Alarm | None
         last(lambda alarm: alarm.transition in _DESCRIBES_THE_FAN),
         last(lambda alarm: alarm.causes),
         last(lambda alarm: alarm.acknowledged and alarm.transition in _NAMES_WHO_ACKNOWLEDGED),
+        last(lambda alarm: alarm.transition in _SAYS_HOW_FAR),
+        last(_is_commented),
     )
+
+
+def _is_commented(alarm: Alarm) -> bool:
+    """Whether an operator has commented on this occurrence, not on an earlier one."""
+    is_of_earlier = alarm.marked_onset_t_ns not in (0, alarm.onset_t_ns)
+    return bool(alarm.comment) and alarm.transition != Transition.REFUSED and not is_of_earlier
 
 
 def until(alarm: Alarm) -> str:

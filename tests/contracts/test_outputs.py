@@ -26,9 +26,9 @@ SHELVED = {"shelved_until_t_ns": NOW_NS + 10**13}
 _numbers = itertools.count(100)
 
 
-def of(fan: int, transition: Transition = Transition.RAISED, *, earlier: int = 0, **more: object) -> Alarm:
-    """The next transition. earlier: how many numbers before that it was sent."""
-    return replace(alarm(transition, next(_numbers) - earlier, **more), fan=fan)
+def of(fan: int, transition: Transition = Transition.RAISED, **more: object) -> Alarm:
+    """The next transition."""
+    return replace(alarm(transition, next(_numbers), **more), fan=fan)
 
 
 def shows(output: Output, fan: int, expected: tuple[bool, bool] | None) -> None:
@@ -90,7 +90,8 @@ def test_an_alarm_is_shown_acknowledged_silenced_and_gone_whoever_asked(output: 
 
 
 def test_a_late_message_ends_no_alarm(output: Output) -> None:
-    output.feed(score(10.0, state=FanState.ALARM), of(2), of(2, Transition.CLEARED, earlier=2, active=False))
+    late = of(2, Transition.CLEARED, active=False)
+    output.feed(score(10.0, state=FanState.ALARM), of(2), late)
     output.feed(score(11.0, state=FanState.STOPPED))
     shows(output, 2, (False, False))
 

@@ -34,7 +34,7 @@ from fantwin.pipeline.outputs.rerun.viewer_core import ViewerCore
 from fantwin.pipeline.plugins import StageRow
 from fantwin.pipeline.prediction.twin_file import TwinFile
 from fantwin.pipeline.runtime.stage import Context, Core, Stage, StageConfig, load_stage
-from fantwin.pipeline.site.alarm_store import AlarmStore
+from fantwin.pipeline.site.alarm_history import AlarmHistory
 from fantwin.pipeline.site.fleet import Fan
 from fantwin.pipeline.site.request_desk import RequestDesk
 from fantwin.pipeline.site.site_model import SiteModel
@@ -105,13 +105,13 @@ CORES: dict[str, Callable[[TwinFile], Core]] = {
     "twin_integrator": lambda twin: TwinIntegratorCore(twin, LOOSE, 0),
     "scorer": lambda _twin: core_of(FANS, "rpm"),
     "scorer of low limits": lambda _twin: core_of(FANS, "rpm", **OFTEN),
-    "viewer": lambda _twin: ViewerCore(TRAYS, FakeSink()),
-    "viewer of a fleet": lambda _twin: ViewerCore(TRAYS, FakeSink(), fleet()),
+    "viewer": lambda _twin: ViewerCore("site", TRAYS, FakeSink()),
+    "viewer of a fleet": lambda _twin: ViewerCore("site", TRAYS, FakeSink(), fleet()),
 }
 
 
 def fleet() -> FleetView:
-    return FleetView("site", TRAYS, PlotPlaces(FleetPlots([Fan("tray1", 0)], 1), 0), 2_000_000_000)
+    return FleetView(TRAYS, PlotPlaces(FleetPlots([Fan("tray1", 0)], 1), 0), 2_000_000_000)
 
 
 def all_valid(message: Message) -> Message:
@@ -223,8 +223,8 @@ def test_the_mqtt_stage_survives_any_message_and_request_and_publishes_only_json
     received = [Received(f"fantwin/site/tray1/{fan}/request", payload, is_retained=False) for fan, payload in asked]
     link = FakeLink(received)
     with TemporaryDirectory() as folder:
-        store = AlarmStore(Path(folder) / "alarms.sqlite")
-        model = SiteModel("site", TRAYS, store, keeps_curves=False)
+        store = AlarmHistory(Path(folder) / "alarms.sqlite")
+        model = SiteModel("site", TRAYS, store)
         context = Context("site", TRAYS, config, Path(folder), Path(folder), 0)
         core = MqttCore(context, model, store, RequestDesk("p"), Topics("fantwin", "site"), link)
         core.tick(-20_000_000_000)

@@ -16,10 +16,11 @@ from fantwin.pipeline.outputs.notify.config import NotifierConfig
 from fantwin.pipeline.outputs.notify.outbox import Outbox
 from fantwin.pipeline.outputs.notify.sending import MAY_BE_REPEATED
 from fantwin.pipeline.runtime.stage import StageError
+from fantwin.pipeline.site.alarm_history import FILE, AlarmHistory
 from fantwin.schemas.enums import Severity, Transition
 from fantwin.schemas.messages import Alarm
 from fantwin.schemas.units import NS_PER_S
-from fantwin.stages.notifier import OUTBOX, STOPPED_WITHIN_S, NotifierCore
+from fantwin.stages.notifier import STOPPED_WITHIN_S, NotifierCore
 from tests.support.message_receivers import ALERTMANAGER, HttpReceiver, MailServer, RunningAlertmanager
 from tests.support.notified_alarms import START_NS, alarm, cleared, notifier_core, secret
 from tests.support.running_chain import eventually
@@ -112,7 +113,7 @@ def test_a_target_that_hangs_holds_up_neither_the_core_nor_its_end(tmp_path, mai
         assert time.monotonic() - began_s < 1
         notifier.core.close()
         assert time.monotonic() - began_s < STOPPED_WITHIN_S + 1
-    file = sqlite3.connect(tmp_path / OUTBOX)
+    file = sqlite3.connect(tmp_path / FILE)
     left = file.execute("SELECT under_way FROM message WHERE target = 'hangs' ORDER BY number").fetchall()
     file.close()
     assert left == [(1,), (0,)], "it is sent again after a restart"
@@ -167,6 +168,21 @@ def test_a_full_disk_is_said_nothing_is_forgotten_and_what_has_arrived_is_not_se
         notifier.hear(alarm(fan=1))
     eventually(lambda: len(mail.mails) >= 2 and not notifier.core.problem(), "the next one arrives")
     assert mail.subjects() == ["WARNING, fan 0 of tray1 (hall)", "WARNING, fan 1 of tray1 (hall)"]
+
+
+def test_what_another_output_kept_while_the_notifier_was_away_is_sent_and_forged_messages_hide_nothing(
+    tmp_path, mail, started
+):
+    notifier = started(tmp_path, [mail_target(tmp_path, mail)])
+    notifier.hear(alarm(fan=0, sequence=10))
+    notifier.core.close()
+    page = AlarmHistory(tmp_path / FILE)
+    page.add(alarm(fan=1, sequence=11))
+    page.close()
+    notifier.start()
+    notifier.hear(*(cleared(3, sequence=number, onset_s=-9.0) for number in range(12, 32)), alarm(fan=3, sequence=12))
+    eventually(lambda: len(mail.mails) >= 3, "all three are sent")
+    assert mail.subjects() == [f"WARNING, fan {fan} of tray1 (hall)" for fan in (0, 1, 3)]
 
 
 def test_a_fan_that_is_taken_out_of_the_configuration_is_not_spoken_of_any_more(tmp_path, mail, started):

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from fantwin.pipeline.site.alarm_book import AlarmBook
 from fantwin.pipeline.tray_scoring.snapshot_store import SnapshotStore
 from fantwin.schemas.blocks import cut
 from fantwin.schemas.enums import Action, FanState, Transition
@@ -19,7 +20,7 @@ from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Alarm, Score, ScorerSnapshot
 from fantwin.schemas.units import NS_PER_S
 from fantwin.scoring.alarms.alarm_flags import is_listed, is_retained, is_silenced
-from fantwin.scoring.alarms.current_alarms import CurrentAlarm, current_alarms
+from fantwin.scoring.alarms.current_alarms import CurrentAlarm
 from fantwin.scoring.model.decision import Decision
 from fantwin.stages.scorer import ScorerCore
 from tests.stages.test_scorer import eventful_prediction
@@ -215,11 +216,11 @@ def standing_of(emitted: Sequence[Any]) -> list[CurrentAlarm]:
     """How the alarms stand for who has followed them from `raised` on."""
     former = raised().restore(snapshot_of(raised()))
     messages = [*(("former", each) for each in former), *(("successor", each) for each in emitted)]
-    return current_alarms(
-        replace(message, header=Header(producer, number, "tray1"))
-        for number, (producer, message) in enumerate(messages)
-        if isinstance(message, Alarm)
-    )
+    book = AlarmBook()
+    for number, (producer, message) in enumerate(messages):
+        if isinstance(message, Alarm):
+            book.add(replace(message, header=Header(producer, number, "tray1")))
+    return book.all()
 
 
 def test_from_a_snapshot_of_another_twin_only_operator_settings_are_restored() -> None:

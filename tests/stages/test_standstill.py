@@ -14,7 +14,7 @@ from fantwin.schemas.enums import FanState, InvalidReason, Transition
 from fantwin.schemas.messages import Alarm, Grid, Prediction, Score
 from fantwin.schemas.reference_conditions import ReferenceConditions
 from fantwin.schemas.standstill import Standstill
-from fantwin.scoring.alarms.current_alarms import current_alarms
+from fantwin.scoring.alarms.current_alarms import current_alarm
 from fantwin.stages.scorer import ScorerCore
 from tests.stages.test_twin_integrator import core_of, physical_twin, run_freely
 
@@ -129,7 +129,7 @@ def test_a_blocked_fan_at_its_minimum_is_an_alarm_that_a_stop_does_not_end() -> 
     assert found.times(Transition.DATA_LOST) == [], "it is judged by whether it stands"
     (cleared_s,) = found.times(Transition.CLEARED)
     assert cleared_s > 40.0, "only a fan that turns again ends it"
-    (alarm,) = current_alarms(found.alarms)
+    alarm = current_alarm(found.alarms)
     assert alarm.causes[0].cause == "blocked"
     other = seen(command, speed, block=64)
     np.testing.assert_array_equal(found.scores, other.scores)

@@ -14,7 +14,6 @@ import pytest
 
 from fantwin.pipeline.config.models import TrayConfig
 from fantwin.pipeline.outputs.rerun.alarm_log import LogLine
-from fantwin.pipeline.outputs.rerun.fleet_view import Overview
 from fantwin.pipeline.outputs.rerun.viewer_core import (
     FLUSH_PERIOD_NS,
     PAGE_PERIOD_NS,
@@ -49,7 +48,6 @@ class FakeSink:
     lines: list[LogLine] = field(default_factory=list)
     places: dict[Fan, int] = field(default_factory=dict)
     hidden: list[tuple[Fan, int]] = field(default_factory=list)
-    overviews: list[Overview] = field(default_factory=list)
     pages: list[str] = field(default_factory=list)
     wear: list[tuple[str, WearPoints]] = field(default_factory=list)
     tables: list[tuple[int, str]] = field(default_factory=list)
@@ -69,9 +67,6 @@ class FakeSink:
     def hide_fan(self, fan: Fan, t_ns: int) -> None:
         self.hidden.append((fan, t_ns))
         del self.places[fan]
-
-    def draw_overview(self, overview: Overview) -> None:
-        self.overviews.append(overview)
 
     def draw_wear(self, tray: str, points: Sequence[WearPoints]) -> None:
         self.wear += [(tray, each) for each in points]
@@ -105,7 +100,7 @@ class FakeSink:
 
 
 def core_of(sink: FakeSink, fans: int = 3, **tray: Any) -> ViewerCore:
-    return ViewerCore([TrayConfig(name="tray1", fans=fans, **tray)], sink)
+    return ViewerCore("site", [TrayConfig(name="tray1", fans=fans, **tray)], sink)
 
 
 def sent(message: Message) -> Message | Envelope:

@@ -102,11 +102,14 @@ def record(chain: Chain) -> None:
     with chain.watcher() as watcher:
         eventually(lambda: published(view_of(watcher, "scorer")) > 100, "scores flow")
         chain.kill(watcher, "twin_integrator")
-        eventually(lambda: any(alarm.fan == FAULTY and alarm.active for alarm in watcher.alarms()), "it is raised")
+        eventually(
+            lambda: any(each.newest.fan == FAULTY and each.newest.active for each in watcher.current_alarms()),
+            "it is raised",
+        )
         run(*chain.words("alarms"), "ack", TRAY, FAULTY, "--operator", "Ann")
         run(*chain.words("alarms"), "shelve", TRAY, 1 - FAULTY, "--for", "1m", "--operator", "Bob")
         chain.kill(watcher, "scorer")
-        eventually(lambda: not any(alarm.active for alarm in watcher.alarms()), "it is cleared")
+        eventually(lambda: not any(each.newest.active for each in watcher.current_alarms()), "it is cleared")
     assert tray.end() == 0
     assert up.end() == 0, up.output()
 

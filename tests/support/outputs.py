@@ -194,7 +194,7 @@ class ViewerOutput:
 
     def __init__(self, _folder: Path) -> None:
         self._sink = FakeSink()
-        self._core = ViewerCore([TrayConfig(name=TRAY, fans=FANS, speed_unit="rpm")], self._sink)
+        self._core = ViewerCore(SITE, [TrayConfig(name=TRAY, fans=FANS, speed_unit="rpm")], self._sink)
         self._ticks = 0
 
     def feed(self, *messages: Message) -> None:

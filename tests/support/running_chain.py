@@ -16,9 +16,10 @@ from pathlib import Path
 from typing import Any
 
 from fantwin.pipeline.bus.session import Bus
-from fantwin.pipeline.config.models import BusConfig
+from fantwin.pipeline.config.models import BusConfig, TrayConfig
 from fantwin.pipeline.selftest.scratch_site import FANTWIN
-from fantwin.pipeline.site.site_watcher import SiteWatcher, StageView
+from fantwin.pipeline.site.site_state import StageView
+from fantwin.pipeline.site.site_watcher import SiteWatcher
 
 DEMO = Path(__file__).parents[2] / "pipeline" / "demo"
 SITE, TRAY, FANS = "demo", "tray1", 8
@@ -155,7 +156,7 @@ class Chain:
     @contextmanager
     def watcher(self) -> Iterator[SiteWatcher]:
         with Bus(BusConfig(endpoint=self.endpoint), listens=False) as bus:
-            yield SiteWatcher(bus, SITE)
+            yield SiteWatcher(bus, SITE, trays=[TrayConfig(name=TRAY, fans=FANS)])
 
     def process_ids(self) -> dict[str, int]:
         """The ids of the processes that `up` last reported as started, by label."""

@@ -54,7 +54,7 @@ def run(chain: Chain) -> None:
     chain.start_tray("--profile", "manual", "--fault", f"inlet:fan={FAULTY},start=12,size=2.5")
     up = chain.start_up()
     with join_bus(config, threading.Event(), listens=False) as bus:
-        watcher = SiteWatcher(bus, config.site)
+        watcher = SiteWatcher(bus, config.site, trays=config.trays)
         eventually(lambda: received(view_of(watcher, "recorder")) > 50, "the recorder has messages")
         chain.kill(watcher, "scorer")
         (alarm,) = eventually(watcher.current_alarms, "an alarm stands")

@@ -23,8 +23,8 @@ from fantwin.pipeline.recordings.reading import read_metadata, read_recording
 from fantwin.pipeline.recordings.run_recordings import recorded_files
 from fantwin.pipeline.replay.offline.alarm_episodes import Episode, episodes
 from fantwin.pipeline.replay.offline.marked_alarms import alarms_in
+from fantwin.pipeline.site.alarm_history import FILE, AlarmHistory
 from fantwin.pipeline.site.alarm_rates import AlarmRates
-from fantwin.pipeline.site.alarm_store import HISTORY
 from fantwin.schemas.codec import CodecError, decode_columns
 from fantwin.schemas.enums import Feedback
 from fantwin.schemas.messages import Alarm, ModelCard, Score
@@ -190,7 +190,7 @@ def _kept_by_gateway(config: Config) -> _Past:
     Raises:
         UserError: there is none, or one cannot be read.
     """
-    files = [config.run_folder / own_file(shard.name, Path(HISTORY)) for shard in shards_of("gateway", config)]
+    files = [config.run_folder / own_file(shard.name, FILE) for shard in shards_of("gateway", config)]
     present = [file for file in files if file.exists()]
     if not present:
         raise UserError(
@@ -201,9 +201,9 @@ def _kept_by_gateway(config: Config) -> _Past:
     rates: dict[str, ObservedRate] = {}
     for file in present:
         alarms += [alarm for _, alarm in alarms_in(file)]
-        kept = AlarmRates(file, read_only=True)
+        kept = AlarmHistory(file, read_only=True)
         try:
-            rates |= kept.observed()
+            rates |= AlarmRates(kept).observed()
         finally:
             kept.close()
     return _Past(episodes(alarms), rates)

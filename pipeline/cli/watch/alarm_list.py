@@ -6,7 +6,7 @@ import json
 import queue
 import threading
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import replace
 from datetime import datetime
 
@@ -19,18 +19,15 @@ from fantwin.pipeline.cli.watch.live_stages import wait_for_stages
 from fantwin.pipeline.config.models import Config
 from fantwin.pipeline.config.roles import roles_of
 from fantwin.pipeline.config.shards import process_list
-from fantwin.pipeline.site.judged_fans import JudgedChanges, JudgedFans, Unjudged, as_judged
-from fantwin.pipeline.site.one_line import readable_alarm
-from fantwin.pipeline.site.site_state import site_states
+from fantwin.pipeline.site.fleet import Fan
+from fantwin.pipeline.site.judging import JudgedChanges, Unjudged, as_judged, at_rest, unjudged
 from fantwin.pipeline.site.site_watcher import SiteWatcher
 from fantwin.pipeline.site.stage_notes import note_lines
-from fantwin.schemas.codec import CodecError, decode
 from fantwin.schemas.enums import Severity
-from fantwin.schemas.messages import Alarm, Diagnosis, newest_t_ns
-from fantwin.schemas.topics import tray_key
+from fantwin.schemas.messages import Alarm, Diagnosis
 from fantwin.schemas.units import NS_PER_S
 from fantwin.scoring.alarms.alarm_flags import is_listed, is_presented
-from fantwin.scoring.alarms.current_alarms import CurrentAlarm, clock, current_alarms
+from fantwin.scoring.alarms.current_alarms import CurrentAlarm, clock, current_alarm
 from fantwin.scoring.diagnosis.shown_causes import CANNOT_TELL, CAUSES, MIN_PROBABILITY, with_share
 from fantwin.scoring.wear.slow_change import is_of_slow_change
 
@@ -49,59 +46,49 @@ def show_list(
         UserError: no scorer is alive.
         typer.Exit: 1, a fan is not judged.
     """
-    key = tray_key(config.site, "*", "alarm")
     news: queue.Queue[Alarm] = queue.Queue()
-    bus.subscribe(key, lambda its_key, payload: _decoded(config.site, its_key, payload, news.put))
-    watcher = SiteWatcher(bus, config.site, roles_of(config))
-    judged = JudgedFans(bus, config.site, config.trays, watcher)
+    trays, roles = config.trays, roles_of(config)
+    watcher = SiteWatcher(bus, config.site, roles, trays, has_scores=True, hear_alarm=news.put)
     wait_for_stages(bus, watcher, config, stop)
-    known: list[Alarm] = []
-    for its_key, payload in bus.recover(key):
-        _decoded(config.site, its_key, payload, known.append)
-    known = [alarm for alarm in known if _counts(watcher, config.site, alarm)]
-    found = [each for each in current_alarms(sorted(known, key=newest_t_ns)) if show_all or is_listed(each.newest)]
+    watcher.ask_for_past_alarms()
     console = Console(soft_wrap=True, highlight=False)
-    unjudged = _wait_until_judged(watcher, judged, config, stop)
-    found = as_judged(found, unjudged)
+    lacking = _wait_until_judged(watcher, config, stop)
+    for _ in range(news.qsize()):
+        news.get()
+    found = [each for each in watcher.current_alarms() if show_all or is_listed(each.newest)]
+    found = as_judged(found, lacking)
     slow = _slow_changes(watcher)
     if json_output:
-        shown = {"alarms": [each.as_json() for each in found], "not_judged": [each.as_json() for each in unjudged]}
-        shown |= {"at_rest": [each.as_json() for each in judged.at_rest()], "slow_changes": slow}
+        shown = {"alarms": [each.as_json() for each in found], "not_judged": [each.as_json() for each in lacking]}
+        shown |= {"at_rest": [each.as_json() for each in at_rest(watcher.model)], "slow_changes": slow}
         typer.echo(json.dumps(shown))
     else:
-        now = judged.words_now()
-        for each in found:
-            console.print(alarm_lines(each, now.get((each.newest.header.tray, each.newest.fan), "")))
-        lines = [Text(line, style="yellow") for line in slow] + [Text(each.line(), style="red") for each in unjudged]
+        words_now = watcher.model.words_now([Fan(each.newest.header.tray, each.newest.fan) for each in found])
+        for each, now in zip(found, words_now, strict=True):
+            console.print(alarm_lines(each, now))
+        lines = [Text(line, style="yellow") for line in slow] + [Text(each.line(), style="red") for each in lacking]
         for line in lines:
             console.print(line)
-        if not found and not unjudged:
+        if not found and not lacking:
             console.print(Text("no alarms", style="green"))
     if watch:
-        changes = JudgedChanges(unjudged)
-
-        def judged_changes() -> list[str]:
-            return changes.lines(judged.unjudged(site_states(watcher, process_list(config))))
-
-        listed = {_identity(alarm) for alarm in known}
-        _watch(news, listed, watcher, config.site, judged_changes, stop, console, json_output=json_output)
-    elif unjudged:
+        _watch(news, watcher, config, JudgedChanges(lacking), stop, console, json_output=json_output)
+    elif lacking:
         raise typer.Exit(1)
 
 
 def _watch(
     news: queue.Queue[Alarm],
-    listed: set[tuple[str, int, str]],
     watcher: SiteWatcher,
-    site: str,
-    judged_changes: Callable[[], list[str]],
+    config: Config,
+    changes: JudgedChanges,
     stop: threading.Event,
     console: Console,
     *,
     json_output: bool,
 ) -> None:
-    """Print each transition that is not listed already, which fans are judged now and were not, or the other way round,
-    and when the last scorer goes or one is back."""
+    """Print each transition, which fans are judged now and were not, or the other way round, and when the last scorer
+    goes or one is back."""
     has_scorer = True
     while not stop.is_set():
         try:
@@ -110,20 +97,15 @@ def _watch(
             if has_scorer != any(view.alive and view.health.stage == "scorer" for view in watcher.stages()):
                 has_scorer = not has_scorer
                 said = "a scorer is back" if has_scorer else "no scorer is alive: alarms are unknown until one is back"
-                typer.echo(f"{datetime.now():%H:%M:%S}  site {site!r}: {said}", err=True)
-            for line in judged_changes() if has_scorer else ():
+                typer.echo(f"{datetime.now():%H:%M:%S}  site {config.site!r}: {said}", err=True)
+            lacking = unjudged(watcher.model, watcher.states(process_list(config))) if has_scorer else []
+            for line in changes.lines(lacking) if has_scorer else ():
                 typer.echo(f"{datetime.now():%H:%M:%S}  {line}", err=True)
             continue
-        if _identity(alarm) in listed or not _counts(watcher, site, alarm):
-            continue
         if json_output:
-            typer.echo(json.dumps({"transition": word(alarm), **alone(alarm).as_json()}))
+            typer.echo(json.dumps({"transition": word(alarm), **current_alarm([alarm]).as_json()}))
         else:
             console.print(_transition_line(alarm))
-
-
-def _identity(alarm: Alarm) -> tuple[str, int, str]:
-    return alarm.header.producer, alarm.header.sequence, alarm.header.tray
 
 
 def _slow_changes(watcher: SiteWatcher) -> list[str]:
@@ -135,37 +117,13 @@ def _slow_changes(watcher: SiteWatcher) -> list[str]:
     )
 
 
-def _wait_until_judged(
-    watcher: SiteWatcher, judged: JudgedFans, config: Config, stop: threading.Event
-) -> list[Unjudged]:
+def _wait_until_judged(watcher: SiteWatcher, config: Config, stop: threading.Event) -> list[Unjudged]:
     """The fans that are not judged now; waits for scores, which come in blocks."""
     until_s = time.monotonic() + _SCORES_S
     while True:
-        unjudged = judged.unjudged(site_states(watcher, process_list(config)))
-        if not unjudged or time.monotonic() > until_s or stop.wait(_POLL_S):
-            return unjudged
-
-
-def _decoded(site: str, key: str, payload: bytes, then: Callable[[Alarm], None]) -> None:
-    """Unreadable messages, and those of another tray than their key says, are skipped; the stages count them."""
-    try:
-        alarm = decode(Alarm, payload)
-    except CodecError:
-        return
-    assert isinstance(alarm, Alarm)
-    if key == tray_key(site, alarm.header.tray, "alarm"):
-        then(readable_alarm(alarm))
-
-
-def _counts(watcher: SiteWatcher, site: str, alarm: Alarm) -> bool:
-    """Whether an alarm is one of the site, not of a stranger."""
-    return watcher.counts(tray_key(site, alarm.header.tray, "alarm"), alarm.header.producer)
-
-
-def alone(alarm: Alarm) -> CurrentAlarm:
-    """The alarm as this message alone describes it."""
-    by = alarm.operator_name if alarm.acknowledged else ""
-    return CurrentAlarm(alarm, alarm.message, alarm.causes, by, alarm.t_ns)
+        lacking = unjudged(watcher.model, watcher.states(process_list(config)))
+        if not lacking or time.monotonic() > until_s or stop.wait(_POLL_S):
+            return lacking
 
 
 def word(alarm: Alarm) -> str:

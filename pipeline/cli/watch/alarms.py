@@ -18,7 +18,7 @@ import typer
 from fantwin.pipeline.bus.session import join_bus
 from fantwin.pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
 from fantwin.pipeline.cli.watch.alarm_history import show_history
-from fantwin.pipeline.cli.watch.alarm_list import alone, show_list, word
+from fantwin.pipeline.cli.watch.alarm_list import show_list, word
 from fantwin.pipeline.cli.watch.live_stages import wait_for_stages
 from fantwin.pipeline.cli.watch.request import ask
 from fantwin.pipeline.config.loading import load_config
@@ -31,7 +31,7 @@ from fantwin.pipeline.site.site_watcher import SiteWatcher
 from fantwin.schemas.enums import Action, Transition
 from fantwin.schemas.messages import Alarm, Request
 from fantwin.schemas.units import NS_PER_S
-from fantwin.scoring.alarms.current_alarms import until
+from fantwin.scoring.alarms.current_alarms import current_alarm, until
 from fantwin.scoring.alarms.fan_condition import GIVES_FEEDBACK
 
 _SECONDS = {"s": 1, "m": 60, "h": 3600, "d": 86400}
@@ -202,7 +202,7 @@ def _report(asked: OperatorAction, tray: str, answers: list[Alarm], json_output:
     refused = [alarm for alarm in answers if alarm.transition == Transition.REFUSED]
     if json_output:
         rows = [
-            {"fan": alarm.fan, "transition": word(alarm), "message": alarm.message, **alone(alarm).as_json()}
+            {"fan": alarm.fan, "transition": word(alarm), "message": alarm.message, **current_alarm([alarm]).as_json()}
             | {"marked_onset_t_ns": alarm.marked_onset_t_ns}
             for alarm in answers
         ]

@@ -11,7 +11,6 @@ from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.cli.watch.status import stage_table
 from fantwin.pipeline.config.models import Config
 from fantwin.pipeline.config.roles import roles_of
-from fantwin.pipeline.site.judged_fans import JudgedFans
 from fantwin.pipeline.site.site_watcher import SiteWatcher
 from fantwin.schemas.codec import decode
 from fantwin.schemas.enums import FanState, InvalidReason
@@ -29,8 +28,7 @@ class DemoScreen:
     def __init__(self, config: Config, bus: Bus) -> None:
         self._config = config
         self._tray = config.trays[0]
-        self._watcher = SiteWatcher(bus, config.site, roles_of(config))
-        self._judged = JudgedFans(bus, config.site, config.trays, self._watcher)
+        self._watcher = SiteWatcher(bus, config.site, roles_of(config), config.trays, has_scores=True)
         self._score: Score | None = None
         bus.subscribe(tray_key(config.site, self._tray.name, "score"), self._on_score)
 
@@ -53,7 +51,7 @@ class DemoScreen:
     def render(self) -> Group:
         """Stages, alarms and fans, for a terminal."""
         starting = Text("starting the stages", style="dim")
-        stages = stage_table(self._watcher, self._config, self._judged) if self._watcher.stages() else starting
+        stages = stage_table(self._watcher, self._config) if self._watcher.stages() else starting
         return Group(stages, self._fan_table())
 
     def line(self) -> str:

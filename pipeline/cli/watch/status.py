@@ -6,7 +6,7 @@ import json
 import sys
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Annotated
 
 import typer
@@ -25,10 +25,12 @@ from fantwin.pipeline.config.shards import StageProcess, chosen_shard, process_l
 from fantwin.pipeline.errors import UsageError, UserError
 from fantwin.pipeline.launch.this_host import load_for_any_host
 from fantwin.pipeline.runtime.signals import stop_on_signals
-from fantwin.pipeline.site.judged_fans import JudgedFans, Unjudged, as_judged
+from fantwin.pipeline.site.fleet import Fan
+from fantwin.pipeline.site.judging import Unjudged, as_judged, at_rest, unjudged
 from fantwin.pipeline.site.refused_input import refused_lines
-from fantwin.pipeline.site.site_state import AT_WORK, StageState, Word, site_states
-from fantwin.pipeline.site.site_watcher import SiteWatcher, StageView
+from fantwin.pipeline.site.site_model import SiteModel
+from fantwin.pipeline.site.site_state import AT_WORK, StageState, StageView, Word
+from fantwin.pipeline.site.site_watcher import SiteWatcher
 from fantwin.pipeline.site.stage_notes import note_lines, notes_as_json
 from fantwin.schemas.enums import Severity
 from fantwin.schemas.streams import LOSS_PREFIX
@@ -84,24 +86,23 @@ def status(
         raise UsageError("--trays and --shard need --stage: which process?")
     with join_bus(settings, listens=False) as bus:
         of_bus = _bus_lines(bus)
-        watcher = SiteWatcher(bus, settings.site, roles_of(settings))
-        judged = JudgedFans(bus, settings.site, settings.trays, watcher)
+        watcher = SiteWatcher(bus, settings.site, roles_of(settings), settings.trays, has_scores=True)
         if once or json_output or not sys.stdout.isatty():
-            _listen(watcher, settings, judged, stop)
+            _listen(watcher, settings, stop)
             watcher.ask_for_past_alarms()
             _require_a_stage(watcher, settings)
             if json_output:
-                typer.echo(json.dumps(as_json(watcher, settings, judged)))
+                typer.echo(json.dumps(as_json(watcher, settings)))
             else:
-                Console().print(stage_table(watcher, settings, judged, of_bus))
+                Console().print(stage_table(watcher, settings, of_bus))
         else:
             watcher.ask_for_past_alarms()
             with Live(console=Console(), refresh_per_second=4) as live:
                 while not stop.wait(0.25):
-                    live.update(stage_table(watcher, settings, judged, of_bus))
+                    live.update(stage_table(watcher, settings, of_bus))
             _require_a_stage(watcher, settings)
-        states = site_states(watcher, process_list(settings))
-        if any(state.is_fault or state.problem for state in states) or unjudged(states, judged):
+        states = watcher.states(process_list(settings))
+        if any(state.is_fault or state.problem for state in states) or not_judged(states, watcher.model):
             raise typer.Exit(1)
         if any(watcher.losses().values()):
             raise typer.Exit(3)
@@ -120,7 +121,7 @@ def _probe(config: Config, process: StageProcess, stop: threading.Event, *, json
         until_s = time.monotonic() + _LISTEN_MAX_S
         while True:
             watcher.ask_for_health(process.stage, process.instance)
-            states = (each for each in site_states(watcher, [process]) if each.label == process.label)
+            states = (each for each in watcher.states([process]) if each.label == process.label)
             state = next(states, None) or StageState(process.label, Word.MISSING, "not seen on the bus", None, True)
             is_at_work = state.word in AT_WORK - {Word.STARTING} and state.view is not None and state.view.alive
             if is_at_work or time.monotonic() > until_s or stop.wait(_POLL_S):
@@ -134,12 +135,12 @@ def _probe(config: Config, process: StageProcess, stop: threading.Event, *, json
         raise typer.Exit(1)
 
 
-def _listen(watcher: SiteWatcher, config: Config, judged: JudgedFans, stop: threading.Event) -> None:
+def _listen(watcher: SiteWatcher, config: Config, stop: threading.Event) -> None:
     """Long enough for rates; longer as long as something seems to be missing, which may not be discovered yet."""
     began_s = time.monotonic()
     while not stop.wait(0.1) and time.monotonic() < began_s + _LISTEN_MAX_S:
-        states = site_states(watcher, process_list(config))
-        is_complete = not any(state.is_fault for state in states) and not unjudged(states, judged)
+        states = watcher.states(process_list(config))
+        is_complete = not any(state.is_fault for state in states) and not not_judged(states, watcher.model)
         if is_complete and time.monotonic() > began_s + _LISTEN_S:
             return
 
@@ -162,14 +163,14 @@ def _bus_lines(bus: Bus) -> list[Text]:
     return [line, *(Text(each, style="red") for each in [bus.certificate_warning()] if each)]
 
 
-def stage_table(watcher: SiteWatcher, config: Config, judged: JudgedFans, of_bus: Sequence[Text] = ()) -> Group:
+def stage_table(watcher: SiteWatcher, config: Config, of_bus: Sequence[Text] = ()) -> Group:
     """The page for people: a row for each stage, then problems, then alarms, then the fans that are not judged.
 
     of_bus: lines on the bus itself.
     """
     table = Table(title="stages", title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
     lost = watcher.losses()
-    states = site_states(watcher, process_list(config))
+    states = watcher.states(process_list(config))
     names_width = max((len(state.label) for state in states), default=0)
     table.add_column("stage", no_wrap=True, min_width=names_width)  # a name that is cut may be any stage's
     table.add_column("state")
@@ -186,19 +187,20 @@ def stage_table(watcher: SiteWatcher, config: Config, judged: JudgedFans, of_bus
             problems.append(Text(f"{state.label}: {state.problem}", style="red"))
     notes = [Text(line) for line in note_lines(state.view.health for state in states if state.view)]
     problems += [Text(line, style="yellow") for line in (*loss_lines(states), *refused_lines(watcher.refused()))]
-    now, lacking = judged.words_now(), unjudged(states, judged)
-    current = as_judged(watcher.current_alarms(), lacking)
-    alarms = [_alarm_line(each, now) for each in current if is_listed(each.newest)]
+    lacking = not_judged(states, watcher.model)
+    current = [each for each in as_judged(watcher.current_alarms(), lacking) if is_listed(each.newest)]
+    words_now = watcher.model.words_now([Fan(each.newest.header.tray, each.newest.fan) for each in current])
+    alarms = [_alarm_line(each, now) for each, now in zip(current, words_now, strict=True)]
     if not _has_scorer(states):
-        not_judged = [Text("no fan is judged: the configuration has no scorer", style="yellow")]
+        missing = [Text("no fan is judged: the configuration has no scorer", style="yellow")]
     elif not any(state.view and state.view.alive and state.view.health.stage == "scorer" for state in states):
-        not_judged = [Text("alarms unknown: no scorer is alive", style="red")]
+        missing = [Text("alarms unknown: no scorer is alive", style="red")]
     else:
-        not_judged = [Text(each.line(), style="red") for each in lacking]
-    at_rest = [Text(each.line(), style="dim") for each in judged.at_rest()]
-    no_alarms = [] if alarms or not_judged else [Text("no alarms", style="green")]
+        missing = [Text(each.line(), style="red") for each in lacking]
+    resting = [Text(each.line(), style="dim") for each in at_rest(watcher.model)]
+    no_alarms = [] if alarms or missing else [Text("no alarms", style="green")]
     return Group(
-        *([table] if watcher.stages() else []), *of_bus, *notes, *problems, *alarms, *not_judged, *at_rest, *no_alarms
+        *([table] if watcher.stages() else []), *of_bus, *notes, *problems, *alarms, *missing, *resting, *no_alarms
     )
 
 
@@ -207,9 +209,9 @@ def _has_scorer(states: Sequence[StageState]) -> bool:
     return any(state.stage == "scorer" for state in states)
 
 
-def unjudged(states: Sequence[StageState], judged: JudgedFans) -> list[Unjudged]:
+def not_judged(states: Sequence[StageState], model: SiteModel) -> list[Unjudged]:
     """The fans that should be judged and are not."""
-    return judged.unjudged(states) if _has_scorer(states) else []
+    return unjudged(model, states) if _has_scorer(states) else []
 
 
 def loss_lines(states: Sequence[StageState]) -> list[str]:
@@ -240,7 +242,7 @@ def _duration(seconds: float) -> str:
     return next((f"{seconds / size:.0f} {unit}" for unit, size in units if seconds >= 2 * size), f"{seconds:.0f} s")
 
 
-def _alarm_line(current: CurrentAlarm, words_now: Mapping[tuple[str, int], str]) -> Text:
+def _alarm_line(current: CurrentAlarm, now: str) -> Text:
     alarm = current.newest
     style = _STYLES.get(alarm.severity, "bold red") if alarm.active else "green"
     text = Text.assemble(
@@ -248,21 +250,21 @@ def _alarm_line(current: CurrentAlarm, words_now: Mapping[tuple[str, int], str])
         f"  {alarm.header.tray}  fan {alarm.fan}: {', '.join(current.states())}",
     )
     about = current.about()
-    if now := words_now.get((alarm.header.tray, alarm.fan)):
+    if now:
         text.append(f", now {now}")
     text.append("".join(f", {cause}" for cause in most_probable(current.causes)))
     return text.append(f"; {about}") if about else text
 
 
-def as_json(watcher: SiteWatcher, config: Config, judged: JudgedFans) -> dict[str, object]:
+def as_json(watcher: SiteWatcher, config: Config) -> dict[str, object]:
     """The same for machines (`--json`)."""
-    states, lost = site_states(watcher, process_list(config)), watcher.losses()
-    lacking = unjudged(states, judged)
+    states, lost = watcher.states(process_list(config)), watcher.losses()
+    lacking = not_judged(states, watcher.model)
     return {
         "stages": [_state_as_json(state, lost.get(state.label, 0)) for state in states],
         "alarms": [current.as_json() for current in as_judged(watcher.current_alarms(), lacking)],
         "not_judged": [each.as_json() for each in lacking],
-        "at_rest": [each.as_json() for each in judged.at_rest()],
+        "at_rest": [each.as_json() for each in at_rest(watcher.model)],
     }
 
 

@@ -6,11 +6,12 @@ again after a restart, with the same number.
 
 from __future__ import annotations
 
+import sqlite3
 from collections.abc import Sequence
 from contextlib import suppress
 
 from fantwin.pipeline.errors import UserError
-from fantwin.pipeline.site.alarm_store import AlarmStore
+from fantwin.pipeline.site.alarm_history import AlarmHistory
 from fantwin.schemas.messages import Alarm
 
 READER = "mqtt"
@@ -19,20 +20,23 @@ READER = "mqtt"
 class TransitionQueue:
     """lost: how many were dropped because too many waited."""
 
-    def __init__(self, store: AlarmStore, most_waiting: int) -> None:
+    def __init__(self, history: AlarmHistory, most_waiting: int) -> None:
         """Raises:
         UserError: the history cannot be read.
         """
-        self._store = store
+        self._history = history
         self._most_waiting = most_waiting
-        self._done = store.position(READER)
-        """all up to this number have been acknowledged"""
+        self._newest = history.newest_number()
+        position = history.position(READER)
+        self._done = self._newest if position is None else position
+        """all up to this number have been acknowledged; what was there before the first start is not sent"""
         self._sent = self._done
         """the last one that was taken"""
         self._under_way: dict[int, bool] = {}
         """by number, oldest first, whether each has been acknowledged"""
-        self._newest = store.newest_number()
         self.lost = 0
+        if position is None:
+            self._keep_position()
 
     @property
     def waiting(self) -> int:
@@ -41,8 +45,8 @@ class TransitionQueue:
 
     def notice_new(self) -> None:
         """The history has grown."""
-        with suppress(UserError):  # the store says it
-            self._newest = self._store.newest_number()
+        with suppress(UserError):  # the history says it
+            self._newest = self._history.newest_number()
         too_many = self._newest - self._sent - self._most_waiting
         if too_many > 0:
             self.lost += too_many
@@ -54,8 +58,8 @@ class TransitionQueue:
         if self._sent >= self._newest or most <= 0:
             return ()
         try:
-            found = self._store.after(self._sent, most)
-        except UserError:  # the store says it
+            found = self._history.after(self._sent, most)
+        except UserError:  # the history says it
             return ()
         self._under_way |= {number: False for number, _ in found}
         self._sent = found[-1][0] if found else self._newest
@@ -74,4 +78,8 @@ class TransitionQueue:
         done = next(iter(self._under_way)) - 1 if self._under_way else self._sent
         if done != self._done:
             self._done = done
-            self._store.set_position(READER, done)
+            self._keep_position()
+
+    def _keep_position(self) -> None:
+        with suppress(sqlite3.Error):  # after a restart, some are sent twice
+            self._history.set_position(READER, self._done)

@@ -1,19 +1,21 @@
-"""Decides what is to be sent: messages about alarms and the time of the host come in, texts for targets come out.
+"""Decides what is to be sent: transitions of alarms and the time of the host come in, texts for targets come out.
 
-Pure: whoever uses it saves what has changed, together with the texts, and gives it back after a restart.
+Pure: its user saves what has changed, together with the texts, and gives it back after a restart.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
 from fantwin.pipeline.outputs.notify.config import NotifierConfig, TargetConfig
 from fantwin.pipeline.outputs.notify.deciding import Announced, Event, decide, hears_of
-from fantwin.pipeline.outputs.notify.fan_alarm import FanAlarm, FanName, after, heard_at
+from fantwin.pipeline.outputs.notify.fan_alarm import FanAlarm, FanName, fan_alarm
 from fantwin.pipeline.outputs.notify.gathering import Gathered, Happened, is_due, is_held, is_within, next_after
 from fantwin.pipeline.outputs.notify.wording import Place, Text, about_fan, about_many
+from fantwin.pipeline.site.alarm_book import AlarmBook
+from fantwin.pipeline.site.fleet import Fan
 from fantwin.schemas.messages import Alarm
 from fantwin.schemas.units import NS_PER_S
 
@@ -36,7 +38,8 @@ class Saved:
     """All that survives a restart. `is_first`: there was nothing."""
 
     is_first: bool = True
-    alarms: dict[FanName, FanAlarm] = field(default_factory=dict)
+    heard: dict[FanName, tuple[int, int]] = field(default_factory=dict)
+    """by fan: an onset, and when that alarm was first presented, by the clock of the host"""
     announced: dict[tuple[str, FanName], Announced] = field(default_factory=dict)
     """by target and fan"""
     gathered: dict[tuple[str, Basket], Gathered] = field(default_factory=dict)
@@ -50,7 +53,7 @@ class Saved:
 
         return Saved(
             self.is_first,
-            {name: alarm for name, alarm in self.alarms.items() if is_there(name)},
+            {name: heard for name, heard in self.heard.items() if is_there(name)},
             {key: announced for key, announced in self.announced.items() if is_there(key[1])},
             {
                 key: replace(each, fans={name: happened for name, happened in each.fans.items() if is_there(name)})
@@ -72,23 +75,29 @@ class Outgoing:
 class Changes:
     """What is to be saved: names of what has changed in `Saved`, the events that were decided, and their texts."""
 
-    alarms: set[FanName] = field(default_factory=set)
+    heard: set[FanName] = field(default_factory=set)
     announced: set[tuple[str, FanName]] = field(default_factory=set)
     gathered: set[tuple[str, Basket]] = field(default_factory=set)
     events: set[tuple[str, Event]] = field(default_factory=set)
     outgoing: list[Outgoing] = field(default_factory=list)
 
     def __bool__(self) -> bool:
-        return bool(self.alarms or self.announced or self.gathered or self.events or self.outgoing)
+        return bool(self.heard or self.announced or self.gathered or self.events or self.outgoing)
 
 
 class Notifications:
     """Not thread-safe."""
 
     def __init__(
-        self, config: NotifierConfig, place: Place, saved: Saved, was_sent: Callable[[str, Event], bool]
+        self,
+        config: NotifierConfig,
+        place: Place,
+        saved: Saved,
+        was_sent: Callable[[str, Event], bool],
+        past: Iterable[Alarm] = (),
     ) -> None:
-        """was_sent: whether an event was decided before for a target, as saved."""
+        """was_sent: whether an event was decided before for a target, as saved. past: the transitions that were
+        decided on, as far as the alarms of now follow from them."""
         self._config = config
         self._place = place
         self._was_sent = was_sent
@@ -99,8 +108,11 @@ class Notifications:
         self._first_look_ends_ns: int | None = None
         self._is_looking = saved.is_first
         self._times_ns: int | None = None
-        self._open = {name for name, alarm in saved.alarms.items() if alarm.active}
+        self._book = AlarmBook()
+        self._open: set[FanName] = set()
         """fans whose alarm is active: time alone may bring a message about them"""
+        for alarm in past:
+            self._keep(alarm)
 
     @property
     def is_looking(self) -> bool:
@@ -108,14 +120,11 @@ class Notifications:
         return self._is_looking
 
     def add(self, message: Alarm, now_ns: int) -> None:
-        """A message has arrived. now_ns: time of the host."""
-        name = (message.header.tray, message.fan)
-        alarm = after(self.saved.alarms.get(name), message, now_ns)
-        if alarm is None:
-            return
-        self._keep(alarm)
+        """A transition. now_ns: time of the host."""
+        name = self._keep(message)
         if not self._is_looking:
-            self._decide(alarm, now_ns)
+            self._hear(name, now_ns)
+            self._decide(self._alarm(name), now_ns)
 
     def tick(self, now_ns: int) -> None:
         """Time has passed."""
@@ -125,13 +134,13 @@ class Notifications:
         if self._times_ns is None or abs(now_ns - self._times_ns) >= TIMES_PERIOD_NS:
             self._times_ns = now_ns
             for name in sorted(self._open):
-                self._decide(self.saved.alarms[name], now_ns)
+                self._decide(self._alarm(name), now_ns)
         for target in self._targets:
             self._send_due(target, now_ns)
 
     def firing(self, target: TargetConfig) -> list[FanAlarm]:
         """The alarms that an Alertmanager has to have now: active, and not silenced by an operator."""
-        alarms = (self.saved.alarms[name] for name in sorted(self._open))
+        alarms = map(self._alarm, sorted(self._open))
         return [alarm for alarm in alarms if alarm.presented and hears_of(target, alarm)]
 
     def waiting(self) -> Mapping[tuple[str, Basket], int]:
@@ -147,16 +156,30 @@ class Notifications:
             return
         self._is_looking = False
         for name in sorted(self._open):
-            self._keep(heard_at(self.saved.alarms[name], now_ns))
-            self._decide(self.saved.alarms[name], now_ns)
+            self._hear(name, now_ns)
+            self._decide(self._alarm(name), now_ns)
 
-    def _keep(self, alarm: FanAlarm) -> None:
-        self.saved.alarms[alarm.name] = alarm
-        self.changes.alarms.add(alarm.name)
-        if alarm.active:
-            self._open.add(alarm.name)
+    def _keep(self, message: Alarm) -> FanName:
+        newest = self._book.add(message).newest
+        name = (newest.header.tray, newest.fan)
+        if newest.active:
+            self._open.add(name)
         else:
-            self._open.discard(alarm.name)
+            self._open.discard(name)
+        return name
+
+    def _hear(self, name: FanName, now_ns: int) -> None:
+        """Remember when an alarm is presented for the first time."""
+        alarm = self._alarm(name)
+        if alarm.active and alarm.presented and not alarm.first_heard_ns:
+            self.saved.heard[name] = (alarm.onset_t_ns, now_ns)
+            self.changes.heard.add(name)
+
+    def _alarm(self, name: FanName) -> FanAlarm:
+        current = self._book.of(Fan(*name))
+        assert current is not None
+        onset_t_ns, heard_ns = self.saved.heard.get(name, (0, 0))
+        return fan_alarm(current, heard_ns if onset_t_ns == current.newest.onset_t_ns else 0)
 
     def _decide(self, alarm: FanAlarm, now_ns: int) -> None:
         for target in self._targets:
@@ -216,7 +239,8 @@ class Notifications:
 
     def _presented(self, gathered: Gathered) -> list[tuple[FanAlarm, Happened]]:
         """Without the fans that operators have silenced while their message waited."""
-        fans = ((self.saved.alarms[name], happened) for name, happened in gathered.fans.items())
+        known = [(name, happened) for name, happened in gathered.fans.items() if self._book.of(Fan(*name))]
+        fans = ((self._alarm(name), happened) for name, happened in known)
         return [(alarm, happened) for alarm, happened in fans if not alarm.silenced]
 
     def _gathered(self, target: TargetConfig, basket: Basket) -> Gathered:

@@ -1,7 +1,8 @@
-"""What must be sent, and what was decided, in a file of the run folder that survives a kill.
+"""What must be sent, and what was decided, in the file of the history of alarms.
 
-A decision and its message are saved together, or not at all. A message is deleted once its target has taken it. One
-whose delivery was under way when the process was killed is sent again, and says that it may be a repetition.
+Transitions are read from the history. How far that is done, the decisions and their messages are saved together, or not
+at all. A message is deleted once its target has taken it. One whose delivery was under way when the process was killed
+is sent again, and says that it may be a repetition.
 """
 
 from __future__ import annotations
@@ -16,18 +17,19 @@ from pathlib import Path
 
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.outputs.notify.deciding import Announced, Event
-from fantwin.pipeline.outputs.notify.fan_alarm import FanAlarm
 from fantwin.pipeline.outputs.notify.gathering import Gathered
 from fantwin.pipeline.outputs.notify.notifications import Basket, Changes, Saved
 from fantwin.pipeline.outputs.notify.wording import Level, Text
+from fantwin.pipeline.site.alarm_history import AlarmHistory
+from fantwin.schemas.messages import Alarm
 from fantwin.schemas.units import NS_PER_S
 
+READER = "notifier"
 MOST_EVENTS = 200_000
 """of those that were decided, the last are remembered"""
 _SCHEMA = """
-PRAGMA journal_mode = WAL;
-PRAGMA synchronous = FULL;
-CREATE TABLE IF NOT EXISTS alarm (tray TEXT, fan INTEGER, state TEXT NOT NULL, PRIMARY KEY (tray, fan));
+CREATE TABLE IF NOT EXISTS heard (
+    tray TEXT, fan INTEGER, onset_t_ns INTEGER NOT NULL, heard_ns INTEGER NOT NULL, PRIMARY KEY (tray, fan));
 CREATE TABLE IF NOT EXISTS announced (
     target TEXT, tray TEXT, fan INTEGER, state TEXT NOT NULL, PRIMARY KEY (target, tray, fan));
 CREATE TABLE IF NOT EXISTS gathered (target TEXT, basket TEXT, state TEXT NOT NULL, PRIMARY KEY (target, basket));
@@ -68,55 +70,75 @@ class Outbox:
         Raises:
             UserError: it cannot be read or written.
         """
-        self._path = path
         self._lock = threading.Lock()
         self.lost: Counter[str] = Counter()
         """messages lost since the start, by target"""
         self._waiting = 0
         names = tuple(targets)
+        self._history = AlarmHistory(path, schema=_SCHEMA, is_durable=True)
+        self._store = self._history.store
+        self._position = self._history.position(READER)
+        """of the last transition that was read; None: none ever was"""
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            self._file = sqlite3.connect(path, check_same_thread=False, isolation_level=None)
-            self._file.executescript(_SCHEMA)
-            with self._transaction() as file:
-                file.execute("UPDATE message SET under_way = 0, may_be_repeated = 1 WHERE under_way")
+            with self._store.transaction():
+                self._store.write("UPDATE message SET under_way = 0, may_be_repeated = 1 WHERE under_way")
                 known = ", ".join("?" * len(names))
                 self._lose(f"target NOT IN ({known})", names)
                 for table in ("announced", "gathered", "lost", "firing"):
-                    file.execute(f"DELETE FROM {table} WHERE target NOT IN ({known})", names)
-        except (OSError, sqlite3.Error) as error:
+                    self._store.write(f"DELETE FROM {table} WHERE target NOT IN ({known})", names)
+        except sqlite3.Error as error:
             raise UserError(f"{path}: messages cannot be kept there: {error}") from error
 
-    def load(self) -> Saved:
-        """What was saved.
+    def load(self) -> tuple[Saved, Sequence[Alarm]]:
+        """What was saved, and the transitions from which the alarms of then follow.
 
         Raises:
             UserError: it cannot be understood.
         """
+        with self._lock:
+            heard = self._store.read("SELECT tray, fan, onset_t_ns, heard_ns FROM heard")
+            announced = self._store.read("SELECT target, tray, fan, state FROM announced")
+            gathered = self._store.read("SELECT target, basket, state FROM gathered")
+            past = self._history.last_occurrences(self._position) if self._position is not None else ()
+            is_first, self._position = self._position is None, self._position or self._history.newest_number()
         try:
-            with self._lock:
-                alarms = self._file.execute("SELECT state FROM alarm").fetchall()
-                announced = self._file.execute("SELECT target, tray, fan, state FROM announced").fetchall()
-                gathered = self._file.execute("SELECT target, basket, state FROM gathered").fetchall()
-                # the first commit ends the first look; before it there is nothing
-                is_first = not self._file.execute("PRAGMA user_version").fetchone()[0]
-            each = [FanAlarm.from_json(state) for (state,) in alarms]
-            return Saved(
+            saved = Saved(
                 is_first=is_first,
-                alarms={alarm.name: alarm for alarm in each},
+                heard={(tray, fan): (onset_t_ns, heard_ns) for tray, fan, onset_t_ns, heard_ns in heard},
                 announced={(name, (tray, fan)): Announced.from_json(state) for name, tray, fan, state in announced},
                 gathered={(name, Basket(basket)): Gathered.from_json(state) for name, basket, state in gathered},
             )
-        except (sqlite3.Error, ValueError, KeyError, TypeError) as error:
+        except (ValueError, KeyError, TypeError) as error:
             raise UserError(
-                f"{self._path}: cannot be understood ({error}): move it away; alarms that are active now are then sent "
-                "again"
+                f"{self._store.path}: cannot be understood ({error}): move it away; alarms that are active now are "
+                "then sent again"
             ) from error
+        return saved, past
+
+    def hear(self, alarm: Alarm) -> None:
+        """A transition has arrived: into the history."""
+        with self._lock:
+            self._history.add(alarm)
+
+    def news(self, most: int) -> Sequence[Alarm]:
+        """The next transitions that were not read yet, in their order; none if the file cannot be read now."""
+        with self._lock:
+            self._history.save_again()
+            with suppress(UserError):
+                found = self._history.after(self._position or 0, most)
+                self._position = found[-1][0] if found else self._position
+                return [alarm for _, alarm in found]
+        return ()
+
+    @property
+    def problem(self) -> str:
+        """Why transitions cannot be kept or read; empty if they can."""
+        return self._history.problem
 
     def was_sent(self, target: str, event: Event) -> bool:
         """Whether an event was decided before for a target; of a damaged file, where nothing is saved either: no."""
         with self._lock, suppress(sqlite3.Error):
-            found = self._file.execute(
+            found = self._store.write(
                 "SELECT 1 FROM event WHERE target = ? AND tray = ? AND fan = ? AND onset_t_ns = ? AND kind = ?"
                 " AND number = ?",
                 (target, *astuple(event)),
@@ -130,39 +152,40 @@ class Outbox:
         Raises:
             sqlite3.Error: nothing was saved.
         """
-        with self._lock, self._transaction() as file:
-            file.executemany(
-                "INSERT OR REPLACE INTO alarm VALUES (?, ?, ?)",
-                [(*name, saved.alarms[name].to_json()) for name in changes.alarms],
+        file = self._store
+        with self._lock, file.transaction():
+            file.write_many(
+                "INSERT OR REPLACE INTO heard VALUES (?, ?, ?, ?)",
+                [(*name, *saved.heard[name]) for name in changes.heard],
             )
-            file.executemany(
+            file.write_many(
                 "INSERT OR REPLACE INTO announced VALUES (?, ?, ?, ?)",
                 [(target, *fan, saved.announced[target, fan].to_json()) for target, fan in changes.announced],
             )
-            file.executemany(
+            file.write_many(
                 "INSERT OR REPLACE INTO gathered VALUES (?, ?, ?)",
                 [(*key, saved.gathered[key].to_json()) for key in changes.gathered],
             )
-            file.executemany(
+            file.write_many(
                 "INSERT OR IGNORE INTO event VALUES (?, ?, ?, ?, ?, ?)",
                 [(target, *astuple(event)) for target, event in changes.events],
             )
-            file.executemany(
+            file.write_many(
                 "INSERT INTO message (target, made_ns, title, body, level) VALUES (?, ?, ?, ?, ?)",
                 [
                     (each.target, each.made_ns, each.text.title, each.text.body, each.text.level)
                     for each in changes.outgoing
                 ],
             )
-            file.execute("PRAGMA user_version = 1")
-            file.execute("DELETE FROM event WHERE rowid <= (SELECT MAX(rowid) FROM event) - ?", (MOST_EVENTS,))
+            self._history.set_position(READER, self._position or 0)
+            file.write("DELETE FROM event WHERE rowid <= (SELECT MAX(rowid) FROM event) - ?", (MOST_EVENTS,))
             self._lose("made_ns < ?", (now_ns - round(kept_s * NS_PER_S),))
             self._lose("number <= (SELECT number FROM message ORDER BY number DESC LIMIT 1 OFFSET ?)", (most_messages,))
 
     def next_for(self, target: str, after: int = 0) -> Waiting | None:
         """The oldest message of a target, or the first one after another; None: there is none."""
         with self._lock:
-            row = self._file.execute(
+            row = self._store.write(
                 "SELECT number, made_ns, title, body, level, may_be_repeated,"
                 " coalesce((SELECT count FROM lost WHERE target = :target), 0)"
                 " FROM message WHERE target = :target AND number > :after ORDER BY number LIMIT 1",
@@ -176,77 +199,60 @@ class Outbox:
     def begin(self, waiting: Waiting) -> None:
         """Its delivery begins."""
         with self._lock:
-            self._file.execute("UPDATE message SET under_way = 1 WHERE number = ?", (waiting.number,))
+            self._store.write("UPDATE message SET under_way = 1 WHERE number = ?", (waiting.number,))
 
     def delivered(self, target: str, waiting: Waiting) -> None:
         """Its target has taken it."""
-        with self._lock, self._transaction() as file:
-            file.execute("DELETE FROM message WHERE number = ?", (waiting.number,))
-            file.execute("UPDATE lost SET count = count - ? WHERE target = ?", (waiting.lost, target))
+        with self._lock, self._store.transaction():
+            self._store.write("DELETE FROM message WHERE number = ?", (waiting.number,))
+            self._store.write("UPDATE lost SET count = count - ? WHERE target = ?", (waiting.lost, target))
 
     def failed(self, waiting: Waiting, *, is_uncertain: bool) -> None:
         """It is to be delivered again. is_uncertain: its target may have taken it all the same."""
         with self._lock:
-            self._file.execute(
+            self._store.write(
                 "UPDATE message SET under_way = 0, may_be_repeated = may_be_repeated OR ? WHERE number = ?",
                 (is_uncertain, waiting.number),
             )
 
     def refuse(self, target: str, waiting: Waiting) -> None:
         """Its target takes others, but not this one: it is lost."""
-        with self._lock, self._transaction():
+        with self._lock, self._store.transaction():
             self._lose("target = ? AND number = ?", (target, waiting.number))
 
     def count(self) -> int:
         """How many messages wait; once the file is closed or cannot be read, how many did."""
         with self._lock:
             with suppress(sqlite3.Error):
-                self._waiting = self._file.execute("SELECT COUNT(*) FROM message").fetchone()[0]
+                self._waiting = self._store.write("SELECT COUNT(*) FROM message").fetchone()[0]
             return self._waiting
 
     def firing(self, target: str) -> set[FiringKey]:
         """The alerts that an Alertmanager was given and that have not been resolved there."""
         with self._lock:
-            rows = self._file.execute("SELECT tray, fan, severity, onset_t_ns FROM firing WHERE target = ?", (target,))
+            rows = self._store.write("SELECT tray, fan, severity, onset_t_ns FROM firing WHERE target = ?", (target,))
             return set(rows.fetchall())
 
     def set_firing(self, target: str, alerts: Sequence[FiringKey]) -> None:
         """It now has these."""
-        with self._lock, self._transaction() as file:
-            file.execute("DELETE FROM firing WHERE target = ?", (target,))
-            file.executemany("INSERT INTO firing VALUES (?, ?, ?, ?, ?)", [(target, *each) for each in alerts])
+        with self._lock, self._store.transaction():
+            self._store.write("DELETE FROM firing WHERE target = ?", (target,))
+            self._store.write_many("INSERT INTO firing VALUES (?, ?, ?, ?, ?)", [(target, *each) for each in alerts])
 
     def close(self) -> None:
         """Leave a complete file."""
         self.count()
         with self._lock:
-            self._file.close()
-
-    def _transaction(self) -> _Transaction:
-        return _Transaction(self._file)
+            self._history.close()
 
     def _lose(self, condition: str, values: Sequence[object]) -> None:
         """Delete the messages to which this applies, except one that is under way, and count them."""
-        rows = self._file.execute(
+        rows = self._store.write(
             f"DELETE FROM message WHERE NOT under_way AND {condition} RETURNING target", tuple(values)
         ).fetchall()
         counts = Counter(target for (target,) in rows)
         self.lost.update(counts)
-        self._file.executemany(
+        self._store.write_many(
             "INSERT INTO lost VALUES (?, ?) ON CONFLICT (target) DO UPDATE SET count = count + excluded.count",
-            counts.items(),
+            list(counts.items()),
         )
-
-
-class _Transaction:
-    """All that is executed within it happens, or nothing."""
-
-    def __init__(self, file: sqlite3.Connection) -> None:
-        self._file = file
-
-    def __enter__(self) -> sqlite3.Connection:
-        self._file.execute("BEGIN IMMEDIATE")
-        return self._file
-
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        self._file.execute("ROLLBACK" if kind else "COMMIT")

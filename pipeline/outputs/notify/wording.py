@@ -10,9 +10,10 @@ from enum import StrEnum
 from urllib.parse import quote
 
 from fantwin.pipeline.outputs.notify.deciding import Kind
-from fantwin.pipeline.outputs.notify.fan_alarm import FanAlarm, NamedCause
+from fantwin.pipeline.outputs.notify.fan_alarm import FanAlarm
 from fantwin.pipeline.outputs.notify.gathering import Happened, ranges
 from fantwin.schemas.enums import Severity
+from fantwin.schemas.messages import Diagnosis
 from fantwin.schemas.units import NS_PER_S
 from fantwin.scoring.diagnosis.advice import KNOWN_SOON
 from fantwin.scoring.diagnosis.shown_causes import (
@@ -79,7 +80,7 @@ class Place:
         return f"{self.page.rstrip('/')}/#/fan/{quote(alarm.tray, safe='')}/{alarm.fan}" if self.page else ""
 
 
-def cause_line(causes: Sequence[NamedCause]) -> str:
+def cause_line(causes: Sequence[Diagnosis]) -> str:
     """The likely causes with probability and evidence, and other ones that are probable."""
     if not causes:
         return "Cause: unknown"
@@ -169,7 +170,7 @@ def test_text(place: Place, target: str, now_ns: int) -> Text:
     return Text(f"Test ({place.site})", f"{body}\n{place.page}" if place.page else body, Level.INFO)
 
 
-def _with_probability(cause: NamedCause) -> str:
+def _with_probability(cause: Diagnosis) -> str:
     return f"{CAUSES.get(cause.cause, cause.cause)}, {100 * cause.probability:.0f} %"
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import math
-import threading
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -15,7 +14,7 @@ from fantwin.pipeline.site.request_form import LONGEST_SHELVING_S
 from fantwin.schemas.enums import Severity, Transition
 from fantwin.schemas.messages import Alarm
 from fantwin.scoring.alarms.alarm_flags import is_retained, is_silenced
-from fantwin.scoring.alarms.current_alarms import CurrentAlarm
+from fantwin.scoring.alarms.current_alarms import CurrentAlarm, current_alarm
 from fantwin.scoring.alarms.fan_condition import UNTIL_IT_CLEARS_T_NS
 from fantwin.scoring.diagnosis.shown_causes import CANNOT_TELL, likely_causes, likely_evidence
 
@@ -105,9 +104,6 @@ class Condition:
 
     fan: Fan
     current: CurrentAlarm | None = None
-    comment: str = ""
-    commented_t_ns: int = 0
-    commented_by: str = ""
 
     @property
     def retain(self) -> bool:
@@ -124,36 +120,6 @@ class Condition:
         return _fields(self, now_ns)
 
 
-class ConditionBook:
-    """The conditions of all fans. Thread-safe."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._conditions: dict[Fan, Condition] = {}
-
-    def add(self, alarm: Alarm, current: CurrentAlarm) -> Condition:
-        """A message has arrived, and this is the fan's alarm after it; returns its condition now."""
-        fan = Fan(alarm.header.tray, alarm.fan)
-        with self._lock:
-            before = self._conditions.get(fan, Condition(fan))
-            is_of_earlier = alarm.marked_onset_t_ns not in (0, alarm.onset_t_ns)
-            has_comment = bool(alarm.comment) and alarm.transition != Transition.REFUSED and not is_of_earlier
-            said = (alarm.comment, alarm.t_ns, alarm.operator_name) if has_comment else _said(before)
-            self._conditions[fan] = Condition(fan, current, *said)
-            return self._conditions[fan]
-
-    def of(self, fan: Fan) -> Condition:
-        """The condition of a fan."""
-        with self._lock:
-            return self._conditions.get(fan) or Condition(fan)
-
-    def retained(self) -> list[Condition]:
-        """Those that need attention, by tray and fan: what ConditionRefresh sends."""
-        with self._lock:
-            found = [each for each in self._conditions.values() if each.retain]
-        return sorted(found, key=lambda each: each.fan)
-
-
 def event_id(alarm: Alarm) -> bytes:
     """Of the event of a transition: the same in every server, before and after a restart, live and in the history."""
     name = f"{alarm.header.producer}/{alarm.header.tray}/{alarm.fan}/{alarm.header.sequence}"
@@ -163,12 +129,7 @@ def event_id(alarm: Alarm) -> bytes:
 def past_condition(alarm: Alarm) -> Condition:
     """The condition as it was after a transition of the history."""
     fan = Fan(alarm.header.tray, alarm.fan)
-    current = CurrentAlarm(alarm, alarm.message, tuple(alarm.causes), "", alarm.t_ns)
-    return Condition(fan, current, alarm.comment, alarm.t_ns if alarm.comment else 0, alarm.operator_name)
-
-
-def _said(before: Condition) -> tuple[str, int, str]:
-    return before.comment, before.commented_t_ns, before.commented_by
+    return Condition(fan, current_alarm([alarm]))
 
 
 def _last_severity(alarm: Alarm) -> int:
@@ -191,7 +152,7 @@ def _shelving(until_t_ns: int, now_ns: int) -> tuple[str, StandardNode, float]:
 
 def _fields(condition: Condition, now_ns: int) -> dict[str, Any]:
     fan, current = condition.fan, condition.current
-    newest = current.newest if current else None
+    newest, commented = (current.newest, current.commented) if current else (None, None)
     shelving, shelving_node, unshelve_ms = _shelving(newest.shelved_until_t_ns if newest else 0, now_ns)
     active, acked = bool(newest and newest.active), not newest or newest.acknowledged
     confirmed = not newest or newest.confirmed
@@ -220,9 +181,9 @@ def _fields(condition: Condition, now_ns: int) -> dict[str, Any]:
         "Quality/SourceTimestamp": at,
         "LastSeverity": _last_severity(newest) if newest else 0,
         "LastSeverity/SourceTimestamp": at,
-        "Comment": condition.comment,
-        "Comment/SourceTimestamp": Time(condition.commented_t_ns),
-        "ClientUserId": (newest.operator_name if newest else "") or condition.commented_by,
+        "Comment": commented.comment if commented else "",
+        "Comment/SourceTimestamp": Time(commented.t_ns if commented else 0),
+        "ClientUserId": (newest.operator_name if newest else "") or (commented.operator_name if commented else ""),
         "AckedState": "Acknowledged" if acked else "Unacknowledged",
         "AckedState/Id": acked,
         "ConfirmedState": "Confirmed" if confirmed else "Unconfirmed",

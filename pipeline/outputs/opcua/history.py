@@ -25,7 +25,7 @@ MOST_EVENTS = 10_000
 """of one call; the client goes on from where it ended"""
 
 
-class AlarmHistory(HistoryStorageInterface):
+class EventHistory(HistoryStorageInterface):
     """Of the server and the site's folder: all alarms; of a tray or a fan: its own."""
 
     def __init__(self, model: SiteModel, namespace: int) -> None:

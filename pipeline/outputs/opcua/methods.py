@@ -14,7 +14,7 @@ from typing import Any
 
 from asyncua import Server, ua
 
-from fantwin.pipeline.outputs.opcua.conditions import ConditionBook, event_id
+from fantwin.pipeline.outputs.opcua.conditions import Condition, event_id
 from fantwin.pipeline.outputs.opcua.events import EventDelivery
 from fantwin.pipeline.outputs.opcua.identifiers import ALARM, COMMISSION, SHELVING_STATE
 from fantwin.pipeline.outputs.opcua.requests import (
@@ -46,10 +46,8 @@ _SEARCHED = 200
 class Methods:
     """Of one server."""
 
-    def __init__(
-        self, model: SiteModel, book: ConditionBook, desk: RequestDesk, nodes: SiteNodes, delivery: EventDelivery
-    ) -> None:
-        self._model, self._book, self._desk = model, book, desk
+    def __init__(self, model: SiteModel, desk: RequestDesk, nodes: SiteNodes, delivery: EventDelivery) -> None:
+        self._model, self._desk = model, desk
         self._nodes, self._delivery = nodes, delivery
 
     def bind(self, server: Server, namespace: int) -> None:
@@ -108,7 +106,7 @@ class Methods:
 
     def _is_of_occurrence(self, fan: Fan, wanted: Any) -> bool:
         """Whether an event is one of the fan's present alarm."""
-        current = self._book.of(fan).current
+        current = self._model.current_alarm(fan)
         if current is None or not isinstance(wanted, bytes):
             return False
         if wanted == event_id(current.newest):
@@ -128,7 +126,9 @@ class Methods:
         item = numbers[1] if len(numbers) > 1 else None
         if item is not None and item not in subscription.monitored_item_srv._monitored_items:
             return _code("BadMonitoredItemIdInvalid")
-        await self._delivery.refresh(subscription, item, self._book.retained())
+        current = self._model.current_alarms()
+        conditions = [Condition(Fan(each.newest.header.tray, each.newest.fan), each) for each in current]
+        await self._delivery.refresh(subscription, item, [each for each in conditions if each.retain])
         return _code(GOOD)
 
 

@@ -20,9 +20,9 @@ from asyncua.common.connection import TransportLimits
 
 from fantwin.pipeline.config.models import TrayConfig
 from fantwin.pipeline.outputs.opcua.address_space import build_address_space
-from fantwin.pipeline.outputs.opcua.conditions import Condition, ConditionBook
+from fantwin.pipeline.outputs.opcua.conditions import Condition
 from fantwin.pipeline.outputs.opcua.events import EventDelivery, system_event
-from fantwin.pipeline.outputs.opcua.history import AlarmHistory
+from fantwin.pipeline.outputs.opcua.history import EventHistory
 from fantwin.pipeline.outputs.opcua.identifiers import NAMESPACE
 from fantwin.pipeline.outputs.opcua.log_in import LogIn, Permissions, TrustedClients
 from fantwin.pipeline.outputs.opcua.methods import Methods
@@ -79,7 +79,6 @@ class OpcuaServer:
         self,
         listening: Listening,
         model: SiteModel,
-        book: ConditionBook,
         desk: RequestDesk,
         log_in: LogIn,
         trusted: TrustedClients,
@@ -89,7 +88,7 @@ class OpcuaServer:
         """
         for name in ("asyncua", "asyncio"):  # of each client that leaves without a word they say a lot
             logging.getLogger(name).setLevel(logging.CRITICAL)
-        self._listening, self._model, self._book, self._desk = listening, model, book, desk
+        self._listening, self._model, self._desk = listening, model, desk
         self._log_in, self._trusted = log_in, trusted
         self._site: str = model.site
         self._trays: Sequence[TrayConfig] = model.trays
@@ -198,11 +197,11 @@ class OpcuaServer:
         server.set_security_policy(policies, permission_ruleset=Permissions(self._log_in))  # type: ignore[arg-type]
         server.set_identity_tokens(tokens)
         namespace = await server.register_namespace(NAMESPACE)
-        values = SiteValues(self._model, self._book, namespace)
+        values = SiteValues(self._model, namespace)
         nodes = await build_address_space(server, namespace, self._site, self._trays, values.of)
         delivery = EventDelivery(iserver.subscription_service.subscriptions, namespace)
-        Methods(self._model, self._book, self._desk, nodes, delivery).bind(server, namespace)
-        iserver.history_manager.set_storage(AlarmHistory(self._model, namespace))
+        Methods(self._model, self._desk, nodes, delivery).bind(server, namespace)
+        iserver.history_manager.set_storage(EventHistory(self._model, namespace))
         return server, nodes, values, namespace
 
     async def _publish_values(self, server: Server, nodes: SiteNodes, values: SiteValues) -> None:

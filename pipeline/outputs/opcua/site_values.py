@@ -11,7 +11,7 @@ from typing import Any
 
 from asyncua import ua
 
-from fantwin.pipeline.outputs.opcua.conditions import Condition, ConditionBook
+from fantwin.pipeline.outputs.opcua.conditions import Condition
 from fantwin.pipeline.outputs.opcua.encoding import SharedValue, data_value
 from fantwin.pipeline.outputs.opcua.fan_values import GOOD, VARIABLE, FanValues
 from fantwin.pipeline.outputs.opcua.identifiers import ALARM
@@ -29,8 +29,8 @@ _UNSHELVE_TIME = "ShelvingState/UnshelveTime"
 class SiteValues:
     """In the thread of the server only, but for `newest`."""
 
-    def __init__(self, model: SiteModel, book: ConditionBook, namespace: int) -> None:
-        self._model, self._book, self._namespace = model, book, namespace
+    def __init__(self, model: SiteModel, namespace: int) -> None:
+        self._model, self._namespace = model, namespace
         self._values = FanValues()
         self._fields: dict[Fan, tuple[Condition, Mapping[str, Any]]] = {}
         self._ranges: dict[str, tuple[ModelCard | None, float]] = {}
@@ -59,14 +59,15 @@ class SiteValues:
         return data_value(kind, value, GOOD, 0, self._namespace, now)
 
     def _of_condition(self, fan: Fan, field: str, kind: str, now: datetime) -> SharedValue:
-        condition = self._book.of(fan)
+        current = self._model.current_alarm(fan)
         known = self._fields.get(fan)
-        if known is None or known[0] is not condition or field == _UNSHELVE_TIME:
+        if known is None or known[0].current is not current or field == _UNSHELVE_TIME:
+            condition = Condition(fan, current)
             known = (condition, condition.fields(time.time_ns()))
             if len(self._fields) >= _CACHED:
                 self._fields.clear()
             self._fields[fan] = known
-        t_ns = condition.current.newest.t_ns if condition.current else 0
+        t_ns = current.newest.t_ns if current else 0
         return data_value(kind, known[1][field], GOOD, t_ns, self._namespace, now)
 
     def _highest_rpm(self, tray: str) -> float:

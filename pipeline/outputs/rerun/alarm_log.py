@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from fantwin.pipeline.outputs.rerun.worst_page import clock_utc
+import numpy as np
+
+from fantwin.pipeline.recordings.dates import has_date
 from fantwin.schemas.enums import Severity, Statistic, Transition
 from fantwin.schemas.messages import Alarm
+from fantwin.schemas.units import NS_PER_S
 from fantwin.scoring.alarms.alarm_text import TRANSITIONS
 from fantwin.scoring.alarms.fan_condition import UNTIL_IT_CLEARS_T_NS
 from fantwin.scoring.diagnosis.shown_causes import CANNOT_TELL, with_share
@@ -70,3 +73,12 @@ def exceeded(alarm: Alarm) -> str:
         return _EXCEEDED[alarm.statistic]
     residual = "torque balance" if alarm.torque_balance_command and not alarm.residual_rad_s else "speed"
     return f"{residual} off, evidence {alarm.score:.2g} x its limit"
+
+
+def clock_utc(t_ns: int, now_t_ns: int) -> str:
+    """A time of day in UTC, with the date unless it is that of `now_t_ns`; in seconds if the times are no dates."""
+    if not has_date(t_ns):
+        return f"{t_ns / NS_PER_S:.1f} s"
+    day, clock = np.datetime_as_string(np.datetime64(t_ns, "ns"), unit="s").split("T")
+    today = np.datetime_as_string(np.datetime64(now_t_ns, "ns"), unit="D")
+    return clock if day == today else f"{day} {clock}"

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from fantwin.pipeline.outputs.rerun.alarm_log import cut, exceeded
+from fantwin.pipeline.outputs.rerun.alarm_log import clock_utc, cut, exceeded
 from fantwin.pipeline.outputs.rerun.stages_page import markdown_literal
-from fantwin.pipeline.outputs.rerun.worst_page import clock_utc
-from fantwin.pipeline.site.fleet import Fan
-from fantwin.schemas.messages import Alarm
 from fantwin.scoring.alarms.alarm_flags import is_listed, is_silenced
-from fantwin.scoring.alarms.current_alarms import CurrentAlarm, current_alarms, in_sequence, needed
+from fantwin.scoring.alarms.current_alarms import CurrentAlarm
 from fantwin.scoring.diagnosis.shown_causes import most_probable
 
 ALARMS_LISTED = 16
@@ -21,52 +18,34 @@ COLORS = (
 )
 
 
-class AlarmTable:
-    """Keeps the few messages from which the current alarm of each fan follows."""
+def alarm_table(current: Sequence[CurrentAlarm], now_t_ns: int) -> str:
+    """The table in Markdown. now_t_ns: time of the newest sample."""
+    alarms = sorted((each for each in current if is_listed(each.newest)), key=_rank)
+    active = sum(each.newest.active for each in alarms)
+    lines = [f"#### {active:,} active, {len(alarms) - active:,} over" if alarms else "#### No alarms"]
+    if alarms:
+        rows = ["| tray/fan | alarm | since (UTC) | probable cause | seen by |", "|:--|:--|:--|:--|:--|"]
+        lines.append("\n".join([*rows, *(_row(each, now_t_ns) for each in alarms[:ALARMS_LISTED])]))
+    if alarms[ALARMS_LISTED:]:
+        lines.append(f"and {len(alarms) - ALARMS_LISTED:,} more: `fantwin alarms` lists them")
+    return "\n\n".join([*lines, COLORS])
 
-    def __init__(self) -> None:
-        self._messages: dict[Fan, Sequence[Alarm]] = {}
-        self._listed: set[Fan] = set()
-        self.t_ns = 0
-        """time of the newest message's sample, ns since the epoch"""
 
-    def add(self, alarm: Alarm) -> None:
-        """Take a transition."""
-        fan = Fan(alarm.header.tray, alarm.fan)
-        self._messages[fan] = needed(in_sequence([*self._messages.get(fan, ()), alarm]))
-        self.t_ns = max(self.t_ns, alarm.t_ns)
-        if is_listed(self._messages[fan][-1]):
-            self._listed.add(fan)
-        else:
-            self._listed.discard(fan)
-
-    def text(self) -> str:
-        """The table in Markdown."""
-        alarms = sorted(current_alarms(alarm for fan in self._listed for alarm in self._messages[fan]), key=_rank)
-        active = sum(each.newest.active for each in alarms)
-        lines = [f"#### {active:,} active, {len(alarms) - active:,} over" if alarms else "#### No alarms"]
-        if alarms:
-            rows = ["| tray/fan | alarm | since (UTC) | probable cause | seen by |", "|:--|:--|:--|:--|:--|"]
-            lines.append("\n".join([*rows, *(self._row(each) for each in alarms[:ALARMS_LISTED])]))
-        if alarms[ALARMS_LISTED:]:
-            lines.append(f"and {len(alarms) - ALARMS_LISTED:,} more: `fantwin alarms` lists them")
-        return "\n\n".join([*lines, COLORS])
-
-    def _row(self, each: CurrentAlarm) -> str:
-        alarm = each.newest
-        state = alarm.severity.words if alarm.active else "over"
-        state += ", silenced" if is_silenced(alarm) else ", no data" if alarm.stale and alarm.active else ""
-        cause = ", ".join(most_probable(each.causes)) if each.causes else exceeded(alarm) if alarm.active else ""
-        seen = each.acknowledged_by or ("yes" if alarm.acknowledged else "nobody")
-        name = markdown_literal(cut(f"{alarm.header.tray}/{alarm.fan}", NAME_LENGTH))
-        columns = (
-            f"**{name}**" if alarm.active else name,
-            state,
-            clock_utc(alarm.onset_t_ns, self.t_ns) if alarm.onset_t_ns else "",
-            markdown_literal(cut(cause, CAUSE_LENGTH)),
-            markdown_literal(cut(seen, NAME_LENGTH)),
-        )
-        return f"| {' | '.join(columns)} |"
+def _row(each: CurrentAlarm, now_t_ns: int) -> str:
+    alarm = each.newest
+    state = alarm.severity.words if alarm.active else "over"
+    state += ", silenced" if is_silenced(alarm) else ", no data" if alarm.stale and alarm.active else ""
+    cause = ", ".join(most_probable(each.causes)) if each.causes else exceeded(alarm) if alarm.active else ""
+    seen = each.acknowledged_by or ("yes" if alarm.acknowledged else "nobody")
+    name = markdown_literal(cut(f"{alarm.header.tray}/{alarm.fan}", NAME_LENGTH))
+    columns = (
+        f"**{name}**" if alarm.active else name,
+        state,
+        clock_utc(alarm.onset_t_ns, now_t_ns) if alarm.onset_t_ns else "",
+        markdown_literal(cut(cause, CAUSE_LENGTH)),
+        markdown_literal(cut(seen, NAME_LENGTH)),
+    )
+    return f"| {' | '.join(columns)} |"
 
 
 def _rank(each: CurrentAlarm) -> tuple[bool, bool, int, int]:

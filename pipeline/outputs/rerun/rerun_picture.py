@@ -28,7 +28,6 @@ from rerun.experimental import View, ViewerClient
 
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.outputs.rerun.plot_places import FleetPlots
-from fantwin.pipeline.outputs.rerun.rerun_fleet import COUNTS
 from fantwin.pipeline.outputs.rerun.rerun_layout import LayoutName, TrayLayout, wear_blueprint
 from fantwin.pipeline.outputs.rerun.rerun_paths import DAYS, TIMELINE, WEAR, place_in
 from fantwin.pipeline.outputs.rerun.rerun_sink import APPLICATION, LOOPBACK, rerun_program
@@ -64,13 +63,11 @@ class _Rrd:
 
     Attributes:
         trays: by name, with the fans that have been drawn.
-        is_fleet: it has an overview of a fleet.
         worn: the trays with wear; last_day_ns: time of its newest point, 0: there is none.
     """
 
     chunks: Sequence[Chunk]
     trays: dict[str, TrayLayout]
-    is_fleet: bool
     first_ns: int
     last_ns: int
     worn: Sequence[str] = ()
@@ -101,7 +98,7 @@ def draw_picture(
 
     Args:
         rrd: the file.
-        tray: which tray; may be left out where there is one. Without tray and fans, the overview of a fleet is drawn.
+        tray: which tray; may be left out where there is one. Without tray and fans, the plots of a fleet are drawn.
         fans: which fans, counted from 0; the first eight if not given.
         at_s: end of the picture, s after the first sample of the file; its last sample if not given.
         window_s: length of time shown, s.
@@ -159,7 +156,6 @@ def _read(rrd: Path) -> _Rrd:
     except (RuntimeError, ValueError, OSError) as error:
         raise PictureError(f"{rrd}: not a Rerun file: {error}") from error
     trays: dict[str, TrayLayout] = {}
-    is_fleet = False
     times: list[Array] = []
     auxiliary: set[tuple[str, str]] = set()
     alarmed: dict[tuple[str, int], None] = {}
@@ -172,9 +168,6 @@ def _read(rrd: Path) -> _Rrd:
         elif chunk.is_static:
             continue
         elif path.endswith("/speed"):
-            times.append(_times_ns(batch))
-        elif path.startswith(f"{COUNTS}/"):
-            is_fleet = True
             times.append(_times_ns(batch))
         elif path.endswith("/deviation"):
             alarmed[_fan_of(path)] = None
@@ -192,7 +185,7 @@ def _read(rrd: Path) -> _Rrd:
         in_alarm = [fan for tray, fan in alarmed if tray == name]
         trays[name] = replace(layout, auxiliary=beside, alarmed=in_alarm)
     first_ns, last_ns = int(all_times.min()), int(all_times.max())
-    return _Rrd(chunks, trays, is_fleet, first_ns, last_ns, tuple(worn), last_day_ns)
+    return _Rrd(chunks, trays, first_ns, last_ns, tuple(worn), last_day_ns)
 
 
 def _fan_of(path: str) -> tuple[str, int]:
@@ -243,7 +236,7 @@ def _blueprint(
             of = f" of {tray}" if tray else ""
             raise PictureError(f"{rrd}: no wear{of}: a fan has its first point about an hour after it was commissioned")
         return wear_blueprint([tray] if tray else contents.worn, for_picture=True)
-    if contents.is_fleet and tray is None and fans is None:
+    if any(each.places for each in contents.trays.values()) and tray is None and fans is None:
         count = max(
             (place for each in contents.trays.values() for of in each.places.values() for place in of), default=0
         )

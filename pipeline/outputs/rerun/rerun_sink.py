@@ -17,10 +17,9 @@ import rerun as rr
 
 from fantwin.pipeline.config.models import TrayConfig
 from fantwin.pipeline.outputs.rerun.alarm_log import LogLine
-from fantwin.pipeline.outputs.rerun.fleet_view import Overview
 from fantwin.pipeline.outputs.rerun.plot_places import FleetPlots
 from fantwin.pipeline.outputs.rerun.rerun_bands import RerunBands
-from fantwin.pipeline.outputs.rerun.rerun_fleet import RerunFleet
+from fantwin.pipeline.outputs.rerun.rerun_fleet import log_plot_styles
 from fantwin.pipeline.outputs.rerun.rerun_layout import LayoutName, TrayLayout, log_styles
 from fantwin.pipeline.outputs.rerun.rerun_paths import ALARMS_PATH, FLEET_LOG, STAGES_PATH, TIMELINE, log_path
 from fantwin.pipeline.outputs.rerun.rerun_wear import RerunWear
@@ -107,7 +106,7 @@ class RerunSink:
                 check_free(port, f"viewer.{key}", "viewer.serve = false")
         self._recording = rr.RecordingStream(APPLICATION)
         self._bands = RerunBands(self._recording)
-        self._fleet = RerunFleet(self._recording) if fleet else None
+        self._is_fleet = fleet is not None
         layouts = [] if fleet else [TrayLayout(t.name, range(t.fans), t.speed_unit, t.fans) for t in trays]
         self._layout = SiteLayout(tuple(layouts), window_s, fleet)
         self._wear = RerunWear(self._recording)
@@ -127,8 +126,8 @@ class RerunSink:
         self._recording.send_recording_name(f"{name} {np.datetime64(started_t_ns, 'ns').astype('datetime64[s]')} UTC")
         for of_tray in layouts:
             log_styles(self._recording, of_tray)
-        if fleet and self._fleet:
-            self._fleet.log_styles(fleet.count)
+        if fleet:
+            log_plot_styles(self._recording, fleet.count)
         self.flush()  # the styles reach the file first, so that the file of a killed viewer has them
         self._page = _serve_page(web_port, grpc_port) if web_port is not None and grpc_port is not None else None
 
@@ -174,19 +173,14 @@ class RerunSink:
         """From `t_ns` on a fan of a fleet has no place."""
         self._bands.hide(fan, t_ns)
 
-    def draw_overview(self, overview: Overview) -> None:
-        """Send what has changed in the overview of a fleet."""
-        assert self._fleet is not None, "the view has no overview"
-        self._fleet.draw(overview)
-
     def log(self, lines: Sequence[LogLine]) -> None:
         """Add lines to the log of their tray, or of the fleet, with their time of day (UTC)."""
-        placed = [(FLEET_LOG if self._fleet else log_path(line.tray), line) for line in lines]
+        placed = [(FLEET_LOG if self._is_fleet else log_path(line.tray), line) for line in lines]
         for path, group in groupby(sorted(placed, key=itemgetter(0)), key=itemgetter(0)):
             of_log = [line for _, line in group]
             times = np.array([line.t_ns for line in of_log]).astype("datetime64[ns]")
             clocks = [text.split("T")[1] for text in np.datetime_as_string(times, unit="s").tolist()]
-            trays = [f"{line.tray} " if self._fleet else "" for line in of_log]
+            trays = [f"{line.tray} " if self._is_fleet else "" for line in of_log]
             texts = [f"{clock}  {tray}{line.text}" for clock, tray, line in zip(clocks, trays, of_log, strict=True)]
             columns = rr.TextLog.columns(text=texts, level=[line.level for line in of_log])
             self._recording.send_columns(path, [rr.TimeColumn(TIMELINE, timestamp=times)], columns)

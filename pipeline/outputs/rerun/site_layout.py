@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import rerun.blueprint as rrb
 
 from fantwin.pipeline.outputs.rerun.plot_places import FleetPlots
-from fantwin.pipeline.outputs.rerun.rerun_fleet import fleet_alarms_blueprint, fleet_blueprint
+from fantwin.pipeline.outputs.rerun.rerun_fleet import fleet_blueprint
 from fantwin.pipeline.outputs.rerun.rerun_layout import (
     LayoutName,
     TrayLayout,
@@ -42,9 +42,7 @@ class SiteLayout:
         if self.plots is None:
             lays_out = trays_blueprint if name == "all" else alarms_blueprint
             return lays_out(self.trays, self.window_s, for_picture=for_picture)
-        if name == "all":
-            return fleet_blueprint(self.plots, self.window_s, self.auxiliary, for_picture=for_picture)
-        return fleet_alarms_blueprint(self.plots, self.window_s, self.auxiliary, for_picture=for_picture)
+        return fleet_blueprint(self.plots, self.window_s, self.auxiliary, for_picture=for_picture)
 
     def auxiliary_of(self, tray: str) -> Sequence[Channel]:
         """The columns beside command and speed that are drawn of a tray."""

@@ -70,5 +70,5 @@ def view_of_site(
     fleet = None
     if is_fleet:
         places = PlotPlaces(plots, round(options.alarm_plot_hold_s * NS_PER_S))
-        fleet = FleetView(site, trays, places, round(options.window_s * NS_PER_S))
-    return ViewerCore(trays, sink, fleet)
+        fleet = FleetView(trays, places, round(options.window_s * NS_PER_S))
+    return ViewerCore(site, trays, sink, fleet)

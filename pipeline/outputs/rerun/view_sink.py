@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from typing import Protocol
 
 from fantwin.pipeline.outputs.rerun.alarm_log import LogLine
-from fantwin.pipeline.outputs.rerun.fleet_view import Overview
 from fantwin.pipeline.outputs.rerun.wear_points import WearPoints
 from fantwin.pipeline.site.fleet import Fan
 from fantwin.pipeline.site.trace import Trace
@@ -31,10 +30,6 @@ class ViewSink(Protocol):
 
     def hide_fan(self, fan: Fan, t_ns: int) -> None:
         """Draw a fan of a fleet no more from `t_ns` on."""
-        ...
-
-    def draw_overview(self, overview: Overview) -> None:
-        """Show what has changed in the overview of a fleet."""
         ...
 
     def draw_wear(self, tray: str, points: Sequence[WearPoints]) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
+import math
 from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, field
 
@@ -10,22 +10,25 @@ import numpy as np
 
 from fantwin.pipeline.config.models import TrayConfig
 from fantwin.pipeline.outputs.rerun.alarm_log import LogLine, log_line
-from fantwin.pipeline.outputs.rerun.alarm_table import AlarmTable
-from fantwin.pipeline.outputs.rerun.fleet_view import COLUMNS, FleetView
+from fantwin.pipeline.outputs.rerun.alarm_table import alarm_table
+from fantwin.pipeline.outputs.rerun.fleet_view import FleetView
 from fantwin.pipeline.outputs.rerun.stages_page import StagesPage
 from fantwin.pipeline.outputs.rerun.view_sink import ViewSink
 from fantwin.pipeline.outputs.rerun.wear_points import WearPoints, wear_points
-from fantwin.pipeline.runtime.stage import Core
 from fantwin.pipeline.site.fleet import SILENT, Fan
+from fantwin.pipeline.site.site_core import SiteCore
+from fantwin.pipeline.site.site_model import SiteModel
 from fantwin.pipeline.site.trace import MEASURED_COLUMNS, Trace, state_changes, state_name, trace_of, with_holes
-from fantwin.schemas.codec import CodecError, decode_columns
 from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.health import Health
-from fantwin.schemas.messages import Alarm, Message, ModelCard, Score, ScorerSnapshot
+from fantwin.schemas.messages import Alarm, Message, Score, ScorerSnapshot
+from fantwin.schemas.units import NS_PER_S
 
 FLUSH_PERIOD_NS = 500_000_000
 REPEAT_STATES_NS = 5_000_000_000  # a viewer that joins late finds a state at most this old
 PAGE_PERIOD_NS = 5_000_000_000  # minimum between two pages: Rerun never drops data without a time, however old
+BEHIND_NS = 10 * NS_PER_S
+"""trays may be so far behind the others; if all that comes is older still, it is a replay, at times of its own"""
 SAMPLES_HELD = 4096  # samples kept per tray, when a replay is faster than the ticks
 
 
@@ -35,7 +38,7 @@ class _TrayView:
 
     Attributes:
         fans: which are drawn; None: all.
-        newest: the newest score that the overview has not seen.
+        newest: of a fleet, the newest score since the last flush.
         drawn_t_ns: by fan, the time of the last sample drawn.
         before_t_ns: the last sample of the last flush; None: its samples have not been followed since.
         wear: the points of a snapshot that came since the last flush.
@@ -46,57 +49,68 @@ class _TrayView:
     scores: list[Score] = field(default_factory=list)
     samples: int = 0
     states: dict[int, str] = field(default_factory=dict)
-    wrong_fans: int = 0  # fans of the last score, if not the configured number
     repeated_t_ns: int = 0
-    newest: Envelope | None = None
+    newest: Score | None = None
     drawn_t_ns: dict[int, int] = field(default_factory=dict)
     before_t_ns: int | None = None
     wear: Sequence[WearPoints] = ()
 
 
-class ViewerCore(Core):
+class ViewerCore(SiteCore):
     """Collects scores and passes them to a sink in few, long pieces."""
 
-    def __init__(self, trays: Sequence[TrayConfig], sink: ViewSink, fleet: FleetView | None = None) -> None:
-        """fleet: the overview; None: every fan is drawn, and there is no overview."""
+    def __init__(self, site: str, trays: Sequence[TrayConfig], sink: ViewSink, fleet: FleetView | None = None) -> None:
+        """fleet: which fans are drawn; None: all."""
+        self._now_ns: int | None = None
+        """host time of the last tick"""
+        super().__init__(SiteModel(site, trays, now_s=self._now_s))
         self._views = {tray.name: _TrayView(tray, () if fleet else None) for tray in trays}
         self._sink = sink
         self._fleet = fleet
         self._places: dict[Fan, int] = {}
         self._lines: list[LogLine] = []
-        self._alarms = AlarmTable()
         self._shown_alarms = ""
         self._alarms_t_ns = 0
-        self._now_ns = 0
         self._flushed_t_ns = 0
         self._page = StagesPage()
         self._shown_page = ""
         self._page_t_ns = 0
         self._samples_drawn = 0
         self._newest_t_ns = 0
-        self._counts: Counter[str] = Counter()
         self._show_places()
 
+    def _now_s(self) -> float:
+        """The model's clock: what has been heard before the first tick is not silent then."""
+        return math.inf if self._now_ns is None else self._now_ns / NS_PER_S
+
     def step(self, item: Message | Envelope) -> Sequence[Message]:
-        """Keep a score, an alarm or a snapshot for the next flush; add a twin or the health of a stage to the page."""
+        """Keep what is to be drawn, and what is known of the site."""
         if isinstance(item, Health):
             self._page.add_health(item)
+        elif isinstance(item, ScorerSnapshot) and item.header.tray in self._views:
+            if not self._fleet:
+                self._views[item.header.tray].wear = wear_points(item)
             return ()
-        view = self._views.get(item.header.tray)
-        if view is None:
-            self._counts["unknown_tray"] += 1
-        elif isinstance(item, Envelope):
-            self._add_score(view, item)
-        elif isinstance(item, Alarm):
-            self._lines.append(log_line(item))
-            self._alarms.add(item)
-            if self._fleet:
-                self._fleet.add_alarm(item)
-        elif isinstance(item, ScorerSnapshot) and not self._fleet:
-            view.wear = wear_points(item)
-        elif isinstance(item, ModelCard):
-            self._page.add_twin(view.config.name, item)
-        return ()
+        return super().step(item)
+
+    def add_alarm(self, alarm: Alarm) -> None:
+        """Keep it for the next flush."""
+        self._lines.append(log_line(alarm))
+        self._model.add_alarm(alarm)
+
+    def add_score(self, envelope: Envelope) -> None:
+        """Keep it for the next flush."""
+        score = self._model.add_score(envelope, MEASURED_COLUMNS)
+        if score is None:
+            return
+        view = self._views[envelope.header.tray]
+        if self._fleet:
+            view.newest = score
+        if view.fans != ():
+            view.scores.append(score)
+            view.samples += len(score.t_ns)
+            if view.samples >= SAMPLES_HELD:
+                self._flush(view)
 
     def tick(self, now_ns: int) -> Sequence[Message]:
         """Draw the samples since the last flush, twice a second."""
@@ -105,6 +119,7 @@ class ViewerCore(Core):
             self._flushed_t_ns = now_ns
             if now_ns - self._page_t_ns >= PAGE_PERIOD_NS:
                 self._show_stages()
+            self._model.notice_silence()
             self._flush_all()
         return ()
 
@@ -120,8 +135,12 @@ class ViewerCore(Core):
         self._sink.close()
 
     def counters(self) -> Mapping[str, int]:
-        """Samples drawn, scores with another number of fans, and messages of trays that are not configured."""
-        return {"samples_drawn": self._samples_drawn, "wrong_fan_count": 0, **self._counts}
+        """Samples drawn, scores that do not fit, and messages of trays and fans that are not configured."""
+        return {
+            "samples_drawn": self._samples_drawn,
+            "refused_scores": self._model.refused_scores,
+            **self._counts,
+        }
 
     def followed(self) -> Set[str] | None:
         """The trays with a fan that is drawn; None if all are."""
@@ -129,45 +148,18 @@ class ViewerCore(Core):
 
     def problem(self) -> str:
         """Scores with another number of fans than configured, or what the sink reports; empty if there is nothing."""
-        for name, view in self._views.items():
-            if view.wrong_fans:
-                return (
-                    f"scores have {view.wrong_fans} fans, [[tray]] {name} has fans = {view.config.fans}: correct `fans`"
-                )
+        for name, fans in self._model.wrong_fans.items():
+            return (
+                f"scores have {fans} fans, [[tray]] {name} has fans = {self._views[name].config.fans}: correct `fans`"
+            )
         return self._sink.problem()
 
-    def _add_score(self, view: _TrayView, envelope: Envelope) -> None:
-        if self._fleet:
-            view.newest = envelope
-        if view.fans == ():
-            return
-        score = self._decode(view, envelope, MEASURED_COLUMNS)
-        if score is None:
-            return
-        view.scores.append(score)
-        view.samples += len(score.t_ns)
-        if view.samples >= SAMPLES_HELD:
-            self._flush(view)
-
-    def _decode(self, view: _TrayView, envelope: Envelope, columns: Sequence[str]) -> Score | None:
-        """Some columns of a score; None if it cannot be shown, which is counted."""
-        try:
-            score = decode_columns(Score, envelope.payload, columns)
-        except CodecError:
-            self._counts["undecodable"] += 1
-            return None
-        if score.fans != view.config.fans:
-            self._counts["wrong_fan_count"] += 1
-            view.wrong_fans = score.fans
-            return None
-        view.wrong_fans = 0
-        return score if len(score.t_ns) else None
-
     def _show_stages(self) -> None:
-        page = self._page.text(self._now_ns)
+        twins = {name: card for name in self._views if (card := self._model.twin(name))}
+        page = self._page.text(self._model.stages(), twins)
         if page != self._shown_page:
             self._shown_page = page
-            self._page_t_ns = self._now_ns
+            self._page_t_ns = self._now_ns or 0
             self._sink.show_stages(page)
 
     def _flush_all(self) -> None:
@@ -189,12 +181,15 @@ class ViewerCore(Core):
         if view.samples:
             trace = trace_of(view.config.name, view.scores, view.config.speed_unit, view.fans)
             self._draw(view, with_holes(trace, view.scores[-1].period_ns, view.before_t_ns), view.samples)
-            view.before_t_ns = self._newest_t_ns = int(trace.t_ns[-1])
+            view.before_t_ns = int(trace.t_ns[-1])
+            self._note_time(view.before_t_ns)
         view.scores, view.samples = [], 0
 
     def _show_alarms(self) -> None:
         """Show the table of alarms when it has changed, and now and then for viewers that join late."""
-        table, t_ns = self._alarms.text(), self._newest_t_ns or self._alarms.t_ns
+        current = self._model.current_alarms()
+        t_ns = self._newest_t_ns or max((each.newest.t_ns for each in current), default=0)
+        table = alarm_table(current, t_ns)
         if t_ns and (table != self._shown_alarms or t_ns - self._alarms_t_ns >= REPEAT_STATES_NS):
             self._shown_alarms, self._alarms_t_ns = table, t_ns
             self._sink.show_alarms(table, t_ns)
@@ -216,20 +211,20 @@ class ViewerCore(Core):
                 view.states[fan] = names[-1]
                 self._sink.change_states(trace.tray, fan, np.asarray(t_ns), names)
 
+    def _note_time(self, t_ns: int) -> None:
+        if not self._newest_t_ns - BEHIND_NS <= t_ns <= self._newest_t_ns:
+            self._newest_t_ns = t_ns
+
     def _flush_fleet(self, fleet: FleetView) -> None:
-        """Show the newest sample of every fan, and give plots to the fans in alarm."""
-        newest: list[Score] = []
+        """Keep the newest sample of every tray, and give plots to the fans in alarm."""
         for view in self._views.values():
             if view.newest is not None:
-                score = self._decode(view, view.newest, COLUMNS)
-                newest += [score] if score else []
+                fleet.add_newest(view.newest)
+                self._note_time(int(view.newest.t_ns[-1]))
                 view.newest = None
-        fleet.add_newest(newest, self._now_ns)
+        heard = {name for name in self._views if not self._model.is_silent(name)}
+        fleet.update([fan for fan in self._model.in_alarm() if fan.tray in heard], self._now_ns or 0)
         self._show_places()
-        overview = fleet.overview(self._now_ns)
-        if overview is not None:
-            self._newest_t_ns = overview.t_ns
-            self._sink.draw_overview(overview)
 
     def _show_places(self) -> None:
         """Begin and end the plots of a fleet."""
@@ -252,7 +247,7 @@ class ViewerCore(Core):
             self._draw_before(view, fan)
         for fan in places:
             view = self._views[fan.tray]
-            if self._fleet and fan.tray in self._fleet.silent and view.states.get(fan.number, SILENT) != SILENT:
+            if view.drawn_t_ns and self._model.is_silent(fan.tray) and view.states.get(fan.number, SILENT) != SILENT:
                 view.states[fan.number] = SILENT
                 self._sink.change_states(*fan, np.array([view.drawn_t_ns[fan.number] + 1]), [SILENT])
 

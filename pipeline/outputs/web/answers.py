@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from fantwin.pipeline.site.fan_groups import FanGroup
+from fantwin.pipeline.site.fleet import FanGroup
 
 
 class LoginForm(BaseModel):

@@ -24,9 +24,8 @@ from fantwin.pipeline.outputs.web.live_feed import LiveFeed, encoded, keep_alive
 from fantwin.pipeline.outputs.web.metrics import metrics_text
 from fantwin.pipeline.outputs.web.shared_answer import SharedAnswer
 from fantwin.pipeline.recordings.clips.clip import Clip, kept_clips
-from fantwin.pipeline.site.fan_groups import FanGroup
 from fantwin.pipeline.site.fan_history import HISTORY_S
-from fantwin.pipeline.site.fleet import Fan
+from fantwin.pipeline.site.fleet import Fan, FanGroup
 from fantwin.pipeline.site.request_desk import RequestDesk
 from fantwin.pipeline.site.request_form import RequestForm
 from fantwin.pipeline.site.shown import (

@@ -16,7 +16,7 @@ import numpy as np
 from fantwin.pipeline.recordings.dates import format_local, has_date
 from fantwin.pipeline.recordings.rare_messages import rare_messages
 from fantwin.pipeline.replay.offline.alarm_episodes import Episode, episodes
-from fantwin.pipeline.site.alarm_store import AlarmStore
+from fantwin.pipeline.site.alarm_history import AlarmHistory
 from fantwin.schemas.enums import Feedback, InvalidReason
 from fantwin.schemas.messages import Alarm, Prediction
 from fantwin.schemas.units import NS_PER_S
@@ -90,7 +90,7 @@ class MarkedAlarm:
 
 
 def alarms_in(path: Path) -> list[tuple[str, Alarm]]:
-    """The messages about alarms in a recording, or in the file of a gateway, each with its site, empty if not known.
+    """The messages about alarms in a recording, or in a history of alarms, each with its site, empty if not known.
 
     Raises:
         UserError: it cannot be read.
@@ -98,11 +98,11 @@ def alarms_in(path: Path) -> list[tuple[str, Alarm]]:
     if path.suffix != FILE_OF_GATEWAY:
         found = ((envelope.key.split("/")[1], envelope.message) for envelope in rare_messages(path, "alarm"))
         return [(site, message) for site, message in found if isinstance(message, Alarm)]
-    store = AlarmStore(path, read_only=True)
+    history = AlarmHistory(path, read_only=True)
     try:
-        return [("", alarm) for _, alarm in store.after(_FIRST, -1)]
+        return [("", alarm) for _, alarm in history.after(_FIRST, -1)]
     finally:
-        store.close()
+        history.close()
 
 
 def marked_alarms(files: Iterable[tuple[Path, Sequence[tuple[str, Alarm]]]]) -> list[MarkedAlarm]:

@@ -15,8 +15,8 @@ from fantwin.pipeline.recordings.clips.clip import CLIP_KEY
 from fantwin.pipeline.recordings.rare_messages import rare_messages
 from fantwin.pipeline.recordings.reading import read_recording
 from fantwin.pipeline.recordings.writing import RecordingWriter
+from fantwin.pipeline.site.alarm_history import AlarmHistory
 from fantwin.pipeline.site.alarm_rates import AlarmRates
-from fantwin.pipeline.site.alarm_store import AlarmStore
 from fantwin.pipeline.site.judged_time import JudgedStretch
 from fantwin.schemas.enums import Feedback, Transition
 from fantwin.schemas.header import Header
@@ -96,16 +96,14 @@ def test_the_alarms_of_recordings_have_the_feedback_of_later_ones_and_the_rate_t
 
 
 def test_a_gateway_on_this_host_has_kept_the_history(tmp_path: Path) -> None:
-    store = AlarmStore(tmp_path / "alarms.sqlite")
+    store = AlarmHistory(tmp_path / "alarms.sqlite")
     alarms = [alarm for alarm in golden_alarms() if alarm.fan == 1]
     for alarm in [*alarms, marked(alarms[-1], Feedback.FALSE_ALARM, 0, "the door was open")]:
         store.add(alarm)
     first_t_ns = alarms[0].t_ns - 10**9
-    rates = AlarmRates(tmp_path / "alarms.sqlite")
-    rates.catch_up(store, [JudgedStretch("tray1", "abc", first_t_ns, first_t_ns + 10**13, 3_600 * 10**9, 0.5)])
+    AlarmRates(store).catch_up([JudgedStretch("tray1", "abc", first_t_ns, first_t_ns + 10**13, 3_600 * 10**9, 0.5)])
     found = history("-c", DEMO / "demo.toml", "--set", f"run_folder='{tmp_path}'")
     store.close()
-    rates.close()
     assert [alarm["feedback"] for alarm in found["alarms"]] == ["false_alarm"]
     rate = found["rate"]
     assert (rate["fan_hours"], rate["false_alarms"], rate["declared_per_day"]) == (1.0, 1, 0.5)

@@ -16,7 +16,7 @@ from fantwin.pipeline.cli.twins.calibration_check import check_declared_rate
 from fantwin.pipeline.cli.twins.marked_running import marked_running
 from fantwin.pipeline.recordings.writing import RecordingWriter
 from fantwin.pipeline.replay.offline.marked_alarms import LeftOut, alarms_in, concerning, marked_alarms
-from fantwin.pipeline.site.alarm_store import AlarmStore
+from fantwin.pipeline.site.alarm_history import AlarmHistory
 from fantwin.schemas.enums import Action, Severity, Transition
 from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Alarm
@@ -107,7 +107,7 @@ def test_an_alarm_that_nobody_has_marked_leaves_nothing_out(tmp_path: Path) -> N
 
 def test_what_a_gateway_has_kept_counts_for_the_times_of_the_recordings(tmp_path: Path) -> None:
     recording = with_alarm(tmp_path / "alarms.mcap", None)
-    store = AlarmStore(tmp_path / "alarms.sqlite")
+    store = AlarmHistory(tmp_path / "alarms.sqlite")
     alarms = [alarm for _, alarm in alarms_in(with_alarm(tmp_path / "marked.mcap", Action.TRUE_ALARM))]
     long_ago = [
         replace(each, header=replace(each.header, producer="s0"), t_ns=each.t_ns - DAY_NS, onset_t_ns=5 * NS_PER_S)

@@ -14,6 +14,7 @@ from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 from rich.console import Console
 
@@ -21,13 +22,12 @@ from fantwin.pipeline import extras
 from fantwin.pipeline.bus.publisher import Publisher
 from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.cli.watch import status as status_command
-from fantwin.pipeline.cli.watch.status import as_json, loss_lines, stage_table, unjudged
+from fantwin.pipeline.cli.watch.status import as_json, loss_lines, not_judged, stage_table
 from fantwin.pipeline.config.loading import load_config
 from fantwin.pipeline.config.models import BusConfig
 from fantwin.pipeline.launch.this_host import load_for_this_host
-from fantwin.pipeline.site.judged_fans import JudgedFans
-from fantwin.pipeline.site.site_state import StageState, Word
-from fantwin.pipeline.site.site_watcher import SiteWatcher, StageView
+from fantwin.pipeline.site.site_state import StageState, StageView, Word
+from fantwin.pipeline.site.site_watcher import SiteWatcher
 from fantwin.schemas.codec import encode, type_name
 from fantwin.schemas.enums import InvalidReason, Severity, StageStatus, Transition
 from fantwin.schemas.header import Header
@@ -69,6 +69,9 @@ ALARM = Alarm(
 )
 
 
+TRAYS = load_config(DEMO / "demo.toml").trays
+
+
 class Site:
     """A made-up stage on a real bus, and a watcher in a session of its own."""
 
@@ -85,12 +88,9 @@ class Site:
     def _publisher(bus: Bus, key: str, topic: str, producer: str) -> Publisher:
         return bus.publisher(key, BY_NAME[topic], type_name(BY_NAME[topic].message), producer)
 
-    def judged(self, *reasons: InvalidReason) -> JudgedFans:
-        """What a listener knows after a score; reasons: why fans are not judged, beginning with fan 0."""
-        config = load_config(DEMO / "demo.toml")
-        listener = JudgedFans(self.outside, SITE, config.trays, SiteWatcher(self.outside, SITE))
-        listener.add(TRAY, encode(one_sample(FANS, *reasons)))
-        return listener
+    def watcher(self) -> SiteWatcher:
+        """One that has heard nothing yet."""
+        return SiteWatcher(self.outside, SITE, trays=TRAYS, has_scores=True)
 
     def close(self) -> None:
         for bus in self.buses:
@@ -118,18 +118,23 @@ def view(site: Site, watcher: SiteWatcher, *healths: Health) -> StageView:
     return last
 
 
+def judge(watcher: SiteWatcher, *reasons: InvalidReason) -> None:
+    """Let it hear a score; reasons: why fans are not judged, beginning with fan 0."""
+    watcher.model.add_decoded_score(TRAY, one_sample(FANS, *reasons))
+
+
 ONLY_THE_SCORER = 'launcher.stages=["scorer"]'
 
 
-def shown(watcher: SiteWatcher, judged: JudgedFans, *settings: str) -> str:
+def shown(watcher: SiteWatcher, *settings: str) -> str:
     console = Console(width=120, file=io.StringIO(), record=True)
-    console.print(stage_table(watcher, load_config(DEMO / "demo.toml", [ONLY_THE_SCORER, *settings]), judged))
+    console.print(stage_table(watcher, load_config(DEMO / "demo.toml", [ONLY_THE_SCORER, *settings])))
     return console.export_text()
 
 
-def document(watcher: SiteWatcher, judged: JudgedFans) -> Any:
+def document(watcher: SiteWatcher) -> Any:
     """What a machine reads."""
-    return json.loads(json.dumps(as_json(watcher, load_config(DEMO / "demo.toml", [ONLY_THE_SCORER]), judged)))
+    return json.loads(json.dumps(as_json(watcher, load_config(DEMO / "demo.toml", [ONLY_THE_SCORER]))))
 
 
 def status_words(site: Site) -> list[object]:
@@ -154,45 +159,48 @@ def test_rates_are_what_came_between_two_healths():
 
 
 def test_row_18_the_loss_of_a_stage_that_was_restarted_while_it_is_watched_does_not_start_at_0_again(site):
-    watcher = SiteWatcher(site.outside, SITE)
+    watcher = site.watcher()
     follower = replace(
         HEALTH, header=Header("scorer-all-2", 0, ""), t_ns=HEALTH.t_ns + NS_PER_S, uptime_s=180.0, inputs=(), lost=2
     )
     assert view(site, watcher, HEALTH, follower).health.header.producer == "scorer-all-2"
     assert watcher.losses() == {"scorer": 7 + 2}
-    judged = site.judged()
-    (stage,) = document(watcher, judged)["stages"]
+    judge(watcher)
+    (stage,) = document(watcher)["stages"]
     assert (stage["lost"], stage["uptime_s"]) == (7 + 2, 180.0)
-    (row,) = (line for line in shown(watcher, judged).splitlines() if line.strip().startswith("scorer "))
+    (row,) = (line for line in shown(watcher).splitlines() if line.strip().startswith("scorer "))
     assert (row.split()[2:4], row.split()[-1]) == (["3", "min"], "9")
 
 
 def test_row_10_what_was_refused_in_the_name_of_another_is_said_and_is_no_loss(site):
-    watcher = SiteWatcher(site.outside, SITE)
+    watcher = site.watcher()
     refusals = (Counter(name="refused_forged", value=12),)
     view(site, watcher, replace(HEALTH, inputs=(), counters=refusals, lost=0))
-    assert "scorer: refused: 12 messages in the name of another session\n" in shown(watcher, site.judged())
+    assert "scorer: refused: 12 messages in the name of another session\n" in shown(watcher)
     assert watcher.losses() == {"scorer": 0}
 
 
 def test_stages_rates_losses_problems_and_alarms_from_before_the_watcher_came_are_shown(site):
-    watcher = SiteWatcher(site.outside, SITE)
+    watcher = site.watcher()
     site.alarm.put(encode(ALARM))
     view(site, watcher, replace(HEALTH, problem="the line is silent"))
     watcher.ask_for_past_alarms()
-    judged = site.judged()
-    reported = document(watcher, judged)
+    judge(watcher)
+    reported = document(watcher)
     (stage,), (alarm,) = reported["stages"], reported["alarms"]
     assert (stage["stage"], stage["alive"], stage["status"], stage["process_id"]) == ("scorer", True, "ok", 4711)
     assert (stage["state"], stage["lost"], reported["not_judged"]) == ("ok", 7, [])
     assert stage["counters"] == {"lost_on_purpose": 4}
     assert stage["latency_ms"] == {"p50": 1.5, "p99": 2.5}
     assert (alarm["tray"], alarm["fan"], alarm["active"]) == (TRAY, 2, True)
-    assert "scorer: the line is silent" in shown(watcher, judged)
+    assert "scorer: the line is silent" in shown(watcher)
     over = {"active": False, "acknowledged": True, "confirmed": True}
     site.alarm.put(encode(replace(ALARM, t_ns=ALARM.t_ns + 1, header=Header("scorer-all-1", 1, TRAY), **over)))
-    eventually(lambda: [(a.fan, a.active) for a in watcher.alarms()] == [(2, False)], "the last of a fan counts")
-    assert "no alarms" in shown(watcher, judged)
+    eventually(
+        lambda: [(each.newest.fan, each.newest.active) for each in watcher.current_alarms()] == [(2, False)],
+        "the last of a fan counts",
+    )
+    assert "no alarms" in shown(watcher)
 
 
 def test_alarms_are_shown_with_their_states_probable_causes_and_whether_data_confirm_them(site):
@@ -210,72 +218,73 @@ def test_alarms_are_shown_with_their_states_probable_causes_and_whether_data_con
     publish(3, Transition.RAISED, fan=3, onset_t_ns=7)
     publish(4, Transition.CLEARED, fan=3, onset_t_ns=7, **over)
     publish(5, Transition.SHELVED, fan=4, onset_t_ns=0, severity=Severity.NONE, shelved_until_t_ns=2**63 - 1, **over)
-    watcher = SiteWatcher(site.outside, SITE)
+    watcher = site.watcher()
     view(site, watcher, HEALTH)
     watcher.ask_for_past_alarms()
-    text = shown(watcher, site.judged(*[InvalidReason.NONE] * 2, InvalidReason.STOPPED))
+    judge(watcher, *[InvalidReason.NONE] * 2, InvalidReason.STOPPED)
+    text = shown(watcher)
     line = "fan 2: active, acknowledged, now stopped by its command, more drag 87 %; "
     assert f"{line}at {clock(ALARM.t_ns + 1)}: more drag" in " ".join(text.split())
     assert "fan 3" not in text, "it is over, and everybody knows"
     assert "fan 4: never raised, shelved until it clears" in text
-    reported = {alarm["fan"]: alarm for alarm in document(watcher, site.judged())["alarms"]}
+    reported = {alarm["fan"]: alarm for alarm in document(watcher)["alarms"]}
     assert (reported[2]["acknowledged"], reported[2]["causes"][0]["cause"]) == (True, "drag_up")
     assert (reported[3]["retained"], reported[4]["presented"]) == (False, False)
-    lacking = site.judged(*[InvalidReason.NONE] * 2, InvalidReason.NO_SPEED)
-    assert "fan 2: active, not confirmed by data" in " ".join(shown(watcher, lacking).split())
-    assert [alarm["stale"] for alarm in document(watcher, lacking)["alarms"] if alarm["fan"] == 2] == [True]
-    judged = site.judged()
-    assert "not confirmed" not in shown(watcher, judged), "this fan is judged"
-    assert not any(alarm["stale"] for alarm in document(watcher, judged)["alarms"])
+    watcher.model._fleet._judged_s[2] = -np.inf
+    judge(watcher, *[InvalidReason.NONE] * 2, InvalidReason.NO_SPEED)
+    assert "fan 2: active, not confirmed by data" in " ".join(shown(watcher).split())
+    assert [alarm["stale"] for alarm in document(watcher)["alarms"] if alarm["fan"] == 2] == [True]
+    judge(watcher)
+    assert "not confirmed" not in shown(watcher), "this fan is judged"
+    assert not any(alarm["stale"] for alarm in document(watcher)["alarms"])
 
 
 def test_a_viewer_that_is_left_out_for_want_of_its_extra_is_not_missing(site, monkeypatch):
     monkeypatch.setattr(extras, "is_installed", lambda module: module != "rerun")
-    watcher = SiteWatcher(site.outside, SITE)
+    watcher = site.watcher()
     here = load_for_this_host(DEMO / "demo.toml", stages=()).config
-    seen: Any = as_json(watcher, here, site.judged())
+    seen: Any = as_json(watcher, here)
     stages = [stage["stage"] for stage in seen["stages"]]
     assert "recorder" in stages and "viewer" not in stages
 
 
 def test_row_01_a_missing_stage_has_a_row_and_no_alarms_is_not_said_while_a_fan_is_not_judged(site):
-    watcher = SiteWatcher(site.outside, SITE)
+    watcher = site.watcher()
     view(site, watcher, HEALTH)
-    judged = site.judged(InvalidReason.NO_SPEED)
-    text = shown(watcher, judged, 'launcher.stages=["resampler", "scorer"]')
+    judge(watcher)
+    watcher.model._fleet._judged_s[0] = -np.inf
+    judge(watcher, InvalidReason.NO_SPEED)
+    text = shown(watcher, 'launcher.stages=["resampler", "scorer"]')
     assert re.search(r"resampler +missing", text)
     assert "resampler: not seen on the bus" in text
     assert "tray1: fan 0 not judged: no speed" in text
     assert "no alarms" not in text
-    assert document(watcher, judged)["not_judged"] == [{"tray": TRAY, "fans": [0], "why": "no speed"}]
+    assert document(watcher)["not_judged"] == [{"tray": TRAY, "fans": [0], "why": "no speed"}]
 
 
 def test_a_site_without_a_scorer_is_well_and_does_not_say_that_there_are_no_alarms(site):
-    watcher = SiteWatcher(site.outside, SITE)
+    watcher = site.watcher()
     recorder = replace(HEALTH, stage="recorder", header=Header("recorder-all-1", 0, ""))
     line = Input(key="fantwin/demo/tray1/raw", producer="p", received=9, missing=3, duplicated=0, next_sequence=12)
     state = StageState("recorder", Word.OK, "", StageView(replace(recorder, inputs=(line,)), None, alive=True), True)
     console = Console(width=120, file=io.StringIO(), record=True)
-    nobody = JudgedFans(site.outside, SITE, load_config(DEMO / "demo.toml").trays, watcher)
-    assert unjudged([state], nobody) == []
-    assert unjudged([replace(state, label="scorer")], nobody) != []
+    assert not_judged([state], watcher.model) == []
+    assert not_judged([replace(state, label="scorer")], watcher.model) != []
     assert loss_lines([state]) == ["recorder: lost since its start: lost_on_purpose 4, missing on tray1/raw 3"]
     config = load_config(DEMO / "demo.toml", ['launcher.stages=["recorder"]'])
-    console.print(stage_table(watcher, config, nobody))
+    console.print(stage_table(watcher, config))
     text = console.export_text()
     assert "no fan is judged: the configuration has no scorer" in text
     assert "no alarms" not in text
 
 
 def test_a_stage_that_vanished_is_shown_as_gone_and_without_stages_no_table_and_alarms_are_unknown(site):
-    trays = load_config(DEMO / "demo.toml").trays
-    watcher = SiteWatcher(site.outside, SITE)
+    watcher = site.watcher()
     view(site, watcher, HEALTH)
     site.buses[0].close()
     eventually(lambda: not watcher.stages()[0].alive, "the watcher sees it go")
-    gone = shown(watcher, JudgedFans(site.outside, SITE, trays, watcher))
-    later_watcher = SiteWatcher(site.outside, SITE)
-    empty = shown(later_watcher, JudgedFans(site.outside, SITE, trays, later_watcher))
+    gone = shown(watcher)
+    empty = shown(site.watcher())
     assert "gone" in gone and "stages" not in empty
     for text in (gone, empty):
         assert "no stage of site 'demo' answers at tcp/" in text

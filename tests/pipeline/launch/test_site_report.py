@@ -14,7 +14,7 @@ from fantwin.schemas.header import Header
 from fantwin.schemas.health import Note
 from fantwin.schemas.messages import Alarm
 from fantwin.schemas.units import NS_PER_S
-from fantwin.scoring.alarms.current_alarms import clock, current_alarms
+from fantwin.scoring.alarms.current_alarms import clock, current_alarm
 from tests.pipeline.site.test_site_state import CONSUMER, view
 
 IDS = {"resampler": RunningProcess(11, is_at_work=True), "scorer": RunningProcess(12, is_at_work=True)}
@@ -169,7 +169,7 @@ def test_an_alarm_that_came_and_went_between_two_looks_is_said_to_have_been_rais
         cleared(missed),
         replace(cleared(shelved), shelved_until_t_ns=shelved + 3600 * NS_PER_S),
     ):
-        report.alarms(current_alarms([newest]))
+        report.alarms([current_alarm([newest])])
     over = "cleared  tray1  fan 2: back to normal"
     raised = f"ALARM  tray1  fan 2: raised for what began at {clock(missed)}, and over"
     silenced = f"ALARM (silenced)  tray1  fan 2: raised for what began at {clock(shelved)}, and over"

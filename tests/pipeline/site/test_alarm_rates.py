@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from fantwin.pipeline.site import alarm_rates
+from fantwin.pipeline.site.alarm_history import AlarmHistory
 from fantwin.pipeline.site.alarm_rates import AlarmRates
-from fantwin.pipeline.site.alarm_store import AlarmStore
 from fantwin.pipeline.site.judged_time import JudgedStretch, JudgedTime
 from fantwin.schemas.enums import Transition
 from fantwin.schemas.units import NS_PER_S
@@ -24,32 +24,30 @@ def test_a_stretch_that_grows_for_long_does_not_push_out_the_ones_before_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(alarm_rates, "MOST_KEPT", 10)
-    store = AlarmStore(tmp_path / "alarms.sqlite")
-    rates = AlarmRates(tmp_path / "alarms.sqlite")
+    store = AlarmHistory(tmp_path / "alarms.sqlite")
+    rates = AlarmRates(store)
     store.add(alarm(0, FIRST.last_t_ns, sequence=1, transition=Transition.RAISED))
-    rates.catch_up(store, [FIRST])
+    rates.catch_up([FIRST])
     growing = replace(FIRST, first_t_ns=FIRST.last_t_ns + HOUR_NS)
     for saves in range(20):
-        rates.catch_up(store, [replace(growing, last_t_ns=growing.first_t_ns + saves * NS_PER_S, fan_ns=saves)])
+        rates.catch_up([replace(growing, last_t_ns=growing.first_t_ns + saves * NS_PER_S, fan_ns=saves)])
     observed = rates.observed()["tray1"]
     assert observed.since_t_ns == FIRST.first_t_ns and observed.fan_hours == pytest.approx(8.0)
     assert observed.unmarked == 1
-    rates.close()
     store.close()
 
 
 def test_alarms_count_from_the_first_to_the_last_score_of_the_twin_in_force(tmp_path: Path) -> None:
-    store = AlarmStore(tmp_path / "alarms.sqlite")
-    rates = AlarmRates(tmp_path / "alarms.sqlite")
+    store = AlarmHistory(tmp_path / "alarms.sqlite")
+    rates = AlarmRates(store)
     other = replace(FIRST, twin="former", first_t_ns=FIRST.last_t_ns + HOUR_NS, last_t_ns=FIRST.last_t_ns + 2 * HOUR_NS)
     last = replace(FIRST, first_t_ns=other.last_t_ns + HOUR_NS, last_t_ns=other.last_t_ns + 2 * HOUR_NS)
     within = [FIRST.first_t_ns, FIRST.last_t_ns, last.first_t_ns, last.last_t_ns]
     outside = [FIRST.first_t_ns - 1, FIRST.last_t_ns + 1, other.first_t_ns, last.first_t_ns - 1, last.last_t_ns + 1]
     for number, t_ns in enumerate([*within, *outside]):
         store.add(alarm(0, t_ns, sequence=number, transition=Transition.RAISED))
-    rates.catch_up(store, [FIRST, other, last])
+    rates.catch_up([FIRST, other, last])
     assert rates.observed()["tray1"].unmarked == len(within)
-    rates.close()
     store.close()
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from fantwin.pipeline.config.models import TrayConfig
-from fantwin.pipeline.site.alarm_store import AlarmStore
+from fantwin.pipeline.site.alarm_history import AlarmHistory
 from fantwin.pipeline.site.fleet import Fan
 from fantwin.pipeline.site.request_desk import ANSWERED_WITHIN_S, MOST_UNDER_WAY, RequestDesk
 from fantwin.pipeline.site.site_model import SILENT_AFTER_S, SiteModel
@@ -31,7 +31,7 @@ def clock() -> _Clock:
 
 def test_a_tray_without_a_score_is_silent_after_a_while_and_until_its_next_score(tmp_path, clock):
     trays = (TrayConfig(name=TRAY, fans=FANS, speed_unit="rpm"),)
-    model = SiteModel(SITE, trays, AlarmStore(tmp_path / "alarms.sqlite"), now_s=clock)
+    model = SiteModel(SITE, trays, AlarmHistory(tmp_path / "alarms.sqlite"), now_s=clock)
     envelope = Envelope.of(tray_key(SITE, TRAY, "score"), score(), 0)
 
     def is_shown() -> tuple[bool, bool]:

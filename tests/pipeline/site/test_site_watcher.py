@@ -8,10 +8,11 @@ from typing import Any
 
 import pytest
 
+from fantwin.pipeline.config.models import TrayConfig
 from fantwin.pipeline.config.roles import roles_of_stages
 from fantwin.pipeline.runtime.sessions import Session
+from fantwin.pipeline.site.one_line import LONGEST_TEXT
 from fantwin.pipeline.site.site_watcher import MOST_UNKNOWN_SESSIONS, MOST_WATCHED_SESSIONS, SiteWatcher
-from fantwin.pipeline.site.watched_alarms import MOST_WATCHED_FANS, WATCHED_BYTES
 from fantwin.schemas.codec import encode
 from fantwin.schemas.enums import StageStatus
 from fantwin.schemas.header import Header
@@ -21,6 +22,7 @@ from fantwin.schemas.topics import alive_key, health_key, sessions_key, tray_key
 from tests.support import made_messages
 from tests.support.bus_peer import alarm
 
+TRAYS = [TrayConfig(name="tray", fans=8)]
 KEY = tray_key("s", "tray", "alarm")
 STRANGER = "nobody"
 
@@ -78,7 +80,7 @@ def bus() -> Any:
 @pytest.fixture
 def watcher(bus: Any) -> SiteWatcher:
     """Of a site on which a scorer is at work."""
-    watcher = SiteWatcher(bus, "s")
+    watcher = SiteWatcher(bus, "s", trays=TRAYS)
     bus.show(SCORER)
     bus.say(health(SCORER, outputs=(Output(key=KEY, published=0),)))
     return watcher
@@ -96,7 +98,7 @@ def fans(watcher: SiteWatcher) -> list[int]:
 def test_row_17_a_health_is_not_believed_about_what_its_stage_may_not_write(bus, stage, claimed):
     """Otherwise a session of a viewer could make the alarms of the scorer those of a stranger."""
     limited = {"resampler.all": replace(roles_of_stages()["resampler"], trays=("tray",))}
-    watcher = SiteWatcher(bus, "s", roles_of_stages() | limited)
+    watcher = SiteWatcher(bus, "s", roles_of_stages() | limited, TRAYS)
     thief = session(stage, 7)
     bus.show(thief)
     own = tuple(Output(key=tray_key("s", "tray", topic), published=5) for topic in roles_of_stages()[stage].writes)
@@ -110,7 +112,7 @@ def test_row_17_a_health_is_not_believed_about_what_its_stage_may_not_write(bus,
 
 
 def test_row_11_an_alarm_of_a_stranger_is_not_shown_once_the_scorer_is_heard(bus):
-    watcher = SiteWatcher(bus, "s")
+    watcher = SiteWatcher(bus, "s", trays=TRAYS)
     bus.raise_alarm(of(STRANGER))
     assert fans(watcher) == [0], "a replay, say: nobody else publishes there"
     bus.show(SCORER)
@@ -131,17 +133,11 @@ def test_the_alarm_of_a_scorer_that_was_killed_is_shown_beside_its_successor(bus
     assert fans(watcher) == [0]
 
 
-def test_row_11_the_alarms_that_are_kept_are_bounded_and_those_of_strangers_are_forgotten_first(bus):
-    watcher = SiteWatcher(bus, "s")
-    bus.show(SCORER)
-    bus.raise_alarm(of(SCORER.producer, fan=1))
-    for number in range(MOST_WATCHED_FANS + 10):
-        bus.raise_alarm(of(STRANGER, number, fan=10 + number))
-    assert (len(fans(watcher)), fans(watcher)[0]) == (MOST_WATCHED_FANS, 1)
-    watcher = SiteWatcher(bus, "s")
-    for number in range(40):
-        bus.raise_alarm(of(STRANGER, number, fan=number, message="x" * (1 << 19)))
-    assert 20 < len(fans(watcher)) <= WATCHED_BYTES >> 19
+def test_row_11_alarms_of_fans_that_the_site_does_not_have_are_not_kept_and_long_texts_are_cut(bus, watcher):
+    for number in range(100):
+        bus.raise_alarm(of(SCORER.producer, number, fan=number, message="x" * (1 << 19)))
+    assert fans(watcher) == list(range(8))
+    assert {len(each.message) for each in watcher.current_alarms()} == {LONGEST_TEXT}
 
 
 def test_row_11_healths_of_strangers_hide_no_stage_and_few_are_kept(bus, watcher):
@@ -192,21 +188,21 @@ def test_what_shows_no_token_of_a_session_such_as_a_replay_is_seen_where_no_sess
 
 
 def test_row_18_bytes_of_a_stranger_are_no_alarm_and_one_that_is_recovered_is_known(bus):
-    watcher = SiteWatcher(bus, "s")
+    watcher = SiteWatcher(bus, "s", trays=TRAYS)
     receive = bus.subscribers[tray_key("s", "*", "alarm")]
     receive(KEY, b"")  # all fields at their defaults: it decodes
     for name in ("", "other", "tray/../x", "*"):
         receive(KEY, encode(replace(alarm(0), header=Header("peer", 0, name))))
     bus.kept = [(KEY, b"")]
     watcher.ask_for_past_alarms()
-    assert watcher.alarms() == []
+    assert fans(watcher) == []
     bus.kept = [(KEY, encode(alarm(3)))]
     watcher.ask_for_past_alarms()
-    assert [type(each) for each in watcher.alarms()] == [Alarm]
+    assert [each.newest.header for each in watcher.current_alarms()] == [alarm(3).header]
 
 
 def test_row_11_what_a_launched_session_has_lost_is_not_forgotten_in_a_flood_of_others(bus):
-    watcher = SiteWatcher(bus, "s")
+    watcher = SiteWatcher(bus, "s", trays=TRAYS)
     watcher.add_launched(("recorder", 1))
     for number in range(1, MOST_WATCHED_SESSIONS + 3):
         bus.show(session("recorder", number))
@@ -218,7 +214,7 @@ def test_row_11_what_a_launched_session_has_lost_is_not_forgotten_in_a_flood_of_
 
 
 def test_row_13_a_stage_that_is_restarted_after_its_clock_was_set_back_is_the_latest_session(bus):
-    watcher = SiteWatcher(bus, "s")
+    watcher = SiteWatcher(bus, "s", trays=TRAYS)
     for each, t_ns in ((session("recorder", 1), 7200), (session("recorder", 2), 3600)):
         bus.show(each)
         bus.say(health(each, t_ns))

@@ -9,8 +9,7 @@ from typing import Any
 from fantwin.schemas.enums import Severity, Transition
 from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Alarm, Diagnosis
-from fantwin.scoring.alarms.alarm_flags import is_retained
-from fantwin.scoring.alarms.current_alarms import CurrentAlarm, current_alarms
+from fantwin.scoring.alarms.current_alarms import CurrentAlarm, current_alarm
 from fantwin.scoring.alarms.fan_condition import UNTIL_IT_CLEARS_T_NS
 
 _numbers = itertools.count()
@@ -30,31 +29,7 @@ def alarm(
 
 
 def one(*messages: Alarm) -> CurrentAlarm:
-    (standing,) = current_alarms(messages)
-    return standing
-
-
-def test_the_newest_message_of_each_fan_decides_its_state_in_any_order():
-    reported = [alarm(fan=1), alarm(), alarm(Transition.CLEARED, 5, active=False), alarm(tray="b", t_ns=9)]
-    for messages in itertools.permutations(reported):
-        found = [(each.newest.header.tray, each.newest.fan, each.newest.active) for each in current_alarms(messages)]
-        assert found == [("a", 0, False), ("a", 1, True), ("b", 0, True)]
-
-
-def test_the_later_sent_of_two_messages_at_the_same_sample_counts():
-    first, second = alarm(), alarm(Transition.ACKNOWLEDGED, acknowledged=True)
-    assert one(second, first).newest is second
-
-
-def test_the_scorer_that_published_last_counts_regardless_of_its_times():
-    before = alarm(t_ns=900, producer="killed")
-    again = alarm(Transition.REPUBLISHED, 900, producer="b")
-    taken_back = alarm(Transition.REPUBLISHED, 5, producer="b", active=False, severity=Severity.NONE, acknowledged=True)
-    after = alarm(t_ns=7, producer="c")
-    assert not is_retained(one(before, taken_back, again).newest), (
-        "of one producer those that come late were sent before"
-    )
-    assert one(before, again, taken_back, after).newest is after
+    return current_alarm(messages)
 
 
 def test_an_answer_keeps_the_message_and_the_causes():

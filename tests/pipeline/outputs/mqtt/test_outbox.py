@@ -12,8 +12,8 @@ from fantwin.pipeline.config.models import TrayConfig
 from fantwin.pipeline.outputs.mqtt.fan_states import FanStates
 from fantwin.pipeline.outputs.mqtt.outbox import MOST_ANSWERS, Outbox, Outgoing
 from fantwin.pipeline.outputs.mqtt.topics import do_overlap
-from fantwin.pipeline.outputs.mqtt.transition_queue import TransitionQueue
-from fantwin.pipeline.site.alarm_store import AlarmStore
+from fantwin.pipeline.outputs.mqtt.transition_queue import READER, TransitionQueue
+from fantwin.pipeline.site.alarm_history import AlarmHistory
 from fantwin.pipeline.site.site_model import SiteModel
 from fantwin.schemas.enums import FanState
 from fantwin.schemas.envelope import Envelope
@@ -81,7 +81,7 @@ def test_whether_patterns_have_a_topic_in_common(first, second, expected):
 
 def test_the_state_of_a_fan_is_published_again_only_when_it_has_changed(tmp_path):
     trays = (TrayConfig(name=TRAY, fans=FANS),)
-    model = SiteModel(SITE, trays, AlarmStore(tmp_path / "alarms.sqlite"), keeps_curves=False)
+    model = SiteModel(SITE, trays, AlarmHistory(tmp_path / "alarms.sqlite"))
     states = FanStates(model)
 
     def changed(made: Score, *, is_full: bool = False) -> list[int]:
@@ -96,8 +96,9 @@ def test_the_state_of_a_fan_is_published_again_only_when_it_has_changed(tmp_path
     assert len(changed(replace(faster, t_ns=faster.t_ns + 1), is_full=True)) == FANS
 
 
-def filled(folder: Path, count: int) -> AlarmStore:
-    store = AlarmStore(folder / "alarms.sqlite")
+def filled(folder: Path, count: int) -> AlarmHistory:
+    store = AlarmHistory(folder / "alarms.sqlite")
+    store.set_position(READER, 0)
     for number in range(count):
         store.add(alarm(sequence=number))
     return store

@@ -31,16 +31,18 @@ class Desk:
         )
         self.sent: set[tuple[str, Event]] = set()
         self.saved = Saved(is_first=is_first)
+        self.heard: list[Alarm] = []
         self.begin()
 
     def begin(self) -> None:
         place = Place("hall", self.config.page, self.config.zone)
         self.notifications = Notifications(
-            self.config, place, self.saved, lambda target, event: (target, event) in self.sent
+            self.config, place, self.saved, lambda target, event: (target, event) in self.sent, self.heard
         )
 
     def hear(self, *messages: Alarm) -> None:
         for message in messages:
+            self.heard.append(message)
             self.notifications.add(message, self.now_ns)
 
     def wait(self, seconds: float) -> list[Text]:

@@ -9,7 +9,6 @@ import pytest
 
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.outputs.notify.deciding import Announced, Event, Kind
-from fantwin.pipeline.outputs.notify.fan_alarm import after
 from fantwin.pipeline.outputs.notify.gathering import Gathered, Happened
 from fantwin.pipeline.outputs.notify.notifications import Basket, Changes, Outgoing, Saved
 from fantwin.pipeline.outputs.notify.outbox import Outbox
@@ -37,12 +36,14 @@ def outbox(tmp_path: Path) -> Outbox:
 
 
 def test_all_that_was_decided_is_there_again(outbox, tmp_path):
-    assert outbox.load() == Saved()
-    heard = after(None, alarm(), START_NS)
-    assert heard
+    assert outbox.load() == (Saved(), ())
+    outbox.hear(alarm())
+    outbox.hear(alarm(fan=3))
+    (heard,) = outbox.news(1)
+    assert heard.fan == 2
     saved = Saved(
         is_first=False,
-        alarms={FAN: heard},
+        heard={FAN: (START_NS, START_NS + 1)},
         announced={("mail", FAN): Announced(START_NS, 1, True, START_NS)},
         gathered={("mail", Basket.HELD): Gathered(1, 2, 3, {FAN: Happened((Kind.RAISED, Kind.AGAIN), 4)})},
     )
@@ -50,7 +51,10 @@ def test_all_that_was_decided_is_there_again(outbox, tmp_path):
     save(outbox, saved, changes)
     outbox.close()
     again = Outbox(tmp_path / "outbox", ["mail", "chat"])
-    assert again.load() == saved
+    loaded, past = again.load()
+    assert loaded == saved
+    assert [each.fan for each in past] == [2], "the other was not read before the first one was saved"
+    assert [each.fan for each in again.news(9)] == [3]
     assert again.was_sent("mail", EVENT) and not again.was_sent("chat", EVENT)
     waiting = again.next_for("mail")
     assert waiting and waiting.text == TEXT and not waiting.may_be_repeated
@@ -92,28 +96,29 @@ def test_messages_of_a_target_that_is_gone_are_lost_and_counted(outbox, tmp_path
     assert (again.count(), again.lost) == (1, {"chat": 2})
 
 
-def test_nothing_is_saved_by_halves(outbox):
-    with pytest.raises(KeyError):
-        save(outbox, Saved(), Changes(alarms={FAN}, outgoing=texts("mail").outgoing))
-    heard = after(None, alarm(), START_NS)
-    assert heard
-    outbox._file.execute("DROP TABLE event")
+def test_nothing_is_saved_by_halves(outbox, tmp_path):
+    outbox.load()
+    outbox.hear(alarm())
+    assert len(outbox.news(9)) == 1
+    outbox._store.write("DROP TABLE event")
     with pytest.raises(sqlite3.Error):
-        save(outbox, Saved(alarms={FAN: heard}), Changes({FAN}, events={("mail", EVENT)}))
-    assert outbox._file.execute("SELECT COUNT(*) FROM alarm").fetchone() == (0,)
+        save(outbox, Saved(heard={FAN: (1, 2)}), Changes({FAN}, events={("mail", EVENT)}))
+    outbox.close()
+    again = Outbox(tmp_path / "outbox", ["mail"])
+    assert again.load()[0] == Saved(), "not even that it was read"
 
 
 def test_a_file_that_cannot_be_understood_is_named(outbox, tmp_path):
-    outbox._file.execute("INSERT INTO alarm VALUES ('tray1', 2, 'nonsense')")
+    outbox._store.write("INSERT INTO announced VALUES ('mail', 'tray1', 2, 'nonsense')")
     with pytest.raises(UserError, match="move it away"):
         outbox.load()
     (tmp_path / "text").write_text("this is no database, and long enough to be seen as such\n" * 20)
-    with pytest.raises(UserError, match="messages cannot be kept there"):
+    with pytest.raises(UserError, match="the history of alarms cannot be kept there"):
         Outbox(tmp_path / "text", ["mail"])
 
 
 def test_a_file_that_is_damaged_while_it_is_used_ends_nothing(outbox):
-    outbox._file.execute("DROP TABLE event")
+    outbox._store.write("DROP TABLE event")
     assert not outbox.was_sent("mail", EVENT)
     with pytest.raises(sqlite3.Error):
         save(outbox, Saved(), texts("mail"))

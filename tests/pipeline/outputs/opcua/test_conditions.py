@@ -10,26 +10,20 @@ pytest.importorskip("asyncua")
 
 from asyncua.ua.ua_binary import variant_to_binary
 
-from fantwin.pipeline.outputs.opcua.conditions import ALL_FIELDS, Condition, ConditionBook, event_id, past_condition
+from fantwin.pipeline.outputs.opcua.conditions import ALL_FIELDS, Condition, event_id, past_condition
 from fantwin.pipeline.outputs.opcua.events import condition_event, system_event
 from fantwin.pipeline.site.fleet import Fan
 from fantwin.schemas.enums import Severity, Transition
 from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Alarm, Diagnosis
-from fantwin.scoring.alarms.current_alarms import current_alarms
+from fantwin.scoring.alarms.current_alarms import current_alarm
 from fantwin.scoring.alarms.fan_condition import UNTIL_IT_CLEARS_T_NS
 from tests.stages.test_gateway import NOW_NS, TRAY, alarm
 
 
 def after(*alarms: Alarm) -> Condition:
     """The condition of fan 2 after these messages."""
-    book, heard = ConditionBook(), list[Alarm]()
-    condition = Condition(Fan(TRAY, 2))
-    for each in alarms:
-        heard.append(each)
-        condition = book.add(each, current_alarms(heard)[0])
-    assert book.of(Fan(TRAY, 2)) is condition
-    return condition
+    return Condition(Fan(TRAY, 2), current_alarm(alarms))
 
 
 def test_raised_worse_acknowledged_and_cleared():

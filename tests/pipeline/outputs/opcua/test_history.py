@@ -17,9 +17,9 @@ from asyncua import ua
 
 from fantwin.pipeline.config.models import TrayConfig
 from fantwin.pipeline.outputs.opcua import history
-from fantwin.pipeline.outputs.opcua.history import AlarmHistory
-from fantwin.pipeline.site import alarm_store
-from fantwin.pipeline.site.alarm_store import AlarmStore
+from fantwin.pipeline.outputs.opcua.history import EventHistory
+from fantwin.pipeline.site import alarm_history
+from fantwin.pipeline.site.alarm_history import AlarmHistory
 from fantwin.pipeline.site.site_model import SiteModel
 from fantwin.schemas.enums import Transition
 from tests.support.notified_alarms import START_NS, TRAY, alarm
@@ -33,21 +33,21 @@ SERVER = ua.NodeId(ua.ObjectIds.Server)
 def events(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
     """Of fans 0 to 9 in turn, one a second, but for one request that was refused; asks for the seconds of what is
     found and of what comes next."""
-    store = AlarmStore(tmp_path / "alarms.sqlite")
+    store = AlarmHistory(tmp_path / "alarms.sqlite")
     for number in range(40):
         refused = {"transition": Transition.REFUSED} if number == 5 else {}
         store.add(alarm(fan=number % 10, sequence=number, t_ns=START_NS + number * 10**9 + 999, **refused))
     decoded = 0
 
-    decode = alarm_store._decoded
+    decode = alarm_history._decoded
 
     def counted(data: bytes) -> Any:
         nonlocal decoded
         decoded += 1
         return decode(data)
 
-    monkeypatch.setattr("fantwin.pipeline.site.alarm_store._decoded", counted)
-    found = AlarmHistory(SiteModel("hall", (TrayConfig(name=TRAY, fans=10),), store, keeps_curves=False), NAMESPACE)
+    monkeypatch.setattr("fantwin.pipeline.site.alarm_history._decoded", counted)
+    found = EventHistory(SiteModel("hall", (TrayConfig(name=TRAY, fans=10),), store), NAMESPACE)
 
     def ask(start: float | None, end: float | None, most: int = 0, node: ua.NodeId = SERVER) -> tuple[Any, Any, int]:
         nonlocal decoded

@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from fantwin.pipeline.outputs.rerun.alarm_table import ALARMS_LISTED, AlarmTable
+from fantwin.pipeline.outputs.rerun.alarm_table import ALARMS_LISTED, alarm_table
+from fantwin.pipeline.site.alarm_book import AlarmBook
 from fantwin.schemas.enums import Severity, Statistic, Transition
 from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Alarm, Diagnosis
@@ -15,11 +16,11 @@ from tests.stages.test_viewer import FLUSH_PERIOD_NS, REPEAT_STATES_NS, FakeSink
 from tests.support.score_data import START_NS, made_up_tray
 
 
-class Transitions:
-    """Makes alarms with rising sequence numbers."""
+class Table:
+    """Takes alarms with rising sequence numbers, and shows them."""
 
-    def __init__(self, table: AlarmTable) -> None:
-        self._table = table
+    def __init__(self) -> None:
+        self._book = AlarmBook()
         self._count = 0
 
     def add(self, fan: int, transition: Transition, **more: Any) -> None:
@@ -28,19 +29,22 @@ class Transitions:
         fields = {"active": True, "severity": Severity.ALARM, "confirmed": True, "t_ns": onset_t_ns, "score": 2.0}
         fields |= {"residual_rad_s": 0.0, "residual_std_rad_s": 1.0, "statistic": Statistic.DEVIATION, "message": "so"}
         header = Header("scorer", self._count, "tray1")
-        self._table.add(
+        self._book.add(
             Alarm(header=header, fan=fan, onset_t_ns=onset_t_ns, transition=transition, **{**fields, **more})
         )
 
+    def text(self) -> str:
+        return alarm_table(self._book.all(), START_NS)
 
-def rows(table: AlarmTable) -> list[str]:
+
+def rows(table: Table) -> list[str]:
     return [line for line in table.text().splitlines() if line.startswith("| ")][1:]
 
 
 def test_active_alarms_come_first_with_cause_and_who_has_seen_them_and_those_over_and_seen_are_gone() -> None:
-    table = AlarmTable()
+    table = Table()
     assert rows(table) == [] and table.text().startswith("#### No alarms")
-    alarms = Transitions(table)
+    alarms = table
     alarms.add(1, Transition.RAISED)
     alarms.add(1, Transition.DIAGNOSED, causes=(Diagnosis(cause="drag_up", probability=0.9),))
     alarms.add(2, Transition.RAISED, severity=Severity.WARNING)
@@ -60,8 +64,8 @@ def test_active_alarms_come_first_with_cause_and_who_has_seen_them_and_those_ove
 
 
 def test_of_many_alarms_the_newest_are_listed_and_the_rest_counted() -> None:
-    table = AlarmTable()
-    alarms = Transitions(table)
+    table = Table()
+    alarms = table
     for fan in range(ALARMS_LISTED + 5):
         alarms.add(fan, Transition.RAISED)
     assert len(rows(table)) == ALARMS_LISTED and rows(table)[0].startswith(f"| **tray1/{ALARMS_LISTED + 4}**")

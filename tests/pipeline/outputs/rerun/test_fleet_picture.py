@@ -34,10 +34,10 @@ def red_share(png: bytes) -> float:
 
 @pytest.mark.slow
 @needs_a_driver
-def test_the_overview_shows_the_alarm_from_when_it_was_raised_and_the_viewer_has_no_report(view_file: Path) -> None:
+def test_the_log_shows_the_alarm_from_when_it_was_raised_and_the_viewer_has_no_report(view_file: Path) -> None:
     before, during = (rerun_picture.draw_picture(view_file, view="alarm log", at_s=at_s) for at_s in (6.0, 12.0))
     assert red_share(before.png) == 0.0
     assert red_share(during.png) > 1e-4
     whole = rerun_picture.draw_picture(view_file)
-    assert set(whole.reports) == {"the worst fans", "alarms", "alarm log", "fans in alarm, suspect"}
+    assert {"alarms", "alarm log", "plot 1: a fan in alarm"} <= set(whole.reports)
     assert [report for each in (before, during, whole) for of in each.reports.values() for report in of] == []

@@ -47,7 +47,7 @@ def test_row_09_a_view_on_a_full_disk_is_reported_and_the_viewer_goes_on_and_end
         web_port=None,
         memory_limit="256MB",
     )
-    core = ViewerCore(trays, sink)
+    core = ViewerCore("site", trays, sink)
     with (small_disk / "ballast").open("wb", buffering=0) as ballast, pytest.raises(OSError, match="No space"):
         while True:
             ballast.write(bytes(4096))

@@ -2,31 +2,20 @@
 
 from __future__ import annotations
 
-import threading
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
-
-from fantwin.pipeline.bus.session import Bus
-from fantwin.pipeline.config.models import TrayConfig
 from fantwin.pipeline.config.registry import STAGES
 from fantwin.pipeline.runtime.figures import without_figures
+from fantwin.pipeline.site.site_model import SiteModel
 from fantwin.pipeline.site.site_state import StageState, Word
-from fantwin.pipeline.site.site_watcher import SiteWatcher
-from fantwin.schemas.codec import CodecError, decode
 from fantwin.schemas.enums import InvalidReason
 from fantwin.schemas.fan_numbers import fans_in_words
-from fantwin.schemas.messages import Alarm, Score
-from fantwin.schemas.topics import tray_key
+from fantwin.schemas.messages import Alarm
 from fantwin.scoring.alarms.current_alarms import CurrentAlarm
-from fantwin.scoring.alarms.unscored_monitor import JUDGED_AT_REST, REASONS
-from fantwin.scoring.alarms.words_now import STARTING, STOPPED, words_now
+from fantwin.scoring.alarms.unscored_monitor import REASONS
+from fantwin.scoring.alarms.words_now import STARTING, STOPPED
 
-JUDGED_WITHIN_S = 5.0
-"""a fan is judged now if it had a valid score, or was stopped or starting, this recently"""
-_SAMPLED_S = 0.1  # scores of a tray are looked at this often: a fast line sends hundreds a second
 _LAST_JUDGE = "scorer"
 
 
@@ -79,95 +68,28 @@ class AtRest:
         return {"tray": self.tray, "fans": list(self.fans), "state": self.reason.words}
 
 
-class JudgedFans:
-    """Listens to the scores of a site. Thread-safe."""
+def unjudged(model: SiteModel, states: Sequence[StageState]) -> list[Unjudged]:
+    """The fans that are not judged now, and why. states: of the site's stages; one may be the reason."""
+    found: list[Unjudged] = []
+    for tray in model.trays:
+        if late := _why_late(tray.name, states):
+            found.append(Unjudged(tray.name, (), late))
+            continue
+        reasons = model.not_judged(tray.name)
+        if reasons is None:
+            found.append(Unjudged(tray.name, (), _why_no_scores(tray.name, states)))
+            continue
+        for reason, fans in reasons.items():
+            why = REASONS.get(reason, reason.words)
+            found.append(Unjudged(tray.name, () if len(fans) == tray.fans else fans, why))
+    return found
 
-    def __init__(
-        self,
-        bus: Bus,
-        site: str,
-        trays: Sequence[TrayConfig],
-        watcher: SiteWatcher,
-        now_s: Callable[[], float] = time.monotonic,
-    ) -> None:
-        """watcher: knows whose scores count."""
-        self._site = site
-        self._watcher = watcher
-        self._trays = trays
-        self._now_s = now_s
-        self._lock = threading.Lock()
-        self._seen_s: dict[str, float] = {}
-        """by tray: when a score was looked at"""
-        self._judged_s = {tray.name: np.full(tray.fans, -np.inf) for tray in trays}
-        self._reasons = {tray.name: np.zeros(tray.fans, np.uint8) for tray in trays}
-        self._states = {tray.name: np.zeros(tray.fans, np.uint8) for tray in trays}
-        for tray in trays:
-            bus.subscribe(tray_key(site, tray.name, "score"), lambda _key, data, name=tray.name: self.add(name, data))
 
-    def add(self, tray: str, payload: bytes) -> None:
-        """A score of a tray has arrived."""
-        now_s = self._now_s()
-        if now_s - self._seen_s.get(tray, -np.inf) < _SAMPLED_S:
-            return
-        try:
-            score = decode(Score, payload)
-        except CodecError:
-            return
-        judged_s = self._judged_s[tray]
-        if not isinstance(score, Score) or score.fans != len(judged_s) or not len(score.valid):
-            return
-        if not self._watcher.counts(tray_key(self._site, tray, "score"), score.header.producer):
-            return
-        with self._lock:
-            self._seen_s[tray] = now_s
-            judged = score.valid | np.isin(score.invalid_reason, JUDGED_AT_REST)
-            judged_s[judged.any(axis=0)] = now_s
-            self._reasons[tray], self._states[tray] = score.invalid_reason[-1], score.state[-1]
-
-    def at_rest(self) -> list[AtRest]:
-        """The fans that are stopped or starting now; they are judged by whether they stand or turn as commanded."""
-        oldest_s = self._now_s() - JUDGED_WITHIN_S
-        with self._lock:
-            return [
-                AtRest(tray.name, tuple(np.flatnonzero(self._reasons[tray.name] == reason).tolist()), reason)
-                for tray in self._trays
-                for reason in JUDGED_AT_REST
-                if self._seen_s.get(tray.name, -np.inf) >= oldest_s and (self._reasons[tray.name] == reason).any()
-            ]
-
-    def words_now(self) -> dict[tuple[str, int], str]:
-        """What each fan does that is stopped, starting or returning now, for people, by tray and fan."""
-        oldest_s = self._now_s() - JUDGED_WITHIN_S
-        with self._lock:
-            newest = [
-                (tray.name, fan, words_now(state, reason))
-                for tray in self._trays
-                if self._seen_s.get(tray.name, -np.inf) >= oldest_s
-                for fan, (state, reason) in enumerate(
-                    zip(self._states[tray.name].tolist(), self._reasons[tray.name].tolist(), strict=True)
-                )
-            ]
-        return {(tray, fan): words for tray, fan, words in newest if words}
-
-    def unjudged(self, states: Sequence[StageState]) -> list[Unjudged]:
-        """The fans that are not judged now, and why. states: of the site's stages; one may be the reason."""
-        oldest_s = self._now_s() - JUDGED_WITHIN_S
-        found: list[Unjudged] = []
-        with self._lock:
-            for tray in self._trays:
-                if late := _why_late(tray.name, states):
-                    found.append(Unjudged(tray.name, (), late))
-                    continue
-                fans = np.flatnonzero(self._judged_s[tray.name] < oldest_s)
-                if len(fans) and self._seen_s.get(tray.name, -np.inf) < oldest_s:
-                    found.append(Unjudged(tray.name, (), _why_no_scores(tray.name, states)))
-                    continue
-                reasons = self._reasons[tray.name][fans]
-                for reason in np.unique(reasons).tolist():
-                    of_reason = tuple(fans[reasons == reason].tolist())
-                    why = REASONS.get(InvalidReason(reason), InvalidReason(reason).words)
-                    found.append(Unjudged(tray.name, () if len(of_reason) == tray.fans else of_reason, why))
-        return found
+def at_rest(model: SiteModel) -> list[AtRest]:
+    """The fans that are stopped or starting now; they are judged by whether they stand or turn as commanded."""
+    return [
+        AtRest(tray.name, fans, reason) for tray in model.trays for reason, fans in model.at_rest(tray.name).items()
+    ]
 
 
 def as_judged(alarms: Sequence[CurrentAlarm], unjudged: Sequence[Unjudged]) -> list[CurrentAlarm]:

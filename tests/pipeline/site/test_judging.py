@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 from fantwin.pipeline.config.models import TrayConfig
-from fantwin.pipeline.site.judged_fans import JUDGED_WITHIN_S, JudgedChanges, JudgedFans, Unjudged, as_judged
+from fantwin.pipeline.site.fleet import Fan
+from fantwin.pipeline.site.judging import JudgedChanges, Unjudged, as_judged, at_rest, unjudged
+from fantwin.pipeline.site.site_model import SILENT_AFTER_S
 from fantwin.pipeline.site.site_state import StageState, Word
 from fantwin.pipeline.site.site_watcher import SiteWatcher
 from fantwin.schemas.codec import encode
@@ -33,14 +35,20 @@ class Listener:
     def __init__(self) -> None:
         self.bus: Any = StubBus()
         self.now_s = 100.0
-        self.judged = JudgedFans(self.bus, "s", TRAYS, SiteWatcher(self.bus, "s"), lambda: self.now_s)
+        self.watcher = SiteWatcher(self.bus, "s", trays=TRAYS, has_scores=True)
+        self.model = self.watcher.model
+        self.model._now_s = lambda: self.now_s
 
     def score(self, tray: str, *reasons: InvalidReason, producer: str = "") -> None:
+        self.hear(tray, encode(replace(one_sample(FANS, *reasons), header=Header(producer, 0, tray))))
+
+    def hear(self, tray: str, payload: bytes) -> None:
         self.now_s += 1.0
-        self.judged.add(tray, encode(replace(one_sample(FANS, *reasons), header=Header(producer, 0, tray))))
+        key = tray_key("s", tray, "score")
+        self.bus.subscribers[key](key, payload)
 
     def lines(self, *states: StageState) -> list[str]:
-        return [each.line() for each in self.judged.unjudged(states)]
+        return [each.line() for each in unjudged(self.model, states)]
 
 
 @pytest.fixture
@@ -58,7 +66,7 @@ def test_row_01_fans_that_are_not_judged_are_named_with_the_reason_and_one_inval
     listener.score("b")
     listener.score("a", InvalidReason.GAP)
     assert listener.lines() == []
-    listener.now_s += JUDGED_WITHIN_S
+    listener.now_s += SILENT_AFTER_S
     listener.score("a", InvalidReason.STALE, InvalidReason.NONE, InvalidReason.STALE, InvalidReason.NO_SPEED)
     listener.score("b", *[InvalidReason.WARMING_UP] * FANS)
     assert listener.lines() == [
@@ -71,11 +79,11 @@ def test_row_01_fans_that_are_not_judged_are_named_with_the_reason_and_one_inval
 def test_what_fans_do_now_is_known_as_long_as_scores_come(listener):
     sample = one_sample(FANS, InvalidReason.NONE, InvalidReason.STOPPED, InvalidReason.NONE, InvalidReason.STARTING)
     states = np.array([[FanState.RETURNING, FanState.RETURNING, FanState.ALARM, FanState.STARTING]], np.uint8)
-    listener.judged.add("a", encode(replace(sample, header=Header("", 0, "a"), state=states)))
-    now = {("a", 0): RETURNING, ("a", 1): "stopped by its command", ("a", 3): "starting"}
-    assert listener.judged.words_now() == now
-    listener.now_s += JUDGED_WITHIN_S + 1.0
-    assert listener.judged.words_now() == {}
+    listener.hear("a", encode(replace(sample, header=Header("", 0, "a"), state=states)))
+    fans = [Fan("a", number) for number in range(FANS)]
+    assert listener.model.words_now(fans) == [RETURNING, "stopped by its command", "", "starting"]
+    listener.now_s += SILENT_AFTER_S + 1.0
+    assert listener.model.words_now(fans) == [""] * FANS
 
 
 def test_row_11_a_score_of_a_stranger_judges_no_fan_while_the_scorer_is_alive(listener):
@@ -90,7 +98,7 @@ def test_row_11_a_score_of_a_stranger_judges_no_fan_while_the_scorer_is_alive(li
 def test_row_01_without_scores_the_first_stage_that_does_not_work_is_the_reason(listener):
     listener.score("a")
     listener.score("b")
-    listener.now_s += JUDGED_WITHIN_S
+    listener.now_s += SILENT_AFTER_S
     listener.score("b")
     twin = state("twin_integrator", Word.SILENT, "no health for 6 s: it hangs, is blocked or gets no processor time")
     others = [state("acquisition/a", Word.OK), state("acquisition/b", Word.SILENT, "of another tray")]
@@ -113,7 +121,7 @@ def test_row_11_scores_that_are_late_judge_nobody_however_many_come(listener):
 
 @pytest.mark.parametrize("payload", [b"\xff", b"", encode(one_sample(FANS + 1))])
 def test_bytes_that_are_no_score_of_the_tray_judge_nothing(listener, payload):
-    listener.judged.add("a", payload)
+    listener.hear("a", payload)
     assert len(listener.lines()) == 2
 
 
@@ -121,14 +129,14 @@ def test_a_fan_that_its_command_stops_is_judged_and_said_to_be_stopped(listener)
     listener.score("a", InvalidReason.STOPPED, InvalidReason.NONE, InvalidReason.STOPPED, InvalidReason.STARTING)
     listener.score("b", InvalidReason.STOPPED)
     assert listener.lines() == []
-    assert [each.line() for each in listener.judged.at_rest()] == [
+    assert [each.line() for each in at_rest(listener.model)] == [
         "a: fans 0, 2: stopped by their command",
         "a: fan 3: starting",
         "b: fan 0: stopped by its command",
     ]
-    assert listener.judged.at_rest()[1].as_json() == {"tray": "a", "fans": [3], "state": "starting"}
-    listener.now_s += 2 * JUDGED_WITHIN_S
-    assert listener.judged.at_rest() == []
+    assert at_rest(listener.model)[1].as_json() == {"tray": "a", "fans": [3], "state": "starting"}
+    listener.now_s += 2 * SILENT_AFTER_S
+    assert at_rest(listener.model) == []
 
 
 def test_changes_are_of_fans_and_reasons_and_not_of_figures():
