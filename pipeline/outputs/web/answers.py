@@ -48,14 +48,23 @@ class Tray(BaseModel):
     viewer_url: str
 
 
+class Channel(BaseModel):
+    """What is measured of a fan beside its speed; a column of `Curves`."""
+
+    name: str
+    title: str
+    unit: str
+
+
 class Site(BaseModel):
-    """What does not change: the trays, and name, group and present state in words of each class of a cell."""
+    """What does not change: the trays, the channels, and name, group and words for now of each class of a cell."""
 
     site: str
     trays: list[Tray]
     classes: list[str]
     groups: list[FanGroup]
     now: list[str]
+    channels: list[Channel]
     level_at_limit: int
 
 
@@ -168,7 +177,10 @@ class FanInFull(Fan):
 
 
 class Curves(BaseModel):
-    """Samples of a fan as columns: speeds in the unit of the tray; null: not measured or not judged."""
+    """Samples of a fan as columns, with one for each channel: speeds in the unit of the tray; null: not known."""
+
+    model_config = ConfigDict(extra="allow")
+    __pydantic_extra__: dict[str, list[float | None]] = Field(init=False)  # type: ignore[assignment]
 
     speed_unit: str
     t_s: list[float]
