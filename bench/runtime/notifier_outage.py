@@ -25,10 +25,10 @@ from bench.printing import JsonOption, progress, show
 from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.config.models import BusConfig
 from fantwin.pipeline.outputs.notify.sending import MAY_BE_REPEATED
+from fantwin.pipeline.site.alarm_history import FILE
 from fantwin.schemas.codec import encode, type_name
 from fantwin.schemas.messages import Alarm
 from fantwin.schemas.topics import BY_NAME, tray_key
-from fantwin.stages.notifier import OUTBOX
 from tests.support.message_receivers import MailServer
 from tests.support.notified_alarms import alarm, secret
 from tests.support.running_chain import RunningCommand, eventually
@@ -151,7 +151,7 @@ def row_of(site: Site, outage_s: float, back_s: float) -> dict[str, float | str]
 
 
 def waiting(folder: Path) -> int:
-    file = sqlite3.connect(f"file:{folder / 'runs' / OUTBOX}?mode=ro", uri=True)
+    file = sqlite3.connect(f"file:{folder / 'runs' / FILE}?mode=ro", uri=True)
     try:
         return file.execute("SELECT COUNT(*) FROM message").fetchone()[0]
     finally:

@@ -88,7 +88,7 @@ def test_a_blocked_rotor_on_the_pins_is_an_alarm(board: SimulatedBoard, chain: C
         board.order(f"send {spoilt_frame().hex()}")
         eventually(lambda: published(view_of(watcher, "scorer")) > scored + 250, "the baseline is complete")
         board.order(f"block {FAN}")
-        eventually(watcher.alarms, "an alarm is raised")
+        eventually(watcher.current_alarms, "an alarm is raised")
     assert up.end() == 0
     outcome = up.output()
     pace = board.end()

@@ -10,11 +10,11 @@ import pytest
 
 from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.config.models import BusConfig
+from fantwin.pipeline.site.alarm_history import FILE
 from fantwin.schemas.codec import decode, encode, type_name
 from fantwin.schemas.health import Health
 from fantwin.schemas.messages import Alarm
 from fantwin.schemas.topics import BY_NAME, health_key, tray_key
-from fantwin.stages.notifier import OUTBOX
 from tests.support.message_receivers import MailServer
 from tests.support.notified_alarms import alarm, cleared, secret
 from tests.support.running_chain import RunningCommand, eventually
@@ -47,7 +47,7 @@ def mail() -> Iterator[MailServer]:
 
 
 def waiting(folder: Path) -> int:
-    file = sqlite3.connect(f"file:{folder / 'runs' / OUTBOX}?mode=ro", uri=True)
+    file = sqlite3.connect(f"file:{folder / 'runs' / FILE}?mode=ro", uri=True)
     try:
         return file.execute("SELECT COUNT(*) FROM message").fetchone()[0]
     finally:
