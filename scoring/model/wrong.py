@@ -20,7 +20,7 @@ PRIOR = (0.5, 1000.0)
 """times that readings of a tacho of which nothing is known were wrong, and readings"""
 PRIOR_LONGER = 10.0
 """such times of which no more went on than chance would have it"""
-LONGEST = 8
+LONGEST = 4
 """wrong readings, one after the other; more are no tacho's"""
 FEWEST, ONE_MORE = 2, 2
 """readings that must agree at least; and samples more than they take where they are alike: a reading may be seen in one
@@ -30,7 +30,7 @@ sample more than its time, and the last one has to be seen"""
 class WrongReadings(Saved):
     """Follows the far readings of the fans of one tray."""
 
-    KEPT = ("_times", "_readings", "_lasted", "_side", "_long", "_different", "agree")
+    KEPT = ("_times", "_readings", "_lasted", "_side", "_long", "_different", "_std", "agree")
 
     def __init__(self, fans: Fans, bin_s: float, period_s: float, log_limit: float) -> None:
         """Begin without a reading. bin_s: within which samples of a reading that is not held count as one; period_s: of
@@ -41,8 +41,9 @@ class WrongReadings(Saved):
         self._holds = fans.held_s > 0.0
         """(fans,) whether a tacho holds its readings, so that they tell one from another"""
         self._log_limit = log_limit
-        self._times, self._readings = np.zeros((2, count))
-        """(fans,) how often they were wrong for a while, and how many there were"""
+        self._times, self._readings, self._std = np.zeros((3, count))
+        """(fans,) how often they were wrong for a while; how many there were; and what is expected of a healthy fan has
+        this standard deviation, rad/s: in an alarm the one of before it, since the fault is not known yet"""
         self.begin_again(np.ones(count, np.bool_))
         self._lasted = np.zeros(LONGEST)
         """how often those of the tray were wrong for at least 1, 2, ... readings"""
@@ -71,8 +72,9 @@ class WrongReadings(Saved):
         samples ago an alarm was raised, -1: there is none.
         """
         known = np.isfinite(distances_rad_s[0])
+        self._std = np.where(raised < 0, std_rad_s, self._std)
         with np.errstate(invalid="ignore"):
-            far = np.abs(distances_rad_s) > FAR_SIGMAS * std_rad_s
+            far = np.abs(distances_rad_s) > FAR_SIGMAS * np.stack((std_rad_s, self._std))[:, np.newaxis]
         self._readings += known.sum(axis=0) / self._held
         if not far.any() and not self._side.any():
             self.agree = np.zeros_like(self.agree)

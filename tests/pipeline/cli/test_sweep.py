@@ -198,7 +198,7 @@ class AcquisitionOfRefusals:
     """The bus and the acquisition of a tray at once."""
 
     def __init__(self) -> None:
-        self.published = 0
+        self.id, self.published = "1", 0
         self.is_there = True
         self.commands = DeviceCommands(TRAY_OF_SIX, RefusesFan4())  # type: ignore[arg-type]
 

@@ -332,7 +332,8 @@ def test_invalid_input_is_a_one_line_error(folder, tmp_path):
     twin, held_out = folder / "healthy.onnx", folder / "held-out.mcap"
     assert "has fans 0, 1, the runs have 0, 1, 2" in error_of("report", folder / "two.onnx", folder / "three.mcap")
     assert "no such file" in error_of("report", tmp_path / "nowhere.onnx", held_out)
-    assert "not an ONNX file" in error_of("report", held_out, held_out)
+    (tmp_path / "text.onnx").write_text("text")
+    assert "not an ONNX file" in error_of("report", tmp_path / "text.onnx", held_out)
     assert "cannot read the recording" in error_of("report", twin, tmp_path / "nowhere.mcap")
     (tmp_path / "file").touch()
     assert "cannot be created" in error_of("report", twin, held_out, "-o", tmp_path / "file" / "page.html")

@@ -117,7 +117,7 @@ def test_an_existing_view_is_kept_and_a_recording_without_scores_is_one_line(tmp
     assert not (tmp_path / "new.rrd").exists()
 
 
-def test_a_recording_of_a_fleet_shows_its_overview_and_has_a_plot_for_the_fan_in_alarm(tmp_path: Path) -> None:
+def test_a_recording_of_a_fleet_has_a_plot_for_the_fan_in_alarm(tmp_path: Path) -> None:
     trays = {f"fans.{tray}": "3" for tray in TRAYS}
     with RecordingWriter(tmp_path / "fleet.mcap", {"trays": ",".join(TRAYS), **trays}, {}) as writer:
         for number, message in enumerate(messages_of()):
@@ -127,6 +127,4 @@ def test_a_recording_of_a_fleet_shows_its_overview_and_has_a_plot_for_the_fan_in
     fleet = recorded.recorded_site([writer.path])
     assert recorded.write_view(fleet, tmp_path / "fleet.rrd", ViewOptions(fleet_above=3)) == []
     rows = rows_of(tmp_path / "fleet.rrd")
-    in_alarm = [(t_ns - START_NS) / 1e9 for t_ns, row in rows["/fleet/counts/in_alarm"] if row["Scalars:scalars"][0]]
-    assert 8.5 <= in_alarm[0] <= 9.1 and 14.0 <= in_alarm[-1] <= 15.1
     assert "/shown/plot_1/tray2/fan_2/speed" in rows and "/shown/score/plot_1" in rows
