@@ -92,6 +92,16 @@ def _pip(folder: Path | None = None) -> str:
     return "pip install" if is_active else f"{program} install"
 
 
+def require_torch(what: str) -> None:
+    """Raise an error if `what` lacks PyTorch, which no extra brings.
+
+    Raises:
+        UserError: it is not installed.
+    """
+    if not is_installed("torch"):
+        raise UserError(f"{what} needs PyTorch: {how_to_install('torch')}")
+
+
 def _uv_tool(requirement: str, origin: dict[str, Any]) -> str:
     """The command for a tool of uv. uv replaces a tool as a whole, so fantwin is named again with its origin, and so is
     all that was installed with it."""

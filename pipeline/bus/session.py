@@ -230,7 +230,10 @@ class Bus:
         self._declared.append(answer_for_kept(self._session, key_expression, on_query))
 
     def ask_for_kept(self, key: str, timeout_s: float) -> tuple[list[bytes], bool]:
-        """What each keeper of a key has, empty if nothing, and whether all have answered in time. Waits for it."""
+        """What each session that keeps messages of a key has, empty if nothing, and whether all answered in time.
+
+        Waits for the answers.
+        """
         return ask_for_kept(self._session, key, timeout_s)
 
     def require_rights(self, stop: threading.Event | None = None, *, of_role: bool = False) -> None:

@@ -135,6 +135,7 @@ def printed_by(command: str, capsys: pytest.CaptureFixture[str], monkeypatch: py
         ("view r.mcap -o r.png", "fantwin[report]"),
         (f"report {DEMO / 'twin.onnx'} r.mcap", "fantwin[report]"),
         ("report s3://bucket/day.mcap", "fantwin[remote]"),
+        ("train r.mcap -o t.onnx --trainer adam", "torch"),
         ("report r.mcap r.mcap --jobs tcp://127.0.0.1:1", "fantwin[remote]"),
     ],
 )

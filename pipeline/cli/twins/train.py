@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
 
 import typer
 
@@ -39,6 +39,7 @@ from fantwin.pipeline.cli.twins.training_data import (
     twin_errors,
 )
 from fantwin.pipeline.errors import UsageError
+from fantwin.pipeline.extras import require_torch
 
 if TYPE_CHECKING:
     from fantwin.schemas.reference_conditions import ReferenceConditions
@@ -48,6 +49,8 @@ if TYPE_CHECKING:
     from fantwin.twin.progress import Progress
 
 
+Trainer: TypeAlias = Literal["levenberg-marquardt", "adam"]
+"""written again, since twin takes a while to load"""
 NETWORKS = 4
 """with so many, twins hardly depend on the seed: docs/reference/benchmarks.md"""
 
@@ -58,6 +61,7 @@ class TrainingSettings:
 
     model: str = "hybrid"
     seed: int = 0
+    trainer: Trainer = "levenberg-marquardt"
     iterations: int | None = None
     network_inputs: tuple[str, ...] | None = None
     networks: int | None = None
@@ -95,6 +99,9 @@ def train(
     ignore: IgnoreOption = None,
     name: Annotated[str | None, typer.Option(help="Name of the twin. Default: the name of the file.")] = None,
     seed: Annotated[int, typer.Option(help="The same seed and recordings give the same twin.")] = 0,
+    trainer: Annotated[
+        Trainer, typer.Option(help="adam, the published one, needs PyTorch.")
+    ] = DEFAULT_SETTINGS.trainer,
     iterations: Annotated[
         int | None, typer.Option(min=1, help="Maximum iterations of each network. Default: depends on the model.")
     ] = None,
@@ -129,18 +136,23 @@ def train(
 
     Example: fantwin train new-tray.mcap --type type.onnx -o new-tray.onnx
     """
-    given = TrainingSettings(model, seed, iterations, None, networks, command_unit)
+    given = TrainingSettings(model, seed, trainer, iterations, None, networks, command_unit)
     part = Part(tray, fans, from_s, to_s, tuple(window_s or ()), ignored_columns(ignore))
     if type_twin and (given != DEFAULT_SETTINGS or window_s or ignore):
         raise UsageError("--type keeps the network of the type: leave out the options of a model and of its training")
     not_written = "no twin was written; --iterations N ends after N iterations of each network and writes one"
+    if trainer == "adam":
+        require_torch("--trainer adam")
     pool = RecordingsInParallel(jobs, skip_bad)
     with interruptible("no twin was written" if type_twin else not_written), twin_errors():
         chosen = _chosen(model)
         if len(chosen) > 1:
             data = partial(_read, recordings, validate, test, part, pool)
-            if networks is not None:
-                raise UsageError("--networks is for one model: models are compared with one network each")
+            if networks is not None or trainer != DEFAULT_SETTINGS.trainer:
+                raise UsageError(
+                    "--networks and --trainer are for one model: models are compared with one network each, "
+                    "trained alike"
+                )
             how = {"seed": seed, "iterations": iterations, "command_unit": command_unit}
             train_side_by_side(chosen, data, output, pool, **how, json_output=json_output)
             return
@@ -246,7 +258,7 @@ def fit_twin(
     from fantwin.twin.networks import one_after_another  # noqa: PLC0415
     from fantwin.twin.progress import unreported  # noqa: PLC0415
 
-    can_average = find_kind(settings.model).averages_networks
+    can_average = find_kind(settings.model).averages_networks and settings.trainer == DEFAULT_SETTINGS.trainer
     return train_twin(
         training_data.runs,
         held_out.runs if held_out else [],
@@ -254,6 +266,7 @@ def fit_twin(
         name=name,
         seed=settings.seed,
         max_iterations=settings.iterations,
+        trainer=settings.trainer,
         network_inputs=settings.network_inputs or BOTH_INPUTS,
         networks=settings.networks if settings.networks is not None else NETWORKS if can_average else 1,
         each_network=each_network or one_after_another,
