@@ -169,7 +169,7 @@ class AlarmHistory:
             return
 
     def begins_t_ns(self) -> int | None:
-        """From when on the history is complete; None: nobody has said it.
+        """Time from which on the history is complete; None: it is not known.
 
         Raises:
             UserError: the file cannot be read.
@@ -227,7 +227,7 @@ class AlarmHistory:
         return self._alarms(query, number=number, most=most)
 
     def last_occurrences(self, until: int) -> Sequence[Alarm]:
-        """Of each fan, the transitions of its last alarm up to a number: what its current alarm then follows from.
+        """Transitions of the last alarm of each fan up to a number: its current alarm then follows from them.
 
         Raises:
             UserError: the file cannot be read.

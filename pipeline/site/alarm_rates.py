@@ -43,7 +43,7 @@ SELECT feedback, COUNT(*) FROM alarm WHERE tray = :tray AND :twin = (
 
 
 class AlarmRates:
-    """In the file of a history; not thread-safe, like it."""
+    """Rates of alarms, from the file of a history; not thread-safe, as the history."""
 
     def __init__(self, history: AlarmHistory) -> None:
         self._history, self._store = history, history.store

@@ -218,7 +218,7 @@ class Fleet:
         return self._of_tray[fan.tray].start + fan.number
 
     def not_judged(self, tray: str, since_s: float) -> dict[InvalidReason, tuple[int, ...]]:
-        """By the reason of the newest sample, the fans of a tray that were not judged since then."""
+        """Fans of a tray that were not judged since then, by the reason of the newest sample."""
         of_tray = self._of_tray[tray]
         fans = np.flatnonzero(self._judged_s[of_tray] < since_s)
         reasons = self._reasons[of_tray][fans]

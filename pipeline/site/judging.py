@@ -32,14 +32,14 @@ class Unjudged:
         return tray == self.tray and (not self.fans or fan in self.fans)
 
     def line(self) -> str:
-        """For people."""
+        """A text for people."""
         if not self.fans:
             return f"{self.tray}: no fan is judged: {self.why}"
         names = fans_in_words(self.fans)
         return f"{self.tray}: {'fan' if len(self.fans) == 1 else 'fans'} {names} not judged: {self.why}"
 
     def as_json(self) -> dict[str, object]:
-        """For machines; no fans: all of the tray."""
+        """JSON values for machines; no fans: all of the tray."""
         return {"tray": self.tray, "fans": list(self.fans), "why": self.why}
 
 
@@ -52,7 +52,7 @@ class AtRest:
     reason: InvalidReason
 
     def line(self) -> str:
-        """For people."""
+        """A text for people."""
         names = fans_in_words(self.fans)
         return f"{self.tray}: {'fan' if len(self.fans) == 1 else 'fans'} {names}: {self.words}"
 
@@ -64,7 +64,7 @@ class AtRest:
         return STOPPED if len(self.fans) == 1 else STOPPED.replace("its", "their")
 
     def as_json(self) -> dict[str, object]:
-        """For machines."""
+        """JSON values for machines."""
         return {"tray": self.tray, "fans": list(self.fans), "state": self.reason.words}
 
 
@@ -111,7 +111,7 @@ class JudgedChanges:
         self._known = _by_tray(listed)
 
     def lines(self, unjudged: Sequence[Unjudged]) -> list[str]:
-        """Of each tray where other fans are not judged, or for another reason: these fans, or that none is left."""
+        """A line on each tray where other fans are not judged, or for another reason; or where all are judged now."""
         before, self._known = self._known, _by_tray(unjudged)
         changed = [
             tray
@@ -133,7 +133,7 @@ def _by_tray(unjudged: Sequence[Unjudged]) -> dict[str, list[Unjudged]]:
 
 
 def _meaning(unjudged: Sequence[Unjudged]) -> list[tuple[tuple[int, ...], str]]:
-    """Without the figures of the reasons, which change all the time."""
+    """Fans and reasons, without the figures in these, which change all the time."""
     return [(each.fans, without_figures(each.why)) for each in unjudged]
 
 

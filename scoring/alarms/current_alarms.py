@@ -112,7 +112,7 @@ class CurrentAlarm:
 
 
 def needed(messages: Sequence[Alarm]) -> list[Alarm]:
-    """Of the messages about a fan, in the order sent, the few from which its current alarm follows.
+    """The few messages about a fan, in the order sent, from which its current alarm follows.
 
     The others never matter again, whatever is published next.
     """

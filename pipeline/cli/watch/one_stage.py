@@ -108,6 +108,6 @@ class Problems:
 
 
 def _say(line: str) -> None:
-    """To standard error; the launcher that reads it may have gone."""
+    """Write a line to standard error; the launcher that reads it may have gone."""
     with suppress(OSError):
         os.write(sys.stderr.fileno(), f"{line}\n".encode())

@@ -190,7 +190,7 @@ class Api:
         )
 
     async def metrics(self, request: Request) -> Response:
-        """For Prometheus."""
+        """Metrics in the text format of Prometheus."""
         await self.access.require_scraper(request)
         return Response(await run_in_threadpool(metrics_text, self.model, self.feed.readers), media_type=METRICS_TYPE)
 

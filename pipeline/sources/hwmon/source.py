@@ -105,7 +105,7 @@ class HwmonDevice:
         )
 
     def _measured(self, chip: ChipFolder) -> dict[str, tuple[float, ...]]:
-        """By name of channel; empty where it has no file."""
+        """Values by name of channel; empty where it has no file."""
         scale = 1e-3 * self._config.voltage_scale
         return {
             SUPPLY_VOLTAGE: tuple(_value(chip, f"in{number}_input", scale) for number in self._voltages),
