@@ -30,9 +30,10 @@ from fantwin.simulation.tray import SimulatedTray, TraySample, TraySettings
 SITE, PRODUCER, FANS, RATE_HZ = "fleet", "feed-1", 8, 100
 FAULT_S, PERIOD_S = 6.0, 10.0
 """a fault of this length begins once in each period"""
-FREE_RUN_BEGINS_AGAIN_S = 8.0
-"""by how much an alarm may move where resampler or integrator are restarted: with the free run the statistics begin
-again, and are valid after the warm-up of 3 s. Where only scorer and recorder are, no alarm moves"""
+FREE_RUN_BEGINS_AGAIN_S = 13.0
+"""by how much an alarm may move where resampler or integrator are restarted: the free run begins again and is valid after
+the warm-up of 3 s, and the ten seconds for which a fan must be like a healthy one are counted again. Where only scorer
+and recorder are restarted, no alarm moves"""
 SHIFT = 50
 """samples by which a tray begins later in the run of the fans than the one before"""
 BUSY = "restart_delay_max_s = 0.5\nstop_timeout_s = 120\n"
