@@ -54,9 +54,5 @@ class UnseenError:
         if not unseen_rad_s.any():
             return nowhere, nowhere
         of_speed, of_needed = np.nan_to_num(unseen_rad_s)
-        slope = np.maximum(self._needed_by_speed(measured_rad_s), 0.0)
+        slope = np.maximum(self.viscous + 2.0 * self.drag * np.abs(measured_rad_s), 0.0)  # of the command, by speed
         return of_speed, np.nan_to_num(slope * np.hypot(of_speed, of_needed))
-
-    def _needed_by_speed(self, speed_rad_s: Array) -> Array:
-        """Slope of the command that a fan needs, over its speed."""
-        return self.viscous + 2.0 * self.drag * np.abs(speed_rad_s)

@@ -80,7 +80,8 @@ class AlarmText:
             return "cause unknown"
         first = alarm.causes[0]
         if _is_against_command(alarm):
-            return f"{first.evidence or NOT_AS_COMMANDED}: {_likely(alarm)}"
+            likely = (f"{CAUSES.get(each.cause, each.cause)} {100 * each.probability:.0f} %" for each in alarm.causes)
+            return f"{first.evidence or NOT_AS_COMMANDED}: {', '.join(likely)}"
         name = CAUSES.get(first.cause, first.cause)
         if first.cause == CANNOT_TELL:
             return first.evidence or name  # the evidence begins with the name
@@ -106,7 +107,3 @@ def _after_restart(alarm: Alarm) -> str:
 
 def _is_against_command(alarm: Alarm) -> bool:
     return bool(alarm.causes) and alarm.causes[0].cause in STANDSTILL_CAUSES
-
-
-def _likely(alarm: Alarm) -> str:
-    return ", ".join(f"{CAUSES.get(each.cause, each.cause)} {100 * each.probability:.0f} %" for each in alarm.causes)

@@ -155,6 +155,9 @@ def log_erfc(values: Array) -> Array:
     place -= before
     below = LOG_ERFC.take(before)
     found: Array = below + place * (LOG_ERFC.take(before + 1) - below)
+    if values.max(initial=0.0) > FARTHEST:
+        beyond = np.fmax(values, FARTHEST)
+        found -= (beyond - FARTHEST) * (beyond + FARTHEST)  # erfc falls as exp(-x^2)
     return found
 
 

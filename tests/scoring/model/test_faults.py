@@ -51,6 +51,16 @@ def test_each_fault_that_is_planted_by_its_own_columns_is_named_first_while_the_
     assert first_causes(rows, has_own_drive=has_own_drive) == [row.cause for row in rows]
 
 
+def test_a_speed_that_no_rotor_makes_is_the_tachos_while_the_command_moves() -> None:
+    fans = replace(twin_of(1).fans, pulse_rad_s=np.array([6.3]), held_s=np.array([0.5]))
+    made = MadeFans(fans, 0.5, moving, seed=1)
+    deciding = made.decision()
+    plays(made, deciding, 40.0)
+    plays(made, deciding, 20.0, lambda one: with_reading(one, 10.0 * fans.top_rad_s - one.predicted_rad_s))
+    first, *_ = deciding.alarms[0].causes()
+    assert (first.cause, first.probability > 0.99) == ("sensor_scaling", True)
+
+
 def test_what_a_rotor_does_by_its_torque_balance_is_named_and_clears_while_the_command_steps_every_1_5_s() -> None:
     causes = ["gain_down", "drag_up", "external_torque"]
     fans = twin_of(len(causes)).fans
