@@ -36,7 +36,7 @@ the warm-up of 3 s, and the ten seconds for which a fan must be like a healthy o
 and recorder are restarted, no alarm moves"""
 SHIFT = 50
 """samples by which a tray begins later in the run of the fans than the one before"""
-BUSY = "restart_delay_max_s = 0.5\nstop_timeout_s = 120\n"
+BUSY = "stop_timeout_s = 120\n"
 """settings of [launcher] for a machine that has other things to do"""
 TWIN = Path(__file__).parents[2] / "pipeline" / "demo" / "twin.onnx"
 

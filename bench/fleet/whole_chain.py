@@ -49,7 +49,7 @@ BEGINNING_S = 30.0
 LATE_S = 10.0
 """an alarm may come so long after the end of its fault"""
 DEADLINE_S = 1800.0
-BUSY = "restart_delay_max_s = 0.5\nstop_timeout_s = 300\n"
+BUSY = "stop_timeout_s = 300\n"
 
 
 @dataclass

@@ -11,7 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from types import TracebackType
-from typing import Self
+from typing import ClassVar, Self
 
 import zenoh
 
@@ -40,11 +40,14 @@ SAID_AFTER_S = 3.0
 """a client that waits so long for its router says so"""
 _MEETING_POLL_S = 0.01
 _ALIVE_TIMEOUTS = 2
-"""`Bus.alive` asks again for so many times `recovery_timeout_s`"""
+"""`Bus.alive` asks again for so many times the longest wait for an answer"""
 
 
 class Bus:
     """One session on the bus."""
+
+    answer_timeout_s: ClassVar[float] = 5.0
+    """longest wait for the answer to a question; a complete one usually comes much sooner"""
 
     def __init__(
         self,
@@ -176,7 +179,7 @@ class Bus:
         Raises:
             NoAnswerError: no complete answer came, or `stop` was set before: which tokens exist is not known.
         """
-        timeout_s = self._config.recovery_timeout_s
+        timeout_s = self.answer_timeout_s
         until_s = time.monotonic() + _ALIVE_TIMEOUTS * timeout_s
         was_empty = self._config.mode == "peer"
         while True:
@@ -219,7 +222,7 @@ class Bus:
         """All messages on `key` that `producer` still keeps, as (key, payload). Waits for the answer: not for a stage,
         whose inbox would fill up meanwhile."""
         answers: queue.SimpleQueue[Answer] = queue.SimpleQueue()
-        request = self.request_missed(key, producer, 0, LAST_SEQUENCE, self._config.recovery_timeout_s, answers.put)
+        request = self.request_missed(key, producer, 0, LAST_SEQUENCE, self.answer_timeout_s, answers.put)
         answer = answers.get()
         request.cancel()
         return answer.messages

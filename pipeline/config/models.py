@@ -132,9 +132,6 @@ class BusConfig(Section):
         description="where peers meet, or for clients the address of the router; or a list of routers: a client uses "
         "the first that answers, and another when that one is gone",
     )
-    recovery_timeout_s: float = Field(
-        default=5.0, gt=0, description="how long to wait for missed messages that were requested again"
-    )
     security: SecurityConfig | None = Field(
         default=None, description="certificates and roles: docs/how-to/security.md; without it, none"
     )
@@ -169,8 +166,6 @@ class LauncherConfig(Section):
         f"{', '.join(name for name, row in STAGES.items() if not row.has_common_shards)}; or a table, such as "
         "{ scorer = 4, recorder = 2 }; without it, one process for the site, of acquisition one for each tray",
     )
-    restart_delay_s: float = Field(default=0.2, gt=0, description="first delay before a dead stage is restarted")
-    restart_delay_max_s: float = Field(default=10.0, gt=0, description="the delay doubles up to this")
     watchdog_s: float = Field(
         default=10.0, ge=1, description="a stage whose main loop has not run for this long is killed and restarted"
     )

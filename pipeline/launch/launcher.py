@@ -37,6 +37,8 @@ _SEARCH_S = 2.0  # this long after meeting one process, a launcher has discovere
 _ORDERLY = (0, 3)  # exit status of a stage that stopped in order: without losses, or with losses
 _READY_TIMEOUT_S = 30.0
 _LAST_HEALTH_S = 2.0  # after the end of a process, for what it sent last
+RESTART_DELAY_S, RESTART_DELAY_MAX_S = 0.2, 10.0
+"""the delay before a dead stage is restarted doubles with every death, up to the second"""
 _STABLE_S = 10.0  # a stage that ran this long starts again at the shortest delay
 
 
@@ -47,7 +49,7 @@ class _Slot:
     row: StageProcess
     child: Child | None = None
     start_at_s: float = 0.0
-    delay_s: float = 0.0
+    delay_s: float = RESTART_DELAY_S
     was_ready: bool = False
     was_seen: bool = False
     """whether the process that runs now has been on the bus"""
@@ -118,7 +120,7 @@ class Launcher:
         rows = process_list(config, trays)
         if not rows:
             raise UserError(f"{config.path}: no process has tray {', '.join(trays or ())} first: see launcher.shards")
-        self._slots = [_Slot(row, delay_s=config.launcher.restart_delay_s) for row in rows]
+        self._slots = [_Slot(row) for row in rows]
         self._watchdog = Watchdog(config.launcher.watchdog_s)
         self._is_started = False
         """all stages have been started and waited for"""
@@ -270,7 +272,7 @@ class Launcher:
 
     def _delay_start(self, slot: _Slot, now: float) -> None:
         slot.start_at_s = now + slot.delay_s
-        slot.delay_s = min(2 * slot.delay_s, self._config.launcher.restart_delay_max_s)
+        slot.delay_s = min(2 * slot.delay_s, RESTART_DELAY_MAX_S)
 
     def _check_processes(self) -> None:
         """Notice stages that have died, and restart those that are due."""
@@ -317,7 +319,7 @@ class Launcher:
     def _plan_restart(self, slot: _Slot, status: int, now: float) -> None:
         assert slot.child is not None
         if now - slot.child.started_s > _STABLE_S:
-            slot.delay_s = self._config.launcher.restart_delay_s
+            slot.delay_s = RESTART_DELAY_S
         how = f"was ended by signal {-status}" if status < 0 else f"ended with status {status}"
         if status == EXIT_CANNOT_START:
             slot.child.stop(0.1)  # its last line may still be in the pipe

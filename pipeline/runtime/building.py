@@ -44,8 +44,7 @@ def build_and_join(
         refuse_second(bus(), config.site, session, stop)
 
     is_one_expected = any(map(keeps_snapshots, config.stages))
-    timeout_s = config.bus.recovery_timeout_s
-    kept = KeptSnapshots(bus, config.site, stop, refuse_others, timeout_s, is_one_expected=is_one_expected)
+    kept = KeptSnapshots(bus, config.site, stop, refuse_others, Bus.answer_timeout_s, is_one_expected=is_one_expected)
     parts: dict[str, BuiltStage] = {}
     try:
         parts = build_parts(stage, _context_of(stage, config, shard, session, kept, is_replayed))

@@ -87,7 +87,7 @@ class Receiver:
         """of messages that could not be taken, by reason"""
         self._unreadable: Counter[str] = Counter()
         """by key, the number of messages that cannot be read; at most MOST_UNREADABLE_KEYS keys"""
-        self._recovery = Recovery(bus, inbox, config.bus.recovery_timeout_s, only_rare=stage.may_drop)
+        self._recovery = Recovery(bus, inbox, bus.answer_timeout_s, only_rare=stage.may_drop)
         self.tracker = SequenceTracker(self._recovery.ask, sessions=sessions)
         reads = stage.reads_as_configured(config)
         self._subscriptions = Subscriptions(

@@ -43,7 +43,7 @@ CAN_CUT = os.geteuid() == 0 and shutil.which("ss") is not None
 
 @pytest.fixture
 def chain(tmp_path: Path, endpoint: str) -> Iterator[Chain]:
-    chain = Chain(tmp_path, endpoint, "launcher.restart_delay_s=60", "launcher.restart_delay_max_s=60", viewer=False)
+    chain = Chain(tmp_path, endpoint, viewer=False)
     try:
         yield chain
     finally:

@@ -26,11 +26,12 @@ def timeout_s() -> float:
 
 
 @pytest.fixture
-def link(endpoint: str, timeout_s: float) -> Iterator[tuple[TcpRelay, Bus]]:
+def link(endpoint: str, timeout_s: float, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[TcpRelay, Bus]]:
     """A client behind a link that can be cut, at a router where a scorer is."""
+    monkeypatch.setattr(Bus, "answer_timeout_s", timeout_s)
 
     def client(at: str) -> Bus:
-        return Bus(BusConfig(mode="client", endpoint=at, recovery_timeout_s=timeout_s), threading.Event())
+        return Bus(BusConfig(mode="client", endpoint=at), threading.Event())
 
     with open_router(endpoint), closing(TcpRelay(endpoint)) as relay, client(endpoint) as scorer:
         scorer.declare_alive(KEY)

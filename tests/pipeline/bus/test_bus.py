@@ -114,9 +114,10 @@ def test_a_session_that_does_not_listen_leaves_the_endpoint_to_others(endpoint):
             assert late.came_second
 
 
-def test_a_publisher_keeps_the_newest_messages_that_fit_its_memory(endpoint):
+def test_a_publisher_keeps_the_newest_messages_that_fit_its_memory(endpoint, monkeypatch):
     key, size, count = tray_key("site", "tray", "score"), KEPT_BYTES // 4, 6
-    patient = BusConfig(endpoint=endpoint, recovery_timeout_s=30)
+    monkeypatch.setattr(Bus, "answer_timeout_s", 30.0)
+    patient = BusConfig(endpoint=endpoint)
     met = threading.Event()
     with Bus(patient) as bus, Bus(patient) as asker:
         bus.declare_alive(alive_key("site", "big", "all"))

@@ -15,10 +15,11 @@ from tests.support.running_chain import eventually
 LOST_S, RATE_HZ = 30, 100
 
 
-def test_row_16_what_is_sent_while_a_link_is_lost_for_30_s_is_kept(endpoint):
+def test_row_16_what_is_sent_while_a_link_is_lost_for_30_s_is_kept(endpoint, monkeypatch):
     """Samples of 8 fans at 100 Hz; a consumer that begins, as after a hang, asks for those of 40 s."""
     key, topic = tray_key("s", "a", "raw"), BY_NAME["raw"]
-    config = BusConfig(endpoint=endpoint, recovery_timeout_s=60)
+    monkeypatch.setattr(Bus, "answer_timeout_s", 60.0)
+    config = BusConfig(endpoint=endpoint)
     with Bus(config) as bus, Bus(config) as asker:
         publisher = bus.publisher(key, topic, "", "p")
         for _ in range(LOST_S * RATE_HZ + CATCH_UP_MESSAGES):

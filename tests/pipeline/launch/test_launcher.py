@@ -221,10 +221,11 @@ def recorder_only(lines: list[str], monkeypatch: pytest.MonkeyPatch) -> tuple[La
     bus: Any = LateBus(SITE, 0.0)
     bus.sleep = bus.wait
     monkeypatch.setattr("fantwin.pipeline.launch.launcher.time", bus)
-    settings = ["launcher.stages=['recorder']", "launcher.restart_delay_s=1.0", "launcher.restart_delay_max_s=3.0"]
-    launcher = Launcher(load_config(DEMO / "demo.toml", settings), (), lines.append)
+    monkeypatch.setattr("fantwin.pipeline.launch.launcher.RESTART_DELAY_MAX_S", 3.0)
+    launcher = Launcher(load_config(DEMO / "demo.toml", ["launcher.stages=['recorder']"]), (), lines.append)
     launcher._watcher = SiteWatcher(cast("Any", StubBus()), SITE)
     (slot,) = launcher._slots
+    slot.delay_s = 1.0
     return launcher, bus, slot
 
 

@@ -27,10 +27,10 @@ from tests.support.running_chain import eventually
 from tests.support.toy_stage import TRAY_A, Bench, raw, toy
 
 
-def test_row_11_live_data_does_not_wait_for_a_producer_that_never_answers(config):
+def test_row_11_live_data_does_not_wait_for_a_producer_that_never_answers(config, monkeypatch):
     """A stranger makes the stage ask, and does not answer; the time limit is far beyond the test's."""
-    patient = replace(config, bus=BusConfig(endpoint=config.bus.endpoint, recovery_timeout_s=300))
-    bench = Bench(toy(), patient)
+    monkeypatch.setattr(Bus, "answer_timeout_s", 300.0)
+    bench = Bench(toy(), config)
     asked = threading.Event()
     queries: list[Any] = []
 
@@ -243,9 +243,10 @@ def test_row_11_after_one_catch_up_without_an_answer_the_next_ones_wait_for_less
 
 
 @pytest.fixture
-def endless(endpoint):
+def endless(endpoint, monkeypatch):
     """A bus on which somebody answers requests for KEY of "endless" without end, and whoever asks it."""
-    config = BusConfig(endpoint=endpoint, recovery_timeout_s=60)
+    monkeypatch.setattr(Bus, "answer_timeout_s", 60.0)
+    config = BusConfig(endpoint=endpoint)
     has_ended = threading.Event()
 
     def answer(query: Any) -> None:

@@ -13,7 +13,7 @@ import pytest
 
 from fantwin.pipeline.bus.recovery import recovery_key
 from fantwin.pipeline.bus.session import Bus
-from fantwin.pipeline.config.models import BusConfig, LauncherConfig
+from fantwin.pipeline.config.models import LauncherConfig
 from fantwin.pipeline.config.shards import chosen_shard
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.runtime.runner import Runner
@@ -148,13 +148,10 @@ def test_row_04_a_loop_that_hangs_is_left_behind_in_time(config, monkeypatch, wh
     assert "processing what had arrived did not end in time" in str(errors[0])
 
 
-def test_row_04_a_stage_that_is_stopped_while_it_waits_for_what_it_missed_ends_in_order(config):
+def test_row_04_a_stage_that_is_stopped_while_it_waits_for_what_it_missed_ends_in_order(config, monkeypatch):
     """As when a producer hangs."""
-    settings = replace(
-        config,
-        launcher=LauncherConfig(stop_timeout_s=1.0),
-        bus=BusConfig(endpoint=config.bus.endpoint, recovery_timeout_s=300),
-    )
+    monkeypatch.setattr(Bus, "answer_timeout_s", 300.0)
+    settings = replace(config, launcher=LauncherConfig(stop_timeout_s=1.0))
     stop, asked = threading.Event(), threading.Event()
     queries: list[Any] = []
 
