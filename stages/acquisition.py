@@ -56,9 +56,6 @@ class AcquisitionConfig(StageConfig):
     block_s: float = Field(
         default=0.05, ge=0, le=1, description="a message holds the samples of this time; 0: those of one read"
     )
-    silence_s: float = Field(
-        default=2.0, gt=0, description="health reports a problem after this long without a valid sample"
-    )
 
 
 def limits_of(tray: TrayConfig) -> ReadingLimits:
@@ -76,7 +73,6 @@ class AcquisitionCore(Core):
     def __init__(
         self,
         tray: TrayConfig,
-        config: AcquisitionConfig,
         source: SampleSource,
         blocks: SampleBlocks,
         started_t_ns: int,
@@ -87,7 +83,6 @@ class AcquisitionCore(Core):
         self._tray = tray
         self._host_clock = host_clock
         self._seen_step = host_clock.last_step
-        self._config = config
         self._source = source
         self._blocks = blocks
         self._processed: BlockEvent | None = None
@@ -102,7 +97,7 @@ class AcquisitionCore(Core):
         self._counts: Counter[str] = Counter()
         self._down_reason: str | None = None
         self._now_ns = started_t_ns
-        self._quality = InputQuality(started_t_ns, config.silence_s)
+        self._quality = InputQuality(started_t_ns)
         self._plausibility = Plausibility(limits_of(tray), tray.speed_unit, self._counts, self._quality, self._sequence)
 
     def step(self, item: Item) -> list[Raw]:
@@ -291,7 +286,7 @@ def build(context: Context) -> BuiltStage:
     """
     source = build_tray_source(context)
     blocks = SampleBlocks(source, round(context.config.block_s * NS_PER_S))
-    core = AcquisitionCore(context.tray, context.config, source, blocks, context.started_t_ns, HOST_CLOCK)
+    core = AcquisitionCore(context.tray, source, blocks, context.started_t_ns, HOST_CLOCK)
     return BuiltStage(core, blocks)
 
 

@@ -14,10 +14,10 @@ five seconds, and are then put on the grid. The rate stays until the resampler i
 kept, the least delayed one says how late the first one was.
 
 Gaps longer than `gap_limit_s` are never bridged. Their grid samples are not valid: GAP up to `watermark_s` after the
-last raw sample, then STALE; `stale_for_s` after it the grid ends until samples arrive again. Content depends on sample
-times only. Host time, in `tick`, decides only when grid samples of a gap are published, so that a replay gives the same
-grid. They are not published while the samples may still come because only the link to acquisition is cut. See
-docs/explanation/time.md.
+last raw sample, then STALE; after five seconds, or twice `watermark_s`, the grid ends until samples arrive again.
+Content depends on sample times only. Host time, in `tick`, decides only when grid samples of a gap are published, so
+that a replay gives the same grid. They are not published while the samples may still come because only the link to
+acquisition is cut. See docs/explanation/time.md.
 """
 
 from __future__ import annotations
@@ -26,7 +26,6 @@ import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from itertools import pairwise
 from typing import Self
 
 from pydantic import Field, model_validator
@@ -53,6 +52,11 @@ from fantwin.schemas.units import NS_PER_S
 FASTER = 2.0  # a line that sends this many times the samples of its grid has changed
 
 
+LINK_WAIT_S = 900.0
+"""longest wait, before a gap is published, for acquisition to confirm that it has sent nothing; if the link is cut, the
+samples come later"""
+
+
 class ResamplerConfig(StageConfig):
     """Section `[resampler]`. What is not given follows from the line."""
 
@@ -72,28 +76,16 @@ class ResamplerConfig(StageConfig):
         gt=0,
         description="how long to wait before a gap is published; without it 0.5 s, or gap_limit_s if longer",
     )
-    stale_for_s: float | None = Field(
-        default=None,
-        gt=0,
-        description="the grid ends this long after the last sample; without it 5 s, or twice watermark_s if longer",
-    )
-    link_wait_s: float = Field(
-        default=900.0,
-        ge=0,
-        description="longest wait, before a gap is published, for acquisition to confirm that it has sent nothing; if "
-        "the link is cut, the samples come later",
-    )
 
     @model_validator(mode="after")
     def _check_order(self) -> Self:
-        given_s = [limit_s for limit_s in (self.gap_limit_s, self.watermark_s, self.stale_for_s) if limit_s is not None]
-        if any(earlier_s > later_s for earlier_s, later_s in pairwise(given_s)):
-            raise ValueError("gap_limit_s, watermark_s and stale_for_s must not decrease in this order")
+        if self.gap_limit_s is not None and self.watermark_s is not None and self.gap_limit_s > self.watermark_s:
+            raise ValueError("watermark_s must not be shorter than gap_limit_s")
         return self
 
     def timing(self, rate_hz: float) -> GridTiming:
         """The times of a grid of this rate."""
-        return grid_timing(rate_hz, self.gap_limit_s, self.watermark_s, self.stale_for_s)
+        return grid_timing(rate_hz, self.gap_limit_s, self.watermark_s)
 
 
 class ResamplerCore(Core):
@@ -240,7 +232,7 @@ class ResamplerCore(Core):
         if self._line_hz is not None and is_too_slow(self._line_hz):
             config = config.model_copy(update={"gap_limit_s": config.gap_limit_s or 1.0 / rate_hz})
         self._timing = config.timing(rate_hz)
-        self._grid = SampleGrid(self._tachos, self._timing, round(self._config.link_wait_s * NS_PER_S))
+        self._grid = SampleGrid(self._tachos, self._timing, round(LINK_WAIT_S * NS_PER_S))
         return self._grid
 
 

@@ -44,6 +44,7 @@ SNAPSHOT_PERIOD_SAMPLES = 3000  # at least: at slow rates snapshots would be mos
 MOST_FANS_AT_ONCE = 64  # of a tray whose snapshot is taken with each alarm
 SAVED_OF_PUBLISHED = 3  # of a larger tray: every third is published while nothing happens, for the recording's size
 REST_NS_PER_FAN = 5_000_000  # between snapshots with alarms of a larger tray: each takes a millisecond a fan after days
+NOT_JUDGED_S = 10.0  # health names a fan that has had no score for this long: beyond the start of a free run
 SHOWN_NS = 60 * NS_PER_S  # how long health says that a snapshot was not used
 NEW_START = "what was learned of the fans, alarms and wear start from the beginning"
 OPERATORS_KEPT = "shelved, suppressed and out of service are kept"
@@ -86,7 +87,7 @@ class ScorerCore(Core):
         self._text = AlarmText(speed_unit, twin.advice.command_unit)
         self._is_learned = is_learned
         self._is_replayed = is_replayed
-        self._unscored = UnscoredMonitor(fans, max(1, round(config.not_judged_s * NS_PER_S)))
+        self._unscored = UnscoredMonitor(fans, round(NOT_JUDGED_S * NS_PER_S))
         self._snapshot_store = snapshot_store
         self._wrong_fans = 0
         self._old_samples = OldSamples()

@@ -9,6 +9,8 @@ from fantwin.schemas.units import NS_PER_S
 
 WINDOW = 100
 """newest inputs from which the quality is computed"""
+SILENCE_S = 2.0
+"""a source without a valid sample for longer is a problem; twice the pause of the slowest line that can be judged"""
 JUDGED_FROM = WINDOW // 5
 """inputs needed for a judgement"""
 GOOD_AGAIN = 0.25
@@ -18,9 +20,7 @@ GOOD_AGAIN = 0.25
 class InputQuality:
     """The quality of one source's input. Times: host time, ns since the epoch."""
 
-    def __init__(self, started_t_ns: int, silence_s: float) -> None:
-        """silence_s: a source without a valid sample for longer is a problem."""
-        self._silence_s = silence_s
+    def __init__(self, started_t_ns: int) -> None:
         self._input_t_ns = self._valid_t_ns = started_t_ns
         self._recent: deque[str] = deque()
         """kind of fault of each of the newest WINDOW inputs; empty: a valid sample"""
@@ -64,9 +64,9 @@ class InputQuality:
 
         settings: of the tray, to be checked where the fault does not say which one it is.
         """
-        if now_ns - self._input_t_ns > self._silence_s * NS_PER_S:
-            return f"nothing received for {self._silence_s:g} s; is the source running, connected and sending?"
-        has_valid = now_ns - self._valid_t_ns <= self._silence_s * NS_PER_S
+        if now_ns - self._input_t_ns > SILENCE_S * NS_PER_S:
+            return f"nothing received for {SILENCE_S:g} s; is the source running, connected and sending?"
+        has_valid = now_ns - self._valid_t_ns <= SILENCE_S * NS_PER_S
         if has_valid and not self._mostly_faulty:
             return ""
         fault = self._fault()

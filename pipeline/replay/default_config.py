@@ -72,7 +72,6 @@ def default_config(
     text = (
         f"# defaults: there was no configuration\nsite = {json.dumps(metadata.metadata.get('site', 'site'))}\n\n"
         f"[resampler]\nrate_hz = {rate_hz}\ngap_limit_s = {gap_limit_s}\n"
-        f"watermark_s = {max(0.5, gap_limit_s)}\nstale_for_s = {max(5.0, gap_limit_s)}\n"
     )
     for tray, messages in first.items():
         unit = metadata.speed_unit(tray) if metadata.speed_unit(tray) in ("rad/s", "rpm") else "rad/s"

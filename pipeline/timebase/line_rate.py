@@ -51,24 +51,21 @@ class GridTiming:
         return NS_PER_S / self.period_ns
 
 
-def grid_timing(
-    rate_hz: float, gap_limit_s: float | None, watermark_s: float | None, stale_for_s: float | None
-) -> GridTiming:
-    """The times of a grid of this rate. What is None follows from the rate and from the limits that are given.
+def grid_timing(rate_hz: float, gap_limit_s: float | None, watermark_s: float | None) -> GridTiming:
+    """The times of a grid of this rate. What is None follows from the rate and from the limit that is given.
 
-    The gap limit is five periods, at least 0.1 s, and not above a limit that is given. The watermark is at least the
-    gap limit, and the grid ends after at least twice the watermark.
+    The gap limit is five periods, at least 0.1 s, and not above a watermark that is given. The watermark is at least
+    the gap limit, and the grid ends after at least twice the watermark.
     """
-    given_s = [limit_s for limit_s in (watermark_s, stale_for_s) if limit_s is not None]
-    gap_s = min(max(SHORTEST_GAP_S, GAP_PERIODS / rate_hz), *given_s, math.inf) if gap_limit_s is None else gap_limit_s
-    longest_s = math.inf if stale_for_s is None else stale_for_s
-    watermark_s = min(max(WATERMARK_S, gap_s), longest_s) if watermark_s is None else watermark_s
-    stale_for_s = max(STALE_FOR_S, 2.0 * watermark_s) if stale_for_s is None else stale_for_s
+    if gap_limit_s is None:
+        gap_limit_s = min(max(SHORTEST_GAP_S, GAP_PERIODS / rate_hz), math.inf if watermark_s is None else watermark_s)
+    if watermark_s is None:
+        watermark_s = max(WATERMARK_S, gap_limit_s)
     return GridTiming(
         period_ns=round(NS_PER_S / rate_hz),
-        gap_limit_ns=round(gap_s * NS_PER_S),
+        gap_limit_ns=round(gap_limit_s * NS_PER_S),
         watermark_ns=round(watermark_s * NS_PER_S),
-        stale_for_ns=round(stale_for_s * NS_PER_S),
+        stale_for_ns=round(max(STALE_FOR_S, 2.0 * watermark_s) * NS_PER_S),
     )
 
 

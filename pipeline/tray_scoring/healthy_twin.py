@@ -41,11 +41,6 @@ class ScorerConfig(StageConfig):
     latching: bool = Field(default=False, description="whether a cleared alarm stays until it is reset")
     confirming: bool = Field(default=False, description="whether an acknowledged alarm must be confirmed, too")
     wear_every_s: float = Field(default=600.0, gt=0, description="how often the wear of a fan is measured")
-    not_judged_s: float = Field(
-        default=10.0,
-        gt=0,
-        description="health reports a fan without a score for this long; set it above twin_integrator.warm_up_s",
-    )
     asks_for_snapshots: bool | None = Field(
         default=None,
         description="whether it continues from the snapshot that a recorder keeps, where that is newer than its own "

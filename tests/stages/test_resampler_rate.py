@@ -207,7 +207,6 @@ def test_limits_that_are_not_given_follow_and_keep_their_order() -> None:
         ({"gap_limit_s": 1.0}, (1.0, 1.0, 5.0)),
         ({"watermark_s": 8.0}, (0.1, 8.0, 16.0)),
         ({"watermark_s": 0.05}, (0.05, 0.05, 5.0)),
-        ({"stale_for_s": 0.2}, (0.1, 0.2, 0.2)),
     ):
         timing = ResamplerConfig.model_validate(given).timing(100.0)
         limits_ns = (timing.gap_limit_ns, timing.watermark_ns, timing.stale_for_ns)

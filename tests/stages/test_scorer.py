@@ -397,9 +397,9 @@ def test_blocks_of_any_size_are_judged_the_same_to_the_bit(
     whole = eventful_prediction(seed, samples, change_s)
     whole = replace(whole, t_ns=EPOCH_NS + (whole.t_ns - EPOCH_NS) // STEP_NS * period_ns, period_ns=period_ns)
     ends = [0, *takewhile(lambda end: end < samples, accumulate(cycle(sizes))), samples]
-    single, blocks = (
-        judged(core_of(3, config={"not_judged_s": 0.1}), parts(whole, marks)) for marks in (range(samples + 1), ends)
-    )
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("fantwin.stages.scorer.NOT_JUDGED_S", 0.1)
+        single, blocks = (judged(core_of(3), parts(whole, marks)) for marks in (range(samples + 1), ends))
     assert single == blocks
 
 

@@ -71,8 +71,10 @@ def seen(
     """What integrator and scorer make of readings."""
     predicting = physical_twin(standstill=healthy)
     predicting = replace(predicting, card=replace(predicting.card, conditions=conditions))
-    config = ScorerConfig(not_judged_s=5.0)
-    integrator, scorer = core_of(predicting, warm_up_s=1.0), ScorerCore(1, "rad/s", config, known_of(predicting))
+    integrator, scorer = (
+        core_of(predicting, warm_up_s=1.0),
+        ScorerCore(1, "rad/s", ScorerConfig(), known_of(predicting)),
+    )
     messages, problems = [], set()
     valid = np.isfinite(speed)[:, np.newaxis]
     grid = Grid(

@@ -41,8 +41,6 @@ FASTEST_FAN_RAD_S = 5000.0
 """48,000 rpm: a larger speed was given in another unit"""
 RATE_TOLERANCE = 0.01
 LISTEN_FOR_TACHOS_S = 60
-SLOWEST_S = 1.0
-"""between two samples of the slowest line that can be judged"""
 PUSHED_LATER = "clients push its samples: they are checked only while `fantwin up` runs; run doctor again then"
 Finding = tuple[bool, str]
 """in order or not, and one line"""
@@ -66,7 +64,7 @@ def check_line(context: Context, config: Config, seconds: float, *, is_running: 
 
 def _from_source(context: Context, seconds: float) -> tuple[list[Raw], str]:
     """The samples that acquisition would publish, and what it would report as its problem."""
-    settings = listening_settings(context.config, seconds)
+    settings = context.config.model_copy(update={"block_s": 0.0})
     built = load_stage("acquisition").build(Context(**(vars(context) | {"config": settings})))
     core, source = built.core, built.source
     assert source is not None
@@ -86,11 +84,6 @@ def _from_source(context: Context, seconds: float) -> tuple[list[Raw], str]:
         source.stop()
     problem = core.problem()
     return samples, problem or refusal(core.counters())
-
-
-def listening_settings(config: Any, seconds: float) -> Any:
-    """`[acquisition]` while a line is listened to: it is silent after the pause between two samples of the slowest."""
-    return config.model_copy(update={"block_s": 0.0, "silence_s": seconds + SLOWEST_S})
 
 
 def refusal(counters: Mapping[str, int]) -> str:

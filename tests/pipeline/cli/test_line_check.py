@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import fantwin.client
-from fantwin.pipeline.cli.watch.line_check import _findings, check_line, listening_settings, refusal
+from fantwin.pipeline.cli.watch.line_check import _findings, check_line, refusal
 from fantwin.pipeline.config.loading import parse_config
 from fantwin.pipeline.config.models import Config
 from fantwin.pipeline.runtime.stage import Context
@@ -187,12 +187,6 @@ def test_a_port_is_listened_to_as_acquisition_does(command: str, speed: str, wor
 def test_a_line_that_was_cut_once_is_no_fault_of_the_configuration(counters: dict[str, int], words: str) -> None:
     said = refusal(counters)
     assert words in said if words else not said
-
-
-def test_a_line_that_sends_once_a_second_is_not_silent_between_two_samples() -> None:
-    settings = listening_settings(config_of().sections["acquisition"], 2.0)
-    assert settings.silence_s >= 2.0 + 1.0
-    assert settings.block_s == 0.0
 
 
 def of_push(config: Config, *, is_running: bool) -> list:

@@ -104,9 +104,9 @@ def test_only_the_sections_of_the_stages_asked_for_are_checked():
 def test_all_that_is_wrong_in_a_section_is_one_line():
     target = 'name = "a"\nurl_file = "u"\nquiet_hours = { begin = "22", end = "6" }\n'
     with pytest.raises(ConfigError) as caught:
-        parse(f"{GOOD}[notifier]\ndigest_abov = 3\n[[notifier.target]]\n{target}")
+        parse(f"{GOOD}[notifier]\ntimezon = 3\n[[notifier.target]]\n{target}")
     assert str(caught.value).partition(".toml: ")[2] == (
-        "unknown key 'notifier.digest_abov'; did you mean 'digest_above'?; "
+        "unknown key 'notifier.timezon'; did you mean 'timezone'?; "
         "notifier.target.0.quiet_hours.begin = '22': hours and minutes, such as \"22:00\"; "
         "notifier.target.0.quiet_hours.end = '6': hours and minutes, such as \"22:00\""
     )
@@ -158,7 +158,7 @@ def test_a_file_that_is_not_utf_8_is_one_line(tmp_path):
 @pytest.mark.parametrize(
     ("text", "overrides", "words"),
     [
-        (GOOD, ["resampler.stale_for_s=1e300"], "resampler.stale_for_s = 1e+300: too large: at most 31,622,400 s"),
+        (GOOD, ["resampler.watermark_s=1e300"], "resampler.watermark_s = 1e+300: too large: at most 31,622,400 s"),
         (GOOD, ["resampler.rate_hz=1e-300"], "resampler.rate_hz = 1e-300: too small: 0, or at least 1e-09"),
         (
             GOOD,
