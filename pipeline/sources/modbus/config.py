@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Literal, Self
+from typing import Any, ClassVar, Literal, Self
 
-from pydantic import BaseModel, Field, create_model, model_validator
+from pydantic import BaseModel, ConfigDict, Field, create_model, model_validator
 
 from fantwin.pipeline.sources.polling import PolledConfig
 from fantwin.schemas.channels import CHANNELS, Channel
@@ -33,15 +33,14 @@ class Register(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
         return self
 
 
-_Channels = create_model(
-    "_Channels",
-    __doc__="A register for each channel.",
-    **{each.key: (Register | None, Field(default=None, description=each.label)) for each in CHANNELS},
-)
+_CHANNEL_FIELDS: Any = {each.key: (Register | None, Field(default=None, description=each.label)) for each in CHANNELS}
+_Channels: Any = create_model("_Channels", __doc__="A register for each channel.", **_CHANNEL_FIELDS)
 
 
-class ModbusFan(_Channels, frozen=True, extra="forbid", allow_inf_nan=False):
+class ModbusFan(_Channels):
     """The registers of one fan."""
+
+    model_config: ClassVar[ConfigDict] = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     unit: int = Field(default=1, ge=0, le=255, description="unit id of the fan's device")
     speed: Register = Field(description="speed in rpm, after scale and offset")
@@ -67,7 +66,6 @@ class ModbusConfig(PolledConfig, frozen=True):
         default="E", description="none, even or odd; the serial port has 8 data bits"
     )
     stop_bits: Literal[1, 2] = Field(default=1, description="stop bits of the serial port")
-    timeout_s: float = Field(default=0.5, gt=0, le=10, description="longest wait for the answer to a request")
     average_s: float | None = Field(
         default=None,
         gt=0,

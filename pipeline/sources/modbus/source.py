@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 
 MOST_REGISTERS = 120
 """registers of one request; the protocol allows 125"""
+TIMEOUT_S = 0.5
+"""longest wait for the answer to a request"""
 _FORMATS = {"u16": ">H", "s16": ">h", "u32": ">I", "s32": ">i", "f32": ">f"}
 
 
@@ -144,13 +146,13 @@ class ModbusDevice:
         config = self._config
         logging.getLogger("pymodbus.logging").setLevel(logging.CRITICAL)  # a failure is a line of this source already
         if config.host:
-            return ModbusTcpClient(config.host, port=config.tcp_port, timeout=config.timeout_s, retries=0)
+            return ModbusTcpClient(config.host, port=config.tcp_port, timeout=TIMEOUT_S, retries=0)
         return ModbusSerialClient(
             self._port,
             baudrate=config.baud,
             parity=config.parity,
             stopbits=config.stop_bits,
-            timeout=config.timeout_s,
+            timeout=TIMEOUT_S,
             retries=0,
         )
 
@@ -184,9 +186,7 @@ class ModbusDevice:
         except ConnectionException as error:
             raise self._lost("the connection is gone") from error
         except ModbusException as error:
-            raise DeviceError(
-                f"unit {unit} does not answer within {self._config.timeout_s:g} s; check unit and wiring"
-            ) from error
+            raise DeviceError(f"unit {unit} does not answer within {TIMEOUT_S:g} s; check unit and wiring") from error
         except OSError as error:
             raise self._lost(error.strerror or str(error)) from error
 

@@ -41,7 +41,6 @@ class RedfishConfig(PolledConfig, frozen=True):
     )
     verify: bool = Field(default=True, description="whether the certificate of the controller is checked")
     ca: Path | None = Field(default=None, description="certificate of the authority that signed the controller's")
-    timeout_s: float = Field(default=5.0, gt=0, le=60, description="longest wait for the answer to a request")
     average_s: float | None = Field(
         default=None,
         gt=0,

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from sushy.main import Sushy
 
 Json = Mapping[str, Any]
+TIMEOUT_S = 5.0
+"""longest wait for the answer to a request: controllers are slow"""
 OTHERS_MAY_READ = stat.S_IRWXG | stat.S_IRWXO
 
 
@@ -72,8 +74,8 @@ class RedfishDevice:
         # sushy takes 0 for its own number of attempts, and waits between them; the poller tries again by itself
         options: dict[str, Any] = {
             "verify": str(self._folder / config.ca) if config.ca and config.verify else config.verify,
-            "read_timeout": config.timeout_s,
-            "connect_timeout": config.timeout_s,
+            "read_timeout": TIMEOUT_S,
+            "connect_timeout": TIMEOUT_S,
             "server_side_retries": 1,
             "server_side_retries_delay": 0.01,
         }
@@ -158,7 +160,7 @@ class RedfishDevice:
             if "CERTIFICATE_VERIFY_FAILED" in text or "certificate" in text.lower():
                 why = "its certificate cannot be verified: name the authority by source.ca"
             else:
-                why = f"does not answer within {self._config.timeout_s:g} s, or cannot be reached"
+                why = f"does not answer within {TIMEOUT_S:g} s, or cannot be reached"
             raise DeviceError(f"{why}; waiting for it", is_lost=True) from error
         except (exceptions.SushyError, ValueError) as error:
             raise DeviceError(f"no Redfish service: {type(error).__name__}") from error

@@ -44,14 +44,17 @@ FAN: dict[str, Any] = {
 }
 
 
+@pytest.fixture(autouse=True)
+def patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("fantwin.pipeline.sources.modbus.source.TIMEOUT_S", 5.0)
+
+
 def drive() -> Drive:
     return Drive(SimulatedTray(TraySettings(fans=1, rate_hz=100.0)))
 
 
 def config(port: int, *fans: dict[str, Any], **settings: Any) -> ModbusConfig:
-    return ModbusConfig.model_validate(
-        {"host": "127.0.0.1", "tcp_port": port, "timeout_s": 5.0, "fan": fans or (FAN,), **settings}
-    )
+    return ModbusConfig.model_validate({"host": "127.0.0.1", "tcp_port": port, "fan": fans or (FAN,), **settings})
 
 
 def device(port: int, *fans: dict[str, Any], **settings: Any) -> ModbusDevice:
@@ -97,7 +100,7 @@ def test_what_a_drive_refuses_is_nan_or_an_error_and_a_command_must_be_there() -
 
 
 def over_serial(line: SerialLine, **settings: Any) -> tuple[ModbusConfig, SourceContext]:
-    values = {"port": line.host, "parity": "N", "timeout_s": 5.0, "fan": (FAN,), **settings}
+    values = {"port": line.host, "parity": "N", "fan": (FAN,), **settings}
     return ModbusConfig.model_validate(values), SourceContext(1, "rpm", Path())
 
 

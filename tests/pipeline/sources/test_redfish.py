@@ -82,7 +82,7 @@ def test_what_does_not_fit_the_controller_is_one_line() -> None:
             connected(url, chassis="Rack")
 
 
-def test_a_controller_that_fails_or_is_slow_is_a_failed_poll_and_one_that_is_gone_is_lost() -> None:
+def test_a_controller_that_fails_or_is_slow_is_a_failed_poll_and_one_that_is_gone_is_lost(monkeypatch) -> None:
     controller = Controller(is_new=True)
     with redfish_server(controller) as url:
         made = connected(url)
@@ -92,7 +92,8 @@ def test_a_controller_that_fails_or_is_slow_is_a_failed_poll_and_one_that_is_gon
         assert not caught.value.is_lost
         controller.status = 200
         made.disconnect()
-        made = connected(url, timeout_s=0.3)
+        monkeypatch.setattr("fantwin.pipeline.sources.redfish.source.TIMEOUT_S", 0.3)
+        made = connected(url)
         controller.delay_s = 1.0
         with pytest.raises(DeviceError, match="^does not answer within 0.3 s") as caught:
             made.read()
