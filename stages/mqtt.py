@@ -43,6 +43,10 @@ KNOWN_AFTER_NS = 10 * NS_PER_S
 """time after the start until a fan of which no alarm was heard has none, and a tray without a score is silent"""
 FOUND_WITHIN_NS = 10 * NS_PER_S
 """time after connecting in which the broker sends what it had retained"""
+PERIOD_S = 5.0
+"""between two states of a fan of which only numbers have changed; a change of state or alarm is published at once"""
+MOST_WAITING = 10_000
+"""transitions of alarms that wait on disk while the broker is away; beyond that, the oldest are lost"""
 CHANGES_PERIOD_NS = NS_PER_S // 2
 SITE_PERIOD_NS = 5 * NS_PER_S
 
@@ -60,7 +64,7 @@ class MqttCore(SiteCore):
         self._is_whole = context.instance == ALL_TRAYS
         self._states = FanStates(model)
         self._outbox = Outbox()
-        self._history, self._queue = alarms, TransitionQueue(alarms, config.most_waiting)
+        self._history, self._queue = alarms, TransitionQueue(alarms, MOST_WAITING)
         self._requests = Requests(topics, model.trays, config.accept, config.operator_name, desk)
         self._home_assistant = HomeAssistant(config, topics, model.trays)
         self._devices = self._home_assistant.messages() if config.home_assistant == "publish" else {}
@@ -140,7 +144,7 @@ class MqttCore(SiteCore):
         """Problem of the broker or the history."""
         broker = self._link.problem()
         if broker and self._queue.lost:
-            broker += f"; more than {self._config.most_waiting} transitions of alarms wait, the oldest are lost"
+            broker += f"; more than {MOST_WAITING} transitions of alarms wait, the oldest are lost"
         return "; ".join(filter(None, (broker, self._model.problem())))
 
     def _receive(self, now_ns: int) -> None:
@@ -176,7 +180,7 @@ class MqttCore(SiteCore):
             current = self._model.current_alarm(fan)
             text = json_text(shown_alarm(current) if current else None)
             self._outbox.retain(self._topics.alarm(fan), text, is_urgent=True)
-        is_full = abs(now_ns - self._full_ns) >= self._config.period_s * NS_PER_S
+        is_full = abs(now_ns - self._full_ns) >= PERIOD_S * NS_PER_S
         if is_full:
             self._model.notice_silence()
             self._history.save_again()

@@ -137,8 +137,9 @@ def test_a_broker_that_was_away_gets_all_that_is_retained_and_all_transitions_in
     listener.close()
 
 
-def test_of_too_many_transitions_that_wait_the_oldest_are_lost_counted_and_said(tmp_path, started):
-    stage = started(tmp_path, free_port(), most_waiting=3)
+def test_of_too_many_transitions_that_wait_the_oldest_are_lost_counted_and_said(tmp_path, started, monkeypatch):
+    monkeypatch.setattr("fantwin.stages.mqtt.MOST_WAITING", 3)
+    stage = started(tmp_path, free_port())
     stage.feed(*(alarm(Transition.SEVERITY, number) for number in range(5)))
     assert (stage.counters()["waiting_transitions"], stage.counters()["lost_transitions"]) == (3, 2)
     assert stage.problem().endswith("; more than 3 transitions of alarms wait, the oldest are lost")

@@ -15,23 +15,9 @@ TopicPrefix = Annotated[str, Field(pattern=r"^[^+#$/\x00-\x1f][^+#\x00-\x1f]*[^+
 
 
 class MqttConfig(StageConfig, BrokerSettings, frozen=True):  # pyright: ignore[reportGeneralTypeIssues]  both are frozen
-    """The broker, how often states are published, what may be asked, and what Home Assistant shows."""
+    """The broker, what may be asked, and what Home Assistant shows."""
 
     prefix: TopicPrefix = Field(default="fantwin", description="first part of all topics: PREFIX/SITE/TRAY/FAN/state")
-    period_s: float = Field(
-        default=5.0,
-        ge=0.5,
-        le=3600,
-        description="how often the state of a fan is published if its numbers have changed; a change of state or alarm "
-        "is published at once",
-    )
-    most_waiting: int = Field(
-        default=10_000,
-        ge=1,
-        le=100_000,
-        description="most transitions of alarms that wait on disk while the broker is away; beyond that, the oldest "
-        "are lost",
-    )
     accept: tuple[OperatorAction, ...] = Field(
         default=(), description="actions that may be requested by MQTT; by default none, and no request is read"
     )
@@ -42,9 +28,6 @@ class MqttConfig(StageConfig, BrokerSettings, frozen=True):  # pyright: ignore[r
     )
     home_assistant: Literal["off", "publish", "remove"] = Field(
         default="off", description="publish: fans become devices in Home Assistant; remove: these devices are removed"
-    )
-    home_assistant_prefix: TopicPrefix = Field(
-        default="homeassistant", description="discovery prefix of Home Assistant"
     )
     home_assistant_trays: tuple[Name, ...] = Field(
         default=(), description="trays whose fans become devices; empty: all"

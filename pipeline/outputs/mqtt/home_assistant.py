@@ -20,6 +20,8 @@ from fantwin.pipeline.site.fleet import Fan
 from fantwin.schemas.topics import ALL_TRAYS
 
 ACKNOWLEDGE = "acknowledge"
+DISCOVERY_PREFIX = "homeassistant"
+"""where Home Assistant looks for devices"""
 SITE_DEVICE = "site"
 ONLINE, OFFLINE = "online", "offline"
 _QOS = 1
@@ -37,7 +39,7 @@ class HomeAssistant:
         self._can_acknowledge = ACKNOWLEDGE in config.accept
         node = re.sub(r"[^A-Za-z0-9_-]", "_", topics.root)
         self._node = node if topics.instance == ALL_TRAYS else f"{node}_{topics.instance}"
-        self._path = f"{config.home_assistant_prefix}/device/{self._node}"
+        self._path = f"{DISCOVERY_PREFIX}/device/{self._node}"
         chosen = [tray for tray in trays if not config.home_assistant_trays or tray.name in config.home_assistant_trays]
         fans = [(Fan(tray.name, number), tray.speed_unit) for tray in chosen for number in range(tray.fans)]
         self._fans = fans[: config.home_assistant_fans]

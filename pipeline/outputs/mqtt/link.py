@@ -18,6 +18,7 @@ from fantwin.pipeline.outputs.mqtt.config import MqttConfig
 from fantwin.pipeline.outputs.mqtt.outbox import Outgoing
 from fantwin.pipeline.outputs.mqtt.topics import REQUEST
 from fantwin.pipeline.sources.mqtt.client import new_client, refusal
+from fantwin.pipeline.sources.mqtt.settings import KEEPALIVE_S
 
 if TYPE_CHECKING:
     from paho.mqtt.client import Client, MQTTMessage
@@ -129,7 +130,7 @@ class BrokerLink:
 
     def start(self) -> None:
         """Connect, again and again where it fails."""
-        self._client.connect_async(self._config.host, self._config.port, keepalive=self._config.keepalive_s)
+        self._client.connect_async(self._config.host, self._config.port, keepalive=KEEPALIVE_S)
         self._client.loop_start()
 
     @property

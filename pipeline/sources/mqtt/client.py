@@ -7,7 +7,7 @@ import threading
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from fantwin.pipeline.sources.mqtt.settings import BrokerSettings
+from fantwin.pipeline.sources.mqtt.settings import KEEPALIVE_S, BrokerSettings
 from fantwin.pipeline.sources.secret_file import read_secret, secret_of_environment
 
 if TYPE_CHECKING:
@@ -71,7 +71,7 @@ def connection_problems(client: Client, settings: BrokerSettings, name: str) -> 
 
     client.on_connect = on_connect
     try:
-        client.connect(settings.host, settings.port, keepalive=settings.keepalive_s)
+        client.connect(settings.host, settings.port, keepalive=KEEPALIVE_S)
     except ssl.SSLError as error:
         from fantwin.pipeline.certificates import tls_refusal  # noqa: PLC0415  slow to import
 

@@ -30,7 +30,6 @@ class MqttConfig(SourceConfig, BrokerSettings, frozen=True):
         description="topic to which commands of `fantwin command` are sent, as JSON, or with `{fan}` in it as a number "
         "for each fan; without it no commands are sent",
     )
-    qos: Literal[0, 1, 2] = Field(default=1, description="quality of service of subscriptions and commands")
     client_id: str = Field(
         default="",
         description="id of this client, another one for each tray; with it, the broker keeps messages while "

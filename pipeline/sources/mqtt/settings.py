@@ -7,15 +7,15 @@ from typing import Self
 
 from pydantic import BaseModel, Field, model_validator
 
+KEEPALIVE_S = 30
+"""a client sends the broker something at least this often"""
+
 
 class BrokerSettings(BaseModel, frozen=True):
     """Address, user and certificates."""
 
     host: str = Field(min_length=1, description="name or address of the broker")
     port: int = Field(default=1883, ge=1, le=65535, description="port of the broker; with TLS usually 8883")
-    keepalive_s: int = Field(
-        default=30, ge=5, le=3600, description="this client sends the broker something at least this often"
-    )
     username: str = Field(default="", description="user of the broker")
     password_file: Path | None = Field(
         default=None, description="file with the password in its first line; only its owner may be able to read it"

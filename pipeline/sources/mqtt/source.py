@@ -18,6 +18,7 @@ from fantwin.pipeline.sources.fan_values import FanValues
 from fantwin.pipeline.sources.json_samples import JsonSamplesError, batches_of, parse_samples
 from fantwin.pipeline.sources.mqtt.client import NOT_REACHED, connection_problems, new_client, refusal
 from fantwin.pipeline.sources.mqtt.config import FAN, MqttConfig
+from fantwin.pipeline.sources.mqtt.settings import KEEPALIVE_S
 from fantwin.pipeline.sources.source import (
     LinkDown,
     LinkUp,
@@ -35,6 +36,8 @@ if TYPE_CHECKING:
 
 MOST_RECENT = 64
 """messages by which one that the broker sends again is recognised"""
+QOS = 1
+"""of subscriptions and commands: the broker keeps what comes while this client is away, and sends it again"""
 LONGEST_NUMBER = 40
 """characters"""
 
@@ -83,7 +86,7 @@ class MqttSource:
     def start(self, deliver: Callable[[SourceEvent], None]) -> None:
         """Connect in a thread of its own, again and again where it fails."""
         self._deliver = deliver
-        self._client.connect_async(self._config.host, self._config.port, keepalive=self._config.keepalive_s)
+        self._client.connect_async(self._config.host, self._config.port, keepalive=KEEPALIVE_S)
         self._client.loop_start()
 
     def stop(self) -> None:
@@ -131,7 +134,7 @@ class MqttSource:
         return client
 
     def _publish(self, topic: str, text: str) -> bool:
-        return self._client.publish(topic, text, qos=self._config.qos).rc == 0
+        return self._client.publish(topic, text, qos=QOS).rc == 0
 
     def _down(self, reason: str) -> None:
         self._is_up = False
@@ -143,7 +146,7 @@ class MqttSource:
             self._is_refused = True
             self._down(refusal(reason))
             return
-        client.subscribe([(topic, self._config.qos) for topic in self._topics])
+        client.subscribe([(topic, QOS) for topic in self._topics])
 
     def _on_subscribe(self, _client: Any, _data: Any, _mid: Any, reasons: Any, _properties: Any) -> None:
         failures = [str(reason) for reason in reasons if reason.is_failure]
