@@ -151,13 +151,7 @@ class NotifierCore(Core):
         """Save the decisions; what cannot be saved is tried again."""
         changes = self._notifications.changes
         try:
-            self._outbox.save(
-                self._notifications.saved,
-                changes,
-                most_messages=self._config.most_messages,
-                kept_s=self._config.kept_s,
-                now_ns=now_ns,
-            )
+            self._outbox.save(self._notifications.saved, changes, now_ns)
         except sqlite3.Error as error:
             self._failed_ns = now_ns
             self._saving = f"messages cannot be saved, and are not sent before they are: {error}"

@@ -167,7 +167,7 @@ def test_the_scorer_survives_any_snapshot(memory: ScorerSnapshot) -> None:
 @given(session=sessions(Alarm))
 def test_the_notifier_survives_any_alarm_and_its_outbox_can_be_read_again(session: list[Message]) -> None:
     target = {"name": "hook", "url_env": "FANTWIN_TEST_URL", "quiet_hours": {"begin": "00:00", "end": "12:00"}}
-    config = NotifierConfig.model_validate({"target": [target], "gather_s": 0})
+    config = NotifierConfig.model_validate({"target": [target]})
     with TemporaryDirectory() as folder:
         outbox = Outbox(Path(folder) / "outbox", ["hook"])
         notifications = Notifications(config, Place("hall"), Saved(is_first=False), outbox.was_sent)

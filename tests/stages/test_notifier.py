@@ -76,10 +76,11 @@ def started() -> Iterator[Callable[..., Notifier]]:
 def short_delays(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sending, "FIRST_DELAY_S", 0.05)
     monkeypatch.setattr(sending, "LONGEST_DELAY_S", 0.2)
+    monkeypatch.setattr("fantwin.pipeline.outputs.notify.services.MAIL_PAUSE_S", 0.0)
 
 
 def mail_target(folder: Path, mail: MailServer, **more: Any) -> dict[str, Any]:
-    return {"name": "mail", "url_file": secret(folder, "mail", mail.url), "pause_s": 0, "repeat_s": 0, **more}
+    return {"name": "mail", "url_file": secret(folder, "mail", mail.url), "repeat_s": 0, **more}
 
 
 def test_a_mail_server_that_was_down_gets_all_once_and_in_order(tmp_path, mail, started):

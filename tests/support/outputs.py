@@ -157,8 +157,8 @@ class NotifierOutput:
         self._receiver = HttpReceiver()
         self._receiver.received = self.posted.setdefault(folder, [])
         url = secret(folder, "hook", f"json://127.0.0.1:{self._receiver.port}/")
-        target = {"name": "hook", "url_file": url, "pause_s": 0, "repeat_s": 0}
-        config = NotifierConfig.model_validate({"target": [target], "timezone": "UTC", "digest_above": 99})
+        target = {"name": "hook", "url_file": url, "repeat_s": 0}
+        config = NotifierConfig.model_validate({"target": [target], "timezone": "UTC"})
         self.core = notifier_core(folder, config, {TRAY: FANS})
         self._now_ns = START_NS
         self._is_closed = False

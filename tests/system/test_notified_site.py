@@ -29,12 +29,9 @@ endpoint = "{endpoint}"
 [[tray]]
 name = "tray1"
 fans = 8
-[notifier]
-gather_s = 0.2
 [[notifier.target]]
 name = "mail"
 url_file = "mail.url"
-pause_s = 0
 """
 
 

@@ -75,9 +75,6 @@ class TargetConfig(Section):
         "at once",
     )
     quiet_hours: QuietHours | None = Field(default=None, description="hours in which messages are held")
-    pause_s: float | None = Field(
-        default=None, ge=0, description="least time between two messages; without it, what the service asks for"
-    )
 
     @property
     def least_severity(self) -> int:
@@ -95,16 +92,16 @@ class TargetConfig(Section):
             return self
         if self.url and (urlsplit(self.url).password or urlsplit(self.url).scheme not in ("http", "https")):
             raise ValueError(f"target {self.name}: url: http:// or https://, without a password (that: url_file)")
-        if self.escalation_after_s or self.quiet_hours or self.pause_s or "repeat_s" in self.model_fields_set:
+        if self.escalation_after_s or self.quiet_hours or "repeat_s" in self.model_fields_set:
             raise ValueError(
                 f"target {self.name}: an Alertmanager repeats, escalates and holds by itself: take out repeat_s, "
-                "escalation_after_s, quiet_hours and pause_s"
+                "escalation_after_s and quiet_hours"
             )
         return self
 
 
 class NotifierConfig(StageConfig):
-    """Who gets messages about alarms, and how many alarms make one message."""
+    """Who gets messages about alarms."""
 
     target: tuple[TargetConfig, ...] = Field(default=(), description="one table `[[notifier.target]]` for each target")
     page: str = Field(
@@ -114,20 +111,6 @@ class NotifierConfig(StageConfig):
         default="",
         description='time zone of quiet hours and of times in messages, such as "Europe/Berlin"; "": that of the host',
     )
-    gather_s: float = Field(
-        default=5.0, ge=0, description="how long a message waits for others that it could be combined with"
-    )
-    digest_above: int = Field(default=3, ge=1, description="messages about more fans than this are combined into one")
-    digest_within_s: float = Field(
-        default=30.0,
-        gt=0,
-        description="while more fans keep coming, a combined message waits for up to this time, and each further one "
-        "twice as long as the one before",
-    )
-    most_messages: int = Field(
-        default=10_000, ge=1, description="most messages that wait for their targets; beyond that, the oldest are lost"
-    )
-    kept_s: float = Field(default=3 * 86_400.0, gt=0, description="a message that has waited this long is lost")
 
     @field_validator("target", mode="before")
     @classmethod

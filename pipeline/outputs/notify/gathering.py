@@ -8,14 +8,19 @@ from dataclasses import dataclass, field
 from datetime import datetime, tzinfo
 from typing import Self
 
-from fantwin.pipeline.outputs.notify.config import NotifierConfig, QuietHours
+from fantwin.pipeline.outputs.notify.config import QuietHours
 from fantwin.pipeline.outputs.notify.deciding import Kind
 from fantwin.pipeline.outputs.notify.fan_alarm import FanName
 from fantwin.schemas.enums import Severity
 from fantwin.schemas.units import NS_PER_S
 
-LONGEST_S = 600.0
-"""a message that waits for more fans waits no longer"""
+GATHER_S = 5.0
+"""how long a message waits for others that it could be combined with"""
+DIGEST_ABOVE = 3
+"""messages about more fans than this are combined into one"""
+DIGEST_WITHIN_S, LONGEST_S = 30.0, 600.0
+"""while more fans keep coming, a combined message waits for up to the first, and each further one twice as long as the
+one before, up to the second"""
 
 
 @dataclass(frozen=True)
@@ -63,27 +68,26 @@ class Gathered:
         return cls(opened_ns, newest_ns, in_a_row, happened)
 
 
-def is_due(gathered: Gathered, config: NotifierConfig, now_ns: int) -> bool:
+def is_due(gathered: Gathered, now_ns: int) -> bool:
     """Whether it becomes a message now. A clock that was set back holds nothing up."""
     if not gathered.fans:
         return False
     waited_ns, silent_ns = abs(now_ns - gathered.opened_ns), abs(now_ns - gathered.newest_ns)
-    gather_ns = config.gather_s * NS_PER_S
-    if len(gathered.fans) <= config.digest_above:
+    gather_ns = GATHER_S * NS_PER_S
+    if len(gathered.fans) <= DIGEST_ABOVE:
         return waited_ns >= gather_ns
-    return silent_ns >= gather_ns or waited_ns >= _longest_ns(gathered, config)
+    return silent_ns >= gather_ns or waited_ns >= _longest_ns(gathered)
 
 
-def next_after(gathered: Gathered, config: NotifierConfig, now_ns: int) -> Gathered:
+def next_after(gathered: Gathered, now_ns: int) -> Gathered:
     """What is gathered after a message: nothing. If more fans kept coming, it then waits twice as long for them."""
-    is_many = len(gathered.fans) > config.digest_above
-    keep_coming = is_many and abs(now_ns - gathered.newest_ns) < config.gather_s * NS_PER_S
+    is_many = len(gathered.fans) > DIGEST_ABOVE
+    keep_coming = is_many and abs(now_ns - gathered.newest_ns) < GATHER_S * NS_PER_S
     return Gathered(in_a_row=gathered.in_a_row + 1 if keep_coming else 0)
 
 
-def _longest_ns(gathered: Gathered, config: NotifierConfig) -> float:
-    doubled_s = config.digest_within_s * 2 ** min(gathered.in_a_row, 10)
-    return max(config.digest_within_s, min(LONGEST_S, doubled_s)) * NS_PER_S
+def _longest_ns(gathered: Gathered) -> float:
+    return min(LONGEST_S, DIGEST_WITHIN_S * 2 ** min(gathered.in_a_row, 10)) * NS_PER_S
 
 
 def is_held(hours: QuietHours | None, severity: int, now_ns: int, zone: tzinfo | None) -> bool:

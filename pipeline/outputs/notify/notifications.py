@@ -12,7 +12,15 @@ from enum import StrEnum
 from fantwin.pipeline.outputs.notify.config import NotifierConfig, TargetConfig
 from fantwin.pipeline.outputs.notify.deciding import Announced, Event, decide, hears_of
 from fantwin.pipeline.outputs.notify.fan_alarm import FanAlarm, FanName, fan_alarm
-from fantwin.pipeline.outputs.notify.gathering import Gathered, Happened, is_due, is_held, is_within, next_after
+from fantwin.pipeline.outputs.notify.gathering import (
+    DIGEST_ABOVE,
+    Gathered,
+    Happened,
+    is_due,
+    is_held,
+    is_within,
+    next_after,
+)
 from fantwin.pipeline.outputs.notify.wording import Place, Text, about_fan, about_many
 from fantwin.pipeline.site.alarm_book import AlarmBook
 from fantwin.pipeline.site.fleet import Fan
@@ -210,8 +218,8 @@ class Notifications:
 
     def _send_due(self, target: TargetConfig, now_ns: int) -> None:
         gathered = self._gathered(target, Basket.OPEN)
-        if is_due(gathered, self._config, now_ns):
-            self._set(target, Basket.OPEN, next_after(gathered, self._config, now_ns))
+        if is_due(gathered, now_ns):
+            self._set(target, Basket.OPEN, next_after(gathered, now_ns))
             for text in self._texts(gathered, now_ns):
                 self.changes.outgoing.append(Outgoing(target.name, text, now_ns))
         held = self._gathered(target, Basket.HELD)
@@ -231,7 +239,7 @@ class Notifications:
 
     def _texts(self, gathered: Gathered, now_ns: int) -> Iterator[Text]:
         fans = self._presented(gathered)
-        if len(fans) > self._config.digest_above:
+        if len(fans) > DIGEST_ABOVE:
             yield about_many(self._place, fans, now_ns)
             return
         for alarm, happened in fans:

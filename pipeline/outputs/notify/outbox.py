@@ -25,6 +25,8 @@ from fantwin.schemas.messages import Alarm
 from fantwin.schemas.units import NS_PER_S
 
 READER = "notifier"
+MOST_MESSAGES, KEPT_S = 10_000, 3 * 86_400.0
+"""that wait for their targets: the oldest beyond that, and those that have waited longer, are lost"""
 MOST_EVENTS = 200_000
 """of those that were decided, the last are remembered"""
 _SCHEMA = """
@@ -146,7 +148,7 @@ class Outbox:
             return found.fetchone() is not None
         return False
 
-    def save(self, saved: Saved, changes: Changes, *, most_messages: int, kept_s: float, now_ns: int) -> None:
+    def save(self, saved: Saved, changes: Changes, now_ns: int) -> None:
         """Save what has changed, all or nothing. Messages that are too old or too many are lost.
 
         Raises:
@@ -179,8 +181,8 @@ class Outbox:
             )
             self._history.set_position(READER, self._position or 0)
             file.write("DELETE FROM event WHERE rowid <= (SELECT MAX(rowid) FROM event) - ?", (MOST_EVENTS,))
-            self._lose("made_ns < ?", (now_ns - round(kept_s * NS_PER_S),))
-            self._lose("number <= (SELECT number FROM message ORDER BY number DESC LIMIT 1 OFFSET ?)", (most_messages,))
+            self._lose("made_ns < ?", (now_ns - round(KEPT_S * NS_PER_S),))
+            self._lose("number <= (SELECT number FROM message ORDER BY number DESC LIMIT 1 OFFSET ?)", (MOST_MESSAGES,))
 
     def next_for(self, target: str, after: int = 0) -> Waiting | None:
         """The oldest message of a target, or the first one after another; None: there is none."""

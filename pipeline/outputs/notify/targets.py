@@ -55,8 +55,7 @@ def sender_of(target: TargetConfig, resolve: Resolve, outbox: Outbox, place: Pla
     connection = connection_of(target, resolve)
     if isinstance(connection, Alertmanager):
         return AlertSender(target.name, connection, outbox, place)
-    pause_s = connection.pause_s if target.pause_s is None else target.pause_s
-    return Sender(target.name, connection.deliver, outbox, pause_s)
+    return Sender(target.name, connection.deliver, outbox, connection.pause_s)
 
 
 def send_test(target: TargetConfig, resolve: Resolve, place: Place) -> Failure | None:

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.outputs.notify import outbox as module
 from fantwin.pipeline.outputs.notify.deciding import Announced, Event, Kind
 from fantwin.pipeline.outputs.notify.gathering import Gathered, Happened
 from fantwin.pipeline.outputs.notify.notifications import Basket, Changes, Outgoing, Saved
@@ -21,9 +22,9 @@ FAN = ("tray1", 2)
 EVENT = Event("tray1", 2, START_NS, Kind.RAISED)
 
 
-def save(outbox: Outbox, saved: Saved, changes: Changes, *, seconds: float = 0.0, most_messages: int = 10) -> None:
+def save(outbox: Outbox, saved: Saved, changes: Changes, *, seconds: float = 0.0) -> None:
     now_ns = START_NS + round(seconds * NS_PER_S)
-    outbox.save(saved, changes, most_messages=most_messages, kept_s=60.0, now_ns=now_ns)
+    outbox.save(saved, changes, now_ns)
 
 
 def texts(*targets: str) -> Changes:
@@ -74,8 +75,10 @@ def test_a_delivery_that_was_under_way_may_be_repeated(outbox, tmp_path):
     assert second and not second.may_be_repeated
 
 
-def test_the_oldest_are_lost_and_the_next_one_knows_how_many(outbox):
-    save(outbox, Saved(), texts(*["mail"] * 5), most_messages=3)
+def test_the_oldest_are_lost_and_the_next_one_knows_how_many(outbox, monkeypatch):
+    monkeypatch.setattr(module, "MOST_MESSAGES", 3)
+    monkeypatch.setattr(module, "KEPT_S", 60.0)
+    save(outbox, Saved(), texts(*["mail"] * 5))
     assert (outbox.count(), outbox.lost) == (3, {"mail": 2})
     save(outbox, Saved(), Changes(), seconds=50)
     assert outbox.count() == 3
