@@ -57,6 +57,8 @@ LIMITS_CHECK_NS = 10 * NS_PER_S
 """time between two checks of the limits on age and size; they are also checked before each part"""
 URGENT = ("alarm", "request", "twin")
 """topics whose messages are on the disk within FLUSH_S"""
+CLIP_BEFORE_S, CLIP_AFTER_S = 60.0, 60.0
+"""a clip begins so long before its alarm, and ends so long after"""
 CLIP_SETTLED_S = 2.0
 """time after the end of a clip for what comes late; it then waits until all of that is on the disk"""
 ROOM_TO_RESUME = 1 << 20
@@ -410,7 +412,7 @@ def _clips_of(parts: RecordingParts, config: RecorderConfig) -> AlarmClips:
     most_bytes = 0
     with suppress(DiskError):  # it does not say its size: the health reports that
         most_bytes = round(parts.disk_bytes() * config.keep_share_of_disk * CLIPS_SHARE)
-    tracker = tracker_of(parts.path, config.clip_before_s, config.clip_after_s, most_bytes, CLIP_SETTLED_S)
+    tracker = tracker_of(parts.path, CLIP_BEFORE_S, CLIP_AFTER_S, most_bytes, CLIP_SETTLED_S)
     worker = ClipWorker(parts.path, config.min_free_bytes, parts.free_bytes)
     clips = AlarmClips(tracker, worker)
     if parts.last_part:

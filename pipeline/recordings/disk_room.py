@@ -18,12 +18,15 @@ from typing import NamedTuple
 from fantwin.pipeline.recordings.clips.alarm_clips import AlarmClips
 from fantwin.pipeline.recordings.disk import Disk, DiskError
 from fantwin.pipeline.recordings.open_part import PartsFolder
-from fantwin.pipeline.recordings.recorder_config import CLIPS_SHARE, LEAST_PART_S, PARTS_WITHIN_LIMITS, RecorderConfig
+from fantwin.pipeline.recordings.recorder_config import CLIPS_SHARE, PARTS_WITHIN_LIMITS, RecorderConfig
 from fantwin.pipeline.recordings.records import RecordingError
 from fantwin.pipeline.recordings.stored_recordings import Stored, StoredPart, StoredRecordings
 from fantwin.schemas.units import NS_PER_S
 
 DAY_NS = 86_400 * NS_PER_S
+PART_BYTES, PART_S = 100_000_000, 86_400.0
+"""a new part begins at this size and after this time, and earlier where the limits are small"""
+LEAST_PART_S = 1.0
 AGED_S = 3600.0
 """between two parts that are deleted by age alone, unless a part has ended: the clock may be wrong"""
 _LOG = logging.getLogger(__name__)
@@ -66,13 +69,13 @@ class DiskRoom:
     @property
     def part_bytes(self) -> float:
         """The size at which a new part begins."""
-        return min(self._config.part_bytes or math.inf, (self._limit_bytes or math.inf) / PARTS_WITHIN_LIMITS)
+        return min(PART_BYTES, (self._limit_bytes or math.inf) / PARTS_WITHIN_LIMITS)
 
     @property
     def part_s(self) -> float:
         """The time after which a new part begins."""
         kept_s = self._config.keep_days * 86_400 or math.inf
-        return max(LEAST_PART_S, min(self._config.part_s or math.inf, kept_s / PARTS_WITHIN_LIMITS))
+        return max(LEAST_PART_S, min(PART_S, kept_s / PARTS_WITHIN_LIMITS))
 
     def keep_limits(self, now_ns: int, *, has_ended_part: bool = False) -> None:
         """Delete what is too old, and the oldest that is too much; room for the part that is written is left. The last

@@ -15,8 +15,6 @@ FLUSH_S, FLUSH_BYTES = 1.0, 64 << 10
 """messages in memory are flushed after this time if they are more than this, or if one of them is urgent"""
 PARTS_WITHIN_LIMITS = 8
 """parts within each limit, because only whole parts are deleted"""
-LEAST_PART_BYTES, LEAST_PART_S = 1_000_000, 1.0
-"""the smallest limits of a part that can be set"""
 RECORDED = tuple(topic.name for topic in TOPICS if topic.recorded)
 SAMPLES = tuple(name for name in RECORDED if BY_NAME[name].has_samples)
 """the topics that may be left out"""
@@ -45,17 +43,6 @@ class RecorderConfig(StageConfig):
         f"flush comes after {FLUSH_S:g} s if {FLUSH_BYTES >> 10} KiB, an alarm, a request, a twin or a problem waits, "
         "or while a clip is running",
     )
-    part_bytes: int = Field(
-        default=100_000_000,
-        ge=0,
-        description="a new part begins at this size, or at an eighth of the space of `keep_share_of_disk`; 0: only at "
-        "that eighth",
-    )
-    part_s: float = Field(
-        default=0.0,
-        ge=0,
-        description="a new part begins after this time, or after an eighth of `keep_days`; 0: only after that eighth",
-    )
     keep_days: float = Field(
         default=14.0, ge=0, description="older recordings are deleted; 0: none is deleted because of its age"
     )
@@ -74,8 +61,6 @@ class RecorderConfig(StageConfig):
     )
 
     clips: bool = Field(default=True, description="keep a clip of each alarm, in the folder clips beside the recording")
-    clip_before_s: float = Field(default=60.0, ge=0, le=600, description="how long before the alarm a clip begins")
-    clip_after_s: float = Field(default=60.0, ge=0, le=600, description="how long after the alarm a clip ends")
 
     @field_validator("topics")
     @classmethod
@@ -85,20 +70,6 @@ class RecorderConfig(StageConfig):
                 raise ValueError(f"unknown topic {name!r}{nearest(name, SAMPLES)}")
             if name not in SAMPLES:
                 raise ValueError(f"{name} is always recorded: name only topics of samples, {', '.join(SAMPLES)}")
-        return value
-
-    @field_validator("part_bytes")
-    @classmethod
-    def _not_too_small(cls, value: int) -> int:
-        if 0 < value < LEAST_PART_BYTES:
-            raise ValueError(f"must be 0 (no limit) or at least {LEAST_PART_BYTES:,} bytes")
-        return value
-
-    @field_validator("part_s")
-    @classmethod
-    def _not_too_short(cls, value: float) -> float:
-        if 0 < value < LEAST_PART_S:
-            raise ValueError(f"must be 0 (no limit) or at least {LEAST_PART_S:g} s")
         return value
 
 

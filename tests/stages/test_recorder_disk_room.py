@@ -57,8 +57,9 @@ def test_clips_count_as_half_of_the_share_at_most_and_the_last_part_stays():
     assert "nothing may be deleted, the last finished part included" in core.notes()[1]
 
 
-@pytest.mark.parametrize("limits", [{"keep_days": 1e-6}, {"keep_share_of_disk": 1e-6}, {"part_bytes": 1_000_000}])
-def test_limits_that_leave_room_for_no_part_begin_none_at_every_tick(limits):
+@pytest.mark.parametrize("limits", [{"keep_days": 1e-6}, {"keep_share_of_disk": 1e-6}, {}])
+def test_limits_that_leave_room_for_no_part_begin_none_at_every_tick(limits, monkeypatch):
+    monkeypatch.setattr("fantwin.pipeline.recordings.disk_room.PART_BYTES", 1_000_000)
     disk = Disk()
     disk.disk, disk.attached_bytes = 1_000_000_000, 5_000_000
     core = recorder(disk, **limits)

@@ -79,8 +79,9 @@ def test_row_03_a_restored_file_is_reported_for_a_minute_and_restored_also_at_th
     assert run.recorded() == list(range(670))
 
 
-def test_row_03_the_file_that_replaced_a_recording_is_left_alone(tmp_path):
-    run = Run(tmp_path, part_s=5.0)
+def test_row_03_the_file_that_replaced_a_recording_is_left_alone(tmp_path, monkeypatch):
+    monkeypatch.setattr("fantwin.pipeline.recordings.disk_room.PART_S", 5.0)
+    run = Run(tmp_path)
     run.seconds(3)
     run.active.unlink()
     run.active.write_bytes(b"of another program")

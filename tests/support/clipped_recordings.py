@@ -6,7 +6,9 @@ from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
+from fantwin.pipeline.recordings import disk_room
 from fantwin.pipeline.recordings.clips.alarm_clips import AlarmClips
 from fantwin.pipeline.recordings.clips.clip import Clip, ClipAlarm
 from fantwin.pipeline.recordings.parts import RecordingParts
@@ -22,19 +24,20 @@ S = 1_000_000_000
 def record(
     source: Path, recording: Path, left_out: Iterable[str] = (), clips: AlarmClips | None = None, **config: Any
 ) -> Recorder:
-    """A recorder that has been given all messages of `source` at their times, and goes on."""
+    """A recorder that has been given all messages of `source` at their times, in parts of a second, and goes on."""
     head, leaves_out = read_metadata(source), tuple(left_out)
     metadata = {**head.metadata, **({"left_out": ",".join(leaves_out)} if leaves_out else {})}
     parts = RecordingParts(recording, metadata, head.attachments, session="s1")
     envelopes = [each for each in read_recording(source) if each.topic not in leaves_out]
     core = Recorder(parts, RecorderConfig(**config), envelopes[0].received_t_ns, leaves_out, clips=clips)
     ticked_ns = 0
-    for envelope in envelopes:
-        core.step(envelope)
-        if envelope.received_t_ns - ticked_ns >= S // 20:
-            ticked_ns = envelope.received_t_ns
-            core.tick(ticked_ns)
-    core.tick(envelopes[-1].received_t_ns + S)  # flushes
+    with patch.object(disk_room, "PART_S", 1.0):
+        for envelope in envelopes:
+            core.step(envelope)
+            if envelope.received_t_ns - ticked_ns >= S // 20:
+                ticked_ns = envelope.received_t_ns
+                core.tick(ticked_ns)
+        core.tick(envelopes[-1].received_t_ns + S)  # flushes
     return core
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from mcap.reader import make_reader
 
+from fantwin.pipeline.recordings import disk_room
 from fantwin.pipeline.recordings.contents import contents_of
 from fantwin.pipeline.recordings.reading import read_metadata, read_recording
 from fantwin.pipeline.recordings.scan import scan
@@ -70,8 +71,9 @@ def until(happens, run: Run) -> None:
     raise AssertionError("it never happened")
 
 
-def test_a_full_disk_loses_nothing_that_memory_can_hold(small_disk):
-    run = Run(small_disk, min_free_bytes=0, part_bytes=1_000_000)
+def test_a_full_disk_loses_nothing_that_memory_can_hold(small_disk, monkeypatch):
+    monkeypatch.setattr(disk_room, "PART_BYTES", 1_000_000)
+    run = Run(small_disk, min_free_bytes=0)
     ballast = small_disk / "ballast"
     ballast.write_bytes(bytes(SIZE_BYTES - 900_000))
     until(run.core.problem, run)
@@ -121,8 +123,9 @@ def test_messages_that_memory_cannot_hold_are_missing_in_the_ledger(small_disk, 
     assert found[-1] == run.sent - 1
 
 
-def test_on_a_full_disk_the_oldest_parts_are_deleted(small_disk):
-    run = Run(small_disk, min_free_bytes=3_000_000, part_bytes=1_000_000)
+def test_on_a_full_disk_the_oldest_parts_are_deleted(small_disk, monkeypatch):
+    monkeypatch.setattr(disk_room, "PART_BYTES", 1_000_000)
+    run = Run(small_disk, min_free_bytes=3_000_000)
     for _ in range(300):  # 30 MB, on a disk of 8
         run.second()
         assert run.core.problem() == ""
