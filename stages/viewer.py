@@ -4,7 +4,7 @@ Reads `score`, `alarm`, `twin`, `health` and `snapshot`; writes nothing. One cor
 the unit of the tray. Samples are collected and drawn twice a second, because a call into Rerun is expensive and a row
 in it is cheap.
 
-With more fans than `fleet_above`, only some are drawn: those in alarm, as far as there is room, and those in `show`. Of
+With more than 64 fans, only some are drawn: those in alarm, as far as there is room, and those in `show`. Of
 the other trays the newest score is asked for once a second, and the rest never arrives.
 
 Only samples and alarms are on the time line, at the time of the sample; wear has a timeline of its own. Reports in host
@@ -27,6 +27,12 @@ from fantwin.pipeline.runtime.stage import BuiltStage, Context, Stage, StageConf
 from fantwin.pipeline.site.fleet import Fan
 from fantwin.pipeline.site.loopback import check_free
 
+FILE_BYTES = 1_000_000_000
+"""size at which the view's file ends"""
+FLEET_ABOVE = 64
+"""with more fans than this on the site, only those in alarm and those in `show` are drawn"""
+ALARM_PLOT_HOLD_S = 60.0
+"""how long the plot of a fan of a fleet stays after its alarm has cleared"""
 READS = ("score", "alarm", "twin", "health", "snapshot")
 
 
@@ -38,7 +44,6 @@ class ViewerConfig(StageConfig):
         description='file in run_folder for the view, such as "view.rrd"; if it exists, it is kept, and view-2.rrd is '
         'written. "": no file; `fantwin view` makes one from a recording',
     )
-    file_bytes: int = Field(default=1_000_000_000, ge=1_000_000, description="size at which the view's file ends")
     serve: bool = Field(default=True, description="serve live viewers on this host (127.0.0.1)")
     grpc_port: int = Field(
         default=9876,
@@ -57,19 +62,8 @@ class ViewerConfig(StageConfig):
     memory_limit: str = Field(
         default="256MB", pattern=r"^\d+(MB|GB|MiB|GiB)$", description="history kept for viewers that join late"
     )
-    fleet_above: int = Field(
-        default=64,
-        ge=0,
-        description="with more fans than this on the site, only those in alarm and those in `show` are drawn",
-    )
     show: tuple[str, ...] = Field(
         default=(), max_length=64, description='fans of a fleet that always have a plot: ["tray1/3", "tray2/0"]'
-    )
-    alarm_plots: int = Field(
-        default=8, ge=0, le=64, description="how many fans in alarm have a plot at a time, in the view of a fleet"
-    )
-    alarm_plot_hold_s: float = Field(
-        default=60.0, ge=0, description="how long such a plot stays after the alarm has cleared, s"
     )
 
 
@@ -107,12 +101,11 @@ def build(context: Context) -> BuiltStage:
     options = ViewOptions(
         layout=config.layout,
         window_s=config.window_s,
-        fleet_above=config.fleet_above,
+        fleet_above=FLEET_ABOVE,
+        alarm_plot_hold_s=ALARM_PLOT_HOLD_S,
         show=shown_fans(config.show, context.trays),
-        alarm_plots=config.alarm_plots,
-        alarm_plot_hold_s=config.alarm_plot_hold_s,
         memory_limit=config.memory_limit,
-        file_bytes=config.file_bytes,
+        file_bytes=FILE_BYTES,
     )
     core = view_of_site(
         context.site,
@@ -152,9 +145,9 @@ def check(context: Context) -> list[str]:
     return problems
 
 
-def topics_read(config: ViewerConfig, trays: Sequence[TrayConfig]) -> tuple[str, ...]:
+def topics_read(_config: ViewerConfig, trays: Sequence[TrayConfig]) -> tuple[str, ...]:
     """Topics of trays. Of a fleet, the wear is not drawn: the snapshots of its scorers are many megabytes a minute."""
-    is_fleet = sum(tray.fans for tray in trays) > config.fleet_above
+    is_fleet = sum(tray.fans for tray in trays) > FLEET_ABOVE
     return tuple(topic for topic in READS if not (is_fleet and topic == "snapshot"))
 
 

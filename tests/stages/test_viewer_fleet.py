@@ -194,8 +194,12 @@ def with_supply(message: Score | Alarm) -> Score | Alarm:
     return replace(message, supply_voltage_v=np.full(message.score.shape, 12.5, np.float32))
 
 
-def test_the_file_of_a_fleet_shows_at_each_time_what_was_shown_then(tmp_path: Path) -> None:
-    core = build(context(tmp_path, 3, 3, fleet_above=3, show=("tray1/0",), alarm_plot_hold_s=HOLD_S)).core
+def test_the_file_of_a_fleet_shows_at_each_time_what_was_shown_then(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("fantwin.stages.viewer.FLEET_ABOVE", 3)
+    monkeypatch.setattr("fantwin.stages.viewer.ALARM_PLOT_HOLD_S", HOLD_S)
+    core = build(context(tmp_path, 3, 3, show=("tray1/0",))).core
     assert isinstance(core, ViewerCore)
     play(core, [with_supply(each) if each.header.tray == "tray2" else each for each in messages_of()])
     core.close()

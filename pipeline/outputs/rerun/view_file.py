@@ -92,7 +92,7 @@ class ViewFile:
                 rest = memoryview(piece)
                 self._room_bytes -= len(piece)
                 if self._room_bytes < 0:
-                    self._stop("it has the size of viewer.file_bytes", "`fantwin view` shows a recording")
+                    self._stop("it has the largest size of a view", "`fantwin view` shows a recording")
                 while rest and not self.problem:
                     try:
                         rest = rest[self._file.write(rest) :]

@@ -17,12 +17,12 @@ from fantwin.pipeline.runtime.stage import StageError
 from fantwin.pipeline.site.fleet import Fan
 from fantwin.schemas.units import NS_PER_S
 
-NO_WEAR = 'viewer.layout = "wear": not with more than {fleet_above} fans (fleet_above); fantwin wear lists the changes'
+NO_WEAR = 'viewer.layout = "wear": not with more than {fleet_above} fans; fantwin wear lists the changes'
 
 
 @dataclass(frozen=True)
 class ViewOptions:
-    """What of the section `[viewer]` the view itself depends on; the defaults are those of the section."""
+    """What the view itself depends on, with the defaults of `[viewer]`."""
 
     layout: LayoutName = "all"
     window_s: float = 30.0
@@ -32,7 +32,7 @@ class ViewOptions:
     alarm_plot_hold_s: float = 60.0
     memory_limit: str = "256MB"
     file_bytes: float = math.inf
-    """size at which the file ends; `[viewer]` sets one"""
+    """size at which the file ends; the viewer sets one"""
 
 
 def view_of_site(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from io import BytesIO
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -19,7 +20,8 @@ from tests.stages.test_viewer_fleet import context, messages_of, play
 def view_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Twenty seconds of three trays of three fans; fan 2 of tray2 is in alarm from 8.5 s to 14.5 s."""
     folder = tmp_path_factory.mktemp("view")
-    core = build(context(folder, 3, 3, fleet_above=3)).core
+    with patch("fantwin.stages.viewer.FLEET_ABOVE", 3):
+        core = build(context(folder, 3, 3)).core
     assert isinstance(core, ViewerCore)
     play(core, messages_of())
     core.close()

@@ -72,7 +72,7 @@ def test_the_file_ends_before_it_exceeds_its_limit(tmp_path: Path) -> None:
             pipe.write(bytes(1000))
     file.close()
     assert 100_000 < path.stat().st_size <= 200_000
-    assert "it has the size of viewer.file_bytes" in file.problem
+    assert "it has the largest size of a view" in file.problem
 
 
 def test_row_09_a_disk_that_hangs_keeps_nobody_waiting(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
