@@ -1,4 +1,4 @@
-"""Small logs of other systems, written for tests: ULog and Betaflight blackbox by hand, ROS 2 bags by rosbags."""
+"""Small logs of other systems, written for tests: ULog by hand, ROS 2 bags by rosbags."""
 
 from __future__ import annotations
 
@@ -8,8 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-
-UNSIGNED = 1  # encoding of a blackbox field: unsigned variable byte
 
 
 def write_ulog(path: Path, topics: Mapping[str, tuple[str, Sequence[tuple[Any, ...]]]]) -> None:
@@ -40,38 +38,6 @@ def _codes(fields: str) -> str:
         name, _, count = kind.partition("[")
         found += codes[name] * int(count.rstrip("]") or 1) if count else codes[name]
     return found
-
-
-def write_blackbox(path: Path, logs: Sequence[Sequence[Sequence[int]]], *headers: str) -> None:
-    """logs: of each the rows of loopIteration, time (us), two motors and two eRPM (hundreds)."""
-    names = ["loopIteration", "time", "motor[0]", "motor[1]", "eRPM[0]", "eRPM[1]"]
-    lines = [
-        "Product:Blackbox flight data recorder by Nicholas Sherlock",
-        "Data version:2",
-        f"Field I name:{','.join(names)}",
-        f"Field I signed:{','.join('0' * len(names))}",
-        f"Field I predictor:{','.join('0' * len(names))}",
-        f"Field I encoding:{','.join([str(UNSIGNED)] * len(names))}",
-        f"Field P predictor:{','.join('0' * len(names))}",
-        f"Field P encoding:{','.join([str(UNSIGNED)] * len(names))}",
-        "I interval:1",
-        "P interval:1/1",
-        *headers,
-    ]
-    header = "".join(f"H {line}\n" for line in lines).encode()
-    content = b""
-    for rows in logs:
-        frames = b"".join(b"I" + b"".join(map(_varint, row)) for row in rows)
-        content += header + frames + b"E\xff" + b"End of log\x00"
-    path.write_bytes(content)
-
-
-def _varint(value: int) -> bytes:
-    out = bytearray()
-    while value > 0x7F:
-        out.append((value & 0x7F) | 0x80)
-        value >>= 7
-    return bytes([*out, value])
 
 
 def write_rosbag(folder: Path, t_s: np.ndarray, command: np.ndarray, rpm: np.ndarray, *, mcap: bool) -> None:

@@ -39,7 +39,7 @@ def import_table(
         Path,
         typer.Argument(
             metavar="FILE",
-            help="A text file whose first line names the columns, or a log: ULog, Betaflight blackbox, ROS 2 bag.",
+            help="A text file whose first line names the columns, or a log: ULog, ROS 2 bag.",
         ),
     ],
     output: Annotated[
@@ -50,7 +50,7 @@ def import_table(
         typer.Option(
             metavar="COLUMN",
             help="Command column: one for all fans, or one per fan. Repeatable. In a log a field, or one pattern for "
-            "all fans, for example 'motor[*]'.",
+            "all fans, for example 'actuator_outputs.output[*]'.",
         ),
     ] = None,
     speed: Annotated[
@@ -84,12 +84,7 @@ def import_table(
             "`tacho` in [[tray]]: one for all fans, or one per fan. Repeatable.",
         ),
     ] = None,
-    poles: Annotated[
-        int | None, typer.Option(help="Magnetic poles of a motor, for speeds in erpm, if the log does not say it.")
-    ] = None,
-    log_number: Annotated[
-        int, typer.Option("--log", metavar="N", help="Which log of a file that has several, counted from 1.")
-    ] = 1,
+    poles: Annotated[int | None, typer.Option(help="Magnetic poles of a motor, for speeds in erpm.")] = None,
     list_fields: Annotated[
         bool, typer.Option("--list", help="Show the fields of a log and their rates; import nothing.")
     ] = False,
@@ -103,11 +98,11 @@ def import_table(
 
     Example: fantwin import FILE.csv --time t:s --command u --speed y:rpm --tacho count:window_s=1 -o REC.mcap
 
-    Example: fantwin import FLIGHT.bbl --command 'motor[*]' --speed 'eRPM[*]:erpm' --poles 14 -o REC.mcap
+    Example: fantwin import FLIGHT.ulg --command 'out.u[*]' --speed 'esc.rpm[*]:rpm' -o REC.mcap
     """
     kind = log_format(file)
     if list_fields:
-        _list_fields(file, kind, log_number, json_output=json_output)
+        _list_fields(file, kind, json_output=json_output)
         return
     if output is None or not command or not speed:
         what = "-o, --command and --speed" if kind is None else "-o, --command and --speed; --list shows the fields"
@@ -124,7 +119,7 @@ def import_table(
     else:
         if time or period:
             raise UsageError(f"--time and --period are for tables: a {kind.title} has its own times")
-        log = open_log(file, kind, log_number)
+        log = open_log(file, kind)
         table, of_log = read_samples(file, log, command, speed, poles, auxiliary=auxiliary)
         notes = list(of_log)
         tachos = _tachos(tacho or (), table.fans)
@@ -142,26 +137,25 @@ def import_table(
         typer.echo(f"hint: {hint}; see --tacho", err=True)
 
 
-def _list_fields(file: Path, kind: LogFormat | None, number: int, *, json_output: bool) -> None:
+def _list_fields(file: Path, kind: LogFormat | None, *, json_output: bool) -> None:
     """Show the fields of a log, with the number of their values and their rates."""
     if kind is None:
         raise UsageError(f"{file}: --list is for logs; the first line of a table names its columns")
-    log = open_log(file, kind, number)
+    log = open_log(file, kind)
     series = log.read(log.names)
     if json_output:
         rows = [
             {"name": name, "values": len(each.values), "rate_hz": each.rate_hz, **_range(each.values)}
             for name, each in series.items()
         ]
-        typer.echo(json.dumps({"format": kind.title, "motor_poles": log.motor_poles, "fields": rows}))
+        typer.echo(json.dumps({"format": kind.title, "fields": rows}))
         return
     width = max(map(len, log.names), default=0)
     for name, each in series.items():
         low, high = _range(each.values).values()
         span = "no numbers" if low is None else f"{low:10.6g} to {high:.6g}"
         typer.echo(f"{name:{width}}  {len(each.values):7d} values  {each.rate_hz:8.3g} Hz  {span}")
-    poles = f", {log.motor_poles} poles" if log.motor_poles else ""
-    typer.echo(f"{file}: {kind.title}, {len(log.names)} fields{poles}")
+    typer.echo(f"{file}: {kind.title}, {len(log.names)} fields")
 
 
 def _range(values: Array) -> dict[str, float | None]:

@@ -20,7 +20,7 @@ class LogFormat(NamedTuple):
         starts: the first bytes of such a file.
         marker: a file in the folder that such a log is; "": it is a file.
         needs: the module of the extra `logs` that reads it.
-        reader: import string of the function that opens it, given a path and the number of the log in the file from 1.
+        reader: import string of what opens it, given a path.
     """
 
     title: str
@@ -31,20 +31,13 @@ class LogFormat(NamedTuple):
 
 
 LOG_FORMATS = (
-    LogFormat("ULog", (b"ULog\x01\x12\x35",), "", "pyulog", "fantwin.pipeline.sources.logs.ulog:open_ulog"),
-    LogFormat(
-        "Betaflight blackbox",
-        (b"H Product:Blackbox",),
-        "",
-        "orangebox",
-        "fantwin.pipeline.sources.logs.blackbox:open_blackbox",
-    ),
+    LogFormat("ULog", (b"ULog\x01\x12\x35",), "", "pyulog", "fantwin.pipeline.sources.logs.ulog:ULogFile"),
     LogFormat(
         "ROS 2 bag",
         (b"SQLite format 3\0", b"\x89MCAP0\r\n"),
         "metadata.yaml",
         "rosbags",
-        "fantwin.pipeline.sources.logs.rosbag:open_rosbag",
+        "fantwin.pipeline.sources.logs.rosbag:RosbagFile",
     ),
 )
 
@@ -68,8 +61,8 @@ def log_format(path: Path) -> LogFormat | None:
     return next((each for each in LOG_FORMATS if start.startswith(each.starts)), None)
 
 
-def open_log(path: Path, kind: LogFormat, number: int = 1) -> LogFile:
-    """Open a log of this format. number: of the log, where a file has several.
+def open_log(path: Path, kind: LogFormat) -> LogFile:
+    """Open a log of this format.
 
     Raises:
         LogError: it cannot be read, or what reads it is not installed.
@@ -77,7 +70,7 @@ def open_log(path: Path, kind: LogFormat, number: int = 1) -> LogFile:
     if problem := missing_extra(f"{path}: a {kind.title}", "logs", kind.needs):
         raise LogError(problem)
     module, _, name = kind.reader.partition(":")
-    log: LogFile = getattr(import_module(module), name)(path, number)
+    log: LogFile = getattr(import_module(module), name)(path)
     if not log.names:
         raise LogError(f"{path}: this {kind.title} has no fields with numbers; is it damaged?")
     return log

@@ -44,11 +44,6 @@ class LogFile(Protocol):
         ...
 
     @property
-    def motor_poles(self) -> int | None:
-        """Magnetic poles of the motors, if the log says so: needed for speeds in electrical revolutions."""
-        ...
-
-    @property
     def names(self) -> Sequence[str]:
         """The names of the fields that have numbers."""
         ...

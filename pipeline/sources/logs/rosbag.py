@@ -26,8 +26,6 @@ _NO_VALUES = ("header", "layout")
 class RosbagFile:
     """A bag whose messages have been read."""
 
-    motor_poles = None
-
     def __init__(self, path: Path) -> None:
         """Raises LogError."""
         from rosbags.highlevel import AnyReader  # noqa: PLC0415  an extra
@@ -87,10 +85,3 @@ def _numbers(name: str, value: Any) -> Iterator[tuple[str, float]]:
     elif isinstance(value, np.ndarray | list | tuple) and len(value) <= MOST_ELEMENTS:
         for number, element in enumerate(value):
             yield from _numbers(f"{name}[{number}]", element)
-
-
-def open_rosbag(path: Path, number: int) -> RosbagFile:
-    """Read a bag. Raises LogError."""
-    if number != 1:
-        raise LogError(f"{path}: --log {number}: a bag has one log")
-    return RosbagFile(path)

@@ -100,7 +100,7 @@ def read_samples(
     others = {name: _of_fans(path, log.names, given, chosen) for name, given in (auxiliary or {}).items()}
     measured = [name for names in others.values() for name in names if name]
     series = log.read(list(dict.fromkeys((*chosen.command, *chosen.speed, *measured))))
-    factor, shown = _rad_s_per(unit or "rad/s", poles or log.motor_poles)
+    factor, shown = _rad_s_per(unit or "rad/s", poles)
     t_ns, speeds = _speeds([series[name] for name in chosen.speed])
     commands = np.column_stack([_held(series[name], t_ns) for name in chosen.command])
     unknown = np.full(len(t_ns), np.nan)

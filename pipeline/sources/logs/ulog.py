@@ -18,8 +18,6 @@ MOST_FIELDS = 10_000
 class ULogFile:
     """An open ULog."""
 
-    motor_poles = None
-
     def __init__(self, path: Path) -> None:
         """Raises LogError: it is no ULog."""
         from pyulog import ULog  # noqa: PLC0415  an extra
@@ -72,10 +70,3 @@ def _refuse_endless(formats: Mapping[str, Any]) -> None:
 
     for name in formats:
         size_of(name)
-
-
-def open_ulog(path: Path, number: int) -> ULogFile:
-    """Open a ULog; it has one log only. Raises LogError."""
-    if number != 1:
-        raise LogError(f"{path}: --log {number}: a ULog file has one log")
-    return ULogFile(path)

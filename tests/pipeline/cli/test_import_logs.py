@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +14,7 @@ from fantwin.schemas.fields import Array
 from fantwin.schemas.messages import Raw
 from fantwin.schemas.tacho import Tacho
 from tests.support.fantwin_command import error_of, fantwin, usage_error_of
-from tests.support.written_logs import write_blackbox, write_rosbag, write_ulog
+from tests.support.written_logs import write_rosbag, write_ulog
 
 RPM = 2 * np.pi / 60
 T_S = np.arange(0, 4, 0.02)
@@ -34,20 +33,6 @@ def ulog(folder: Path) -> Path:
         "esc_status": ("uint64_t timestamp;esc_report[2] esc;", escs),
     }
     write_ulog(path, topics)
-    return path
-
-
-def blackbox(folder: Path, *headers: str) -> Path:
-    """Two logs, in whole steps of the command; the electrical speed of motors with 14 poles, in hundreds a minute."""
-    path = folder / "flight.bbl"
-    first, second = (
-        [
-            (k, round(t * 1e6) + 500, *map(int, 1000 + 1000 * COMMANDS[k]), *map(int, SPEEDS[k] * more * 7 / 100))
-            for k, t in enumerate(T_S)
-        ]
-        for more in (1, 2)
-    )
-    write_blackbox(path, [first, second], *headers)
     return path
 
 
@@ -86,20 +71,29 @@ def test_ulog_with_commands_held_at_the_times_of_the_readings(tmp_path: Path) ->
     np.testing.assert_allclose(samples(recording)[2], SPEEDS, rtol=1e-12)
 
 
-def test_blackbox_with_electrical_speeds_and_the_tacho_that_is_declared(tmp_path: Path) -> None:
-    path, recording = blackbox(tmp_path), tmp_path / "r.mcap"
-    words = ("--command", "motor[*]", "--speed", "eRPM[*]:erpm", "-o", recording)
-    assert "give the magnetic poles of the motor, for example --poles 14" in error_of("import", path, *words)
+def test_electrical_speeds_and_the_tacho_that_is_declared(tmp_path: Path) -> None:
+    path, recording = ulog(tmp_path), tmp_path / "r.mcap"
+    words = ("--command", "actuator_outputs.output[*]", "--speed", "esc_status.esc[*].esc_rpm:erpm", "-o", recording)
+    assert "give the magnetic poles of the motor, for example --poles 14" in usage_error_of("import", path, *words)
     assert "poles come in pairs" in usage_error_of("import", path, *words, "--poles", "13")
-    result = fantwin("import", path, *words, "--poles", 14, "--tacho", "count:window_s=0.02")
-    assert "log 1 of 2 in the file; --log chooses another" in result.stdout
-    _, command, speed = samples(recording)
-    np.testing.assert_array_equal(command, np.floor(1000 + 1000 * COMMANDS))
-    np.testing.assert_allclose(speed, np.floor(SPEEDS * 7 / 100) * 100 / 7, rtol=1e-12)
+    fantwin("import", path, *words, "--poles", 14, "--tacho", "count:window_s=0.02")
+    np.testing.assert_allclose(samples(recording)[2], SPEEDS / 7, rtol=1e-12)
     assert read_runs(recording).tacho == (Tacho(kind="count", window_s=0.02),) * 2
-    fantwin("import", blackbox(tmp_path, "motor_poles:14"), *words, "--log", 2, "--force")
-    np.testing.assert_allclose(samples(recording)[2], np.floor(SPEEDS * 14 / 100) * 100 / 7, rtol=1e-12)
-    assert "--log 3: the file has logs 1 to 2" in error_of("import", path, *words, "--force", "--log", 3)
+
+
+def test_the_table_that_blackbox_decode_writes(tmp_path: Path) -> None:
+    table, recording = tmp_path / "flight.csv", tmp_path / "r.mcap"
+    rows = [
+        f"{k}, {round(1e6 * t)}, {1000 + k}, {s:.0f}" for k, (t, s) in enumerate(zip(T_S, SPEEDS[:, 0], strict=True))
+    ]
+    table.write_text("\n".join(["loopIteration, time (us), motor[0], eRPM[0]", *rows]))
+    words = ("--time", "time (us):us", "--command", "motor[0]", "--speed", "eRPM[0]:rpm", "-o", recording)
+    result = fantwin("import", table, *words)
+    assert result.exit_code == 0, result.output
+    t_ns, command, speed = samples(recording)
+    np.testing.assert_array_equal(t_ns - t_ns[0], np.rint(1e6 * T_S).astype(np.int64) * 1000)
+    np.testing.assert_array_equal(command[:, 0], 1000 + np.arange(len(T_S)))
+    np.testing.assert_allclose(speed[:, 0], SPEEDS[:, 0], rtol=1e-12)
 
 
 @pytest.mark.parametrize("storage", ["sqlite3", "mcap"])
@@ -118,23 +112,14 @@ def test_a_ros_bag_with_times_of_its_messages(tmp_path: Path, storage: str) -> N
     np.testing.assert_allclose(speed, SPEEDS, rtol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("make", "title", "field", "rate_hz"),
-    [
-        (ulog, "ULog", "esc_status.esc[1].esc_rpm", 50),
-        (blackbox, "Betaflight blackbox", "eRPM[1]", 50),
-    ],
-)
-def test_the_fields_are_listed_with_their_rates(
-    tmp_path: Path, make: Callable[[Path], Path], title: str, field: str, rate_hz: float
-) -> None:
-    path = make(tmp_path)
+def test_the_fields_are_listed_with_their_rates(tmp_path: Path) -> None:
+    path, field = ulog(tmp_path), "esc_status.esc[1].esc_rpm"
     listed = json.loads(fantwin("import", path, "--list", "--json").stdout)
-    assert listed["format"] == title
+    assert listed["format"] == "ULog"
     found = {each["name"]: each for each in listed["fields"]}
-    assert (found[field]["values"], found[field]["rate_hz"]) == (200, pytest.approx(rate_hz))
+    assert (found[field]["values"], found[field]["rate_hz"]) == (200, pytest.approx(50))
     lines = fantwin("import", path, "--list").stdout.splitlines()
-    assert lines[-1].startswith(f"{path}: {title}, {len(found)} fields")
+    assert lines[-1].startswith(f"{path}: ULog, {len(found)} fields")
     assert any(line.startswith(field) for line in lines)
 
 
@@ -159,9 +144,6 @@ def test_a_mistake_is_one_line_that_says_what_to_do(tmp_path: Path) -> None:
     assert "no ULog that can be read: the format" in error_of("import", path, "--list")
     write_ulog(path, {"a": ("b[2] x;", ()), "b": ("a y;", ())})
     assert "contains itself" in error_of("import", path, "--list")
-    bad = tmp_path / "bad.bbl"
-    bad.write_bytes(b"H Product:Blackbox flight data recorder by Nicholas Sherlock\n")
-    assert "no blackbox log that can be read" in error_of("import", bad, "--list")
     (tmp_path / "bag").mkdir()
     (tmp_path / "bag" / "metadata.yaml").write_text("none")
     assert "no ROS 2 bag that can be read" in error_of("import", tmp_path / "bag", "--list")

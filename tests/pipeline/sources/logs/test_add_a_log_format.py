@@ -11,7 +11,7 @@ import pytest
 from fantwin.pipeline.recordings.runs import read_runs
 from fantwin.pipeline.sources.logs import formats
 from fantwin.pipeline.sources.logs.formats import LogFormat
-from fantwin.pipeline.sources.logs.log_file import LogFile, Series
+from fantwin.pipeline.sources.logs.log_file import Series
 from fantwin.schemas.units import NS_PER_S
 from tests.support.fantwin_command import fantwin
 
@@ -22,7 +22,6 @@ class ToyLog:
     """A `LogFile` of lines with a time in s, a duty and a speed in rpm."""
 
     notes: Sequence[str] = ()
-    motor_poles: int | None = None
     names: Sequence[str] = ("duty", "rpm")
 
     def __init__(self, path: Path) -> None:
@@ -34,13 +33,8 @@ class ToyLog:
         return {name: self._fields[name] for name in names}
 
 
-def open_toy(path: Path, number: int) -> LogFile:
-    del number
-    return ToyLog(path)
-
-
 def test_a_format_with_a_row_is_recognised_listed_and_imported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    row = LogFormat("toy log", (START,), "", "numpy", f"{__name__}:open_toy")
+    row = LogFormat("toy log", (START,), "", "numpy", f"{__name__}:ToyLog")
     monkeypatch.setattr(formats, "LOG_FORMATS", (*formats.LOG_FORMATS, row))
     log, recording = tmp_path / "fan.toy", tmp_path / "fan.mcap"
     lines = [f"{0.1 * k:.1f} {0.5 + 0.01 * (k % 7):.2f} {600 + k}" for k in range(50)]
