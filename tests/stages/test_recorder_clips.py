@@ -86,7 +86,7 @@ def crash(core: Recorder) -> None:
 
 def test_a_recorder_cuts_a_clip_and_lists_it_while_it_records(chain, tmp_path):
     recording = tmp_path / "recording.mcap"
-    core = record(chain, recording, clips=clips_of(recording))
+    core = record(chain, recording, clips=clips_of(recording), part_s=1.0)
     core.close()
     (clip,) = kept_clips(tmp_path / "clips")
     assert not clip.is_due and clip.size_bytes == (tmp_path / "clips" / clip.name).stat().st_size

@@ -22,16 +22,21 @@ S = 1_000_000_000
 
 
 def record(
-    source: Path, recording: Path, left_out: Iterable[str] = (), clips: AlarmClips | None = None, **config: Any
+    source: Path,
+    recording: Path,
+    left_out: Iterable[str] = (),
+    clips: AlarmClips | None = None,
+    part_s: float = disk_room.PART_S,
+    **config: Any,
 ) -> Recorder:
-    """A recorder that has been given all messages of `source` at their times, in parts of a second, and goes on."""
+    """A recorder that has been given all messages of `source` at their times, and goes on."""
     head, leaves_out = read_metadata(source), tuple(left_out)
     metadata = {**head.metadata, **({"left_out": ",".join(leaves_out)} if leaves_out else {})}
     parts = RecordingParts(recording, metadata, head.attachments, session="s1")
     envelopes = [each for each in read_recording(source) if each.topic not in leaves_out]
     core = Recorder(parts, RecorderConfig(**config), envelopes[0].received_t_ns, leaves_out, clips=clips)
     ticked_ns = 0
-    with patch.object(disk_room, "PART_S", 1.0):
+    with patch.object(disk_room, "PART_S", part_s):
         for envelope in envelopes:
             core.step(envelope)
             if envelope.received_t_ns - ticked_ns >= S // 20:

@@ -35,7 +35,7 @@ def first_raised(path: Path) -> Alarm:
 def cut(source: Path, folder: Path, left_out: tuple[str, ...] = ()) -> Path:
     """The clip of the first alarm of a recording, from its parts, the last of which is still being written."""
     clip = clip_of(first_raised(source), before_s=0.5, after_s=2.0)
-    core = record(source, folder / "recording.mcap", left_out)
+    core = record(source, folder / "recording.mcap", left_out, part_s=1.0)
     (result,) = cut_clips([clip], folder / "recording.mcap", folder / "clips", core._index(), margin_s=MARGIN_S)
     core.close()
     assert result.size_bytes == (folder / "clips" / clip.name).stat().st_size
@@ -116,7 +116,7 @@ def later(tmp_path_factory: pytest.TempPathFactory) -> Path:
     raised = first_raised(source)
     assert raised.onset_t_ns < shelved.t_ns < raised.t_ns
     clip = clip_of(raised, before_s=0.05, after_s=4.5)
-    record(source, folder / "parts" / "recording.mcap").close()
+    record(source, folder / "parts" / "recording.mcap", part_s=1.0).close()
     cut_clips([clip], folder / "parts" / "recording.mcap", folder / "clips", margin_s=0.5)
     return folder / "clips" / clip.name
 
@@ -181,7 +181,7 @@ def test_a_clip_has_its_tray_only(undisturbed, tmp_path):
 
 def test_what_cannot_be_written_leaves_no_file_and_can_be_tried_again(undisturbed, tmp_path):
     clip = clip_of(first_raised(undisturbed), before_s=0.5, after_s=2.0)
-    record(undisturbed, tmp_path / "recording.mcap").close()
+    record(undisturbed, tmp_path / "recording.mcap", part_s=1.0).close()
     folder = tmp_path / "clips"
     with disk_of(40_000):
         (result,) = cut_clips([clip], tmp_path / "recording.mcap", folder)
@@ -193,7 +193,7 @@ def test_what_cannot_be_written_leaves_no_file_and_can_be_tried_again(undisturbe
 
 def test_a_clip_of_parts_that_are_gone_is_not_written_and_one_of_some_has_the_rest(undisturbed, tmp_path):
     alarm = first_raised(undisturbed)
-    record(undisturbed, tmp_path / "recording.mcap").close()
+    record(undisturbed, tmp_path / "recording.mcap", part_s=1.0).close()
     (tmp_path / "recording.mcap").unlink()
     clip = clip_of(alarm, before_s=0.5, after_s=2.0)
     (result,) = cut_clips([clip], tmp_path / "recording.mcap", tmp_path / "clips")
@@ -209,7 +209,7 @@ def test_a_clip_of_parts_that_are_gone_is_not_written_and_one_of_some_has_the_re
 
 def test_where_room_runs_out_while_clips_are_written_the_last_one_is_given_up(undisturbed, tmp_path):
     clip = clip_of(first_raised(undisturbed), before_s=0.5, after_s=2.0)
-    record(undisturbed, tmp_path / "recording.mcap").close()
+    record(undisturbed, tmp_path / "recording.mcap", part_s=1.0).close()
     folder = tmp_path / "clips"
     files: list[int] = []
 
