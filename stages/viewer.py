@@ -4,8 +4,8 @@ Reads `score`, `alarm`, `twin`, `health` and `snapshot`; writes nothing. One cor
 the unit of the tray. Samples are collected and drawn twice a second, because a call into Rerun is expensive and a row
 in it is cheap.
 
-With more than 64 fans, only some are drawn: those in alarm, as far as there is room, and those in `show`. Of
-the other trays the newest score is asked for once a second, and the rest never arrives.
+With more than 64 fans, only some are drawn: those in alarm, as far as there is room, and those in `show`. Of the scores
+of other trays, a few a second are decoded.
 
 Only samples and alarms are on the time line, at the time of the sample; wear has a timeline of its own. Reports in host
 time go to a page without time; otherwise, in a replay of an old recording, these reports would be the newest data,

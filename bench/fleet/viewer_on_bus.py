@@ -2,8 +2,7 @@
 
 Another process publishes the scores and alarms of a made-up fleet, made beforehand, as fast as they would come; some
 fans are in alarm from the beginning. This process is the viewer with its runner: a view in a file, served, with nobody
-watching. On a machine with other work the fleet may come more slowly than in real time: the rate says so, and what the
-viewer asks for itself, once a second, costs the same.
+watching. On a machine with other work the fleet may come more slowly than in real time: the rate says so.
 
     python -m bench.fleet.viewer_on_bus
 """

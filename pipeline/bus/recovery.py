@@ -42,7 +42,7 @@ class Answer:
     Attributes:
         messages: (key, payload) of those that were still kept.
         published: how many messages the producer says it has published; None if it did not answer, or if all were
-            asked, or for the newest only.
+            asked.
         timed_out: a producer that was asked did not answer in time.
     """
 
@@ -67,10 +67,8 @@ class RecoveryRequest:
         last: int,
         timeout_s: float,
         on_answer: OnAnswer,
-        newest: int | None = None,
     ) -> None:
-        """newest: the last so many messages of each producer, without the number of published ones; None: as many as a
-        consumer that begins may ask for, if all producers are asked, and otherwise all."""
+        """If all producers are asked, as many of the last messages of each as a consumer that begins may ask for."""
         self._is_of_one = producer != ALL_PRODUCERS
         self._producer = producer
         self._forgeries = forgeries
@@ -83,9 +81,7 @@ class RecoveryRequest:
         self._lock = threading.Lock()
         self._has_ended = False
         self._cancellation = zenoh.CancellationToken()
-        if newest is None and not self._is_of_one:
-            newest = CATCH_UP_MESSAGES
-        more = "" if newest is None else f";newest={newest}"
+        more = "" if self._is_of_one else f";newest={CATCH_UP_MESSAGES}"
         session.get(
             f"{recovery_key(key, producer)}?first={first};last={last}{more}",
             zenoh.handlers.Callback(self._receive, lambda: self._end(None), indirect=False),

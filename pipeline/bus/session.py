@@ -210,13 +210,12 @@ class Bus:
         last: int,
         timeout_s: float,
         on_answer: OnAnswer,
-        newest: int | None = None,
     ) -> RecoveryRequest:
         """Request messages `first..last` on `key` from `producer` (`*`: all) without waiting for the answer.
 
-        `on_answer` is called once, from a thread of the bus: it must not block. `newest`: see `RecoveryRequest`.
+        `on_answer` is called once, from a thread of the bus: it must not block.
         """
-        return RecoveryRequest(self._session, self.forgeries, key, producer, first, last, timeout_s, on_answer, newest)
+        return RecoveryRequest(self._session, self.forgeries, key, producer, first, last, timeout_s, on_answer)
 
     def recover(self, key: str, producer: str = ALL_PRODUCERS) -> list[tuple[str, bytes]]:
         """All messages on `key` that `producer` still keeps, as (key, payload). Waits for the answer: not for a stage,

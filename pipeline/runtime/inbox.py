@@ -53,15 +53,7 @@ class Recovered:
     answer: Answer
 
 
-@dataclass(frozen=True, slots=True)
-class Newest:
-    """The answer to a request for the newest message on a key."""
-
-    key: str
-    answer: Answer
-
-
-Item: TypeAlias = FromBus | FromSource | Liveness | Recovered | Newest | KeptQuery
+Item: TypeAlias = FromBus | FromSource | Liveness | Recovered | KeptQuery
 
 
 class Inbox:

@@ -7,7 +7,7 @@ how much of each sequence there should be, and which producers there are.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence, Set
+from collections.abc import Sequence
 
 from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.config.models import Config
@@ -16,16 +16,14 @@ from fantwin.pipeline.config.shards import Shard
 from fantwin.pipeline.runtime.believed_outputs import BelievedOutputs
 from fantwin.pipeline.runtime.due_messages import DueMessages
 from fantwin.pipeline.runtime.health import HealthBuilder
-from fantwin.pipeline.runtime.inbox import FromBus, Inbox, Liveness, Newest, Recovered
+from fantwin.pipeline.runtime.inbox import FromBus, Inbox, Liveness, Recovered
 from fantwin.pipeline.runtime.lost_sessions import LostSessions
-from fantwin.pipeline.runtime.newest_messages import NewestMessages
 from fantwin.pipeline.runtime.peers import Peers
 from fantwin.pipeline.runtime.recovery import Recovery
 from fantwin.pipeline.runtime.sequence_tracker import Found, SequenceTracker
 from fantwin.pipeline.runtime.sessions import Sessions, this_host
 from fantwin.pipeline.runtime.silences import Silences
 from fantwin.pipeline.runtime.stage import Stage
-from fantwin.pipeline.runtime.subscriptions import Subscriptions
 from fantwin.pipeline.timebase.host_clock import HOST_CLOCK
 from fantwin.pipeline.timebase.stage_clock import REPLAY, StageClock
 from fantwin.schemas.codec import CodecError
@@ -90,18 +88,19 @@ class Receiver:
         self._recovery = Recovery(bus, inbox, bus.answer_timeout_s, only_rare=stage.may_drop)
         self.tracker = SequenceTracker(self._recovery.ask, sessions=sessions)
         reads = stage.reads_as_configured(config)
-        self._subscriptions = Subscriptions(
-            bus, config.site, reads, stage.undecoded, shard.trays, self.on_message, self.tracker.forget
-        )
-        self._newest = NewestMessages(bus, inbox)
-        self.peers = Peers(self._subscriptions.keys)
+        self.keys = {tray_key(config.site, tray, topic) for topic in reads if topic != "health" for tray in shard.trays}
+        """all that the stage reads, health apart"""
+        self.peers = Peers(self.keys)
         self._silences = Silences(
             {tray_key(config.site, tray, topic): tray for topic in stage.reads[:1] for tray in shard.trays}, sessions
         )
         self._lost = LostSessions(this_host())
 
     def start(self, *, follows_clock: bool) -> None:
-        """Subscribe to health, to who is there and, if it follows them, to the clocks of the trays."""
+        """Subscribe to what the stage reads, to health, to who is there and, if it follows them, to the clocks of the
+        trays."""
+        for key in sorted(self.keys):
+            self._bus.subscribe(key, self.on_message)
         if follows_clock:
             for tray in self._shard.trays:
                 self._bus.subscribe(tray_key(self._site, tray, "clock"), self.on_message)
@@ -119,24 +118,9 @@ class Receiver:
     def _on_liveness(self, key: str, alive: bool) -> None:
         self._inbox.put(Liveness(key, alive))
 
-    @property
-    def current_keys(self) -> Set[str]:
-        """The keys that are read message by message now."""
-        return self._subscriptions.current
-
-    def reads(self, key: str) -> bool:
-        """Whether the stage reads a key, message by message or not; health apart."""
-        return key in self._subscriptions.keys
-
-    def follow(self, trays: Set[str] | None) -> None:
-        """Read the stage's undecoded topics of these trays message by message, None: of all; of the others only the
-        newest message, once a second."""
-        self._newest.watch(self._subscriptions.follow(trays))
-        self._newest.ask()
-
     def catch_up(self) -> None:
         """Request what producers still keep from before this stage started: only then is it ready."""
-        keys = sorted(self._subscriptions.keys, key=lambda key: (not topic_of(key).is_needed_first, key))
+        keys = sorted(self.keys, key=lambda key: (not topic_of(key).is_needed_first, key))
         if "health" in self._stage.reads:
             keys.append(health_key(self._site, "*", "*"))
         self._recovery.catch_up(keys)
@@ -165,15 +149,13 @@ class Receiver:
         is_shown = self._silences.take(tray)
         return not self._due.has(tray) and (is_shown or self._clock.is_of_replay(tray))
 
-    def take(self, item: FromBus | Recovered | Newest | Liveness) -> None:
+    def take(self, item: FromBus | Recovered | Liveness) -> None:
         """Take an item of the inbox."""
         match item:
             case FromBus():
                 self._take_message(item)
             case Recovered():
                 self._take_recovered(item)
-            case Newest():
-                self._take_newest(item)
             case Liveness():
                 self.peers.update(item)
                 self._sessions.update(item.key, item.alive)
@@ -185,10 +167,7 @@ class Receiver:
         envelope = self._decode(item.key, item.payload, item.received_t_ns)
         if envelope is None:
             return
-        is_undecoded = self.is_undecoded(envelope)
-        if is_undecoded and envelope.key not in self.current_keys:
-            return  # it was on its way when the core ceased to follow its tray
-        message = None if is_undecoded else envelope.message
+        message = None if self.is_undecoded(envelope) else envelope.message
         if isinstance(message, Health):
             self._take_health(envelope, message)
         elif isinstance(message, Clock):
@@ -214,16 +193,6 @@ class Receiver:
         self._due.add(due)
         self._recovery.finish(item)
 
-    def _take_newest(self, item: Newest) -> None:
-        now_ns = HOST_CLOCK.now_ns()
-        found = self._decoded(item.answer.messages, now_ns)
-        believed = [each for each in found if not self._sessions.is_stranger(each.key, each.header.producer)]
-        newest = self._newest.finish(item, believed)
-        if newest is not None:
-            self._health.add_input(newest.key, now_ns, now_ns)
-            self._due.add([newest])
-        self._newest.ask()
-
     def _take_health(self, envelope: Envelope, health: Health) -> None:
         said, health = health, self._believed_outputs.of(health)
         if health is not said:
@@ -231,8 +200,8 @@ class Receiver:
         self.peers.add_health(alive_key(self._site, health.stage, health.instance), health)
         if health.stage == REPLAY:
             self._clock.add_replay_health(health.header.producer, has_ended=health.is_last)
-        self._sessions.add_health(health, self._subscriptions.keys)
-        self._due.add(self.tracker.reconcile(health, self.current_keys))
+        self._sessions.add_health(health, self.keys)
+        self._due.add(self.tracker.reconcile(health, self.keys))
         self._silences.add_health(health, self.tracker.has_all_of)
         if "health" in self._stage.reads and self._concerns(envelope):
             self._due.add(self.tracker.accept(envelope))

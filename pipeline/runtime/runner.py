@@ -213,7 +213,6 @@ class Runner:
         self._drain()
 
     def _start(self) -> None:
-        self._follow()
         # sources use the host's time, also during a replay, and so do stages that have all trays in one core
         self._receiver.start(follows_clock=self.stage.core_per_tray and not self._has_source)
         self._bus.declare_alive(self._session.key(self._site))  # before the first message
@@ -226,11 +225,6 @@ class Runner:
         self._bus.declare_alive(alive_key(self._site, self.stage.name, self._shard.name))
         for name, parts in self._parts.items():
             self._sources.start(name, parts)
-
-    def _follow(self) -> None:
-        """Read what the core follows message by message, and ask for the newest of the rest."""
-        serves_all = self._parts.get("")
-        self._receiver.follow(serves_all.core.followed() if serves_all and self.stage.undecoded else None)
 
     def _loop(self, until: Callable[[], bool], status: StageStatus) -> None:
         next_tick = next_health = next_loss = time.monotonic()
@@ -252,8 +246,6 @@ class Runner:
                     parts.core.confirm_input(is_complete=self._receiver.is_complete(name))
                     self._steps.call(name, lambda core=parts.core, now_ns=now_ns: core.tick(now_ns), from_timer=True)
                 self._receiver.ask_again()
-                if self.stage.undecoded:
-                    self._follow()
                 news = False
                 if now >= next_loss:
                     next_loss = now + LOSS_REPORT_S
@@ -300,7 +292,7 @@ class Runner:
         while (item := self._inbox.get(0)) is not None:
             if isinstance(item, FromSource):
                 self._sources.discard(item)
-            elif isinstance(item, FromBus) and self._receiver.reads(item.key) and not self.stage.may_drop:
+            elif isinstance(item, FromBus) and item.key in self._receiver.keys and not self.stage.may_drop:
                 self._counts["lost_at_stop"] += 1
 
     def _close_core(self, name: str, parts: BuiltStage, failed: Set[str]) -> None:

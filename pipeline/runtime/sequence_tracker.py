@@ -133,10 +133,6 @@ class SequenceTracker:
                 due += self._go_on(stream, stream.waiting, Found())
         return due
 
-    def forget(self, key: str) -> None:
-        """This consumer reads a key no more. What it has not read if it begins again is history, not a loss."""
-        self._streams.forget(key)
-
     @property
     def is_waiting(self) -> bool:
         """Whether an answer is due."""

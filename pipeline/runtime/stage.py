@@ -6,7 +6,7 @@ publishes what it returns. The runner is the only loop.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence, Set
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
@@ -100,12 +100,6 @@ class Core(Protocol):
     def notes(self) -> Sequence[str]:
         """What the core works with and has done, a line each, for people; nothing that is wrong."""
         return ()
-
-    def followed(self) -> Set[str] | None:
-        """The trays whose messages of the `undecoded` topics are all passed to `step`; None: all trays. Of the others
-        `step` gets the newest message, about once a second. Only a core that serves all trays is asked, at every tick.
-        """
-        return None
 
     def accepts(self) -> AcceptedSamples | None:
         """What a client may push to it; None: nothing."""

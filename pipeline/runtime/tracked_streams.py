@@ -114,13 +114,6 @@ class TrackedStreams:
         group[key, producer] = stream
         return stream
 
-    def forget(self, key: str) -> None:
-        """Forget the streams of a key: what comes on it later begins new ones. Their counts are added up."""
-        group = self._groups.get(key, {})
-        for stream in group.values():
-            self._forgotten.setdefault(key, StreamState()).add(stream)
-        group.clear()
-
     def inputs(self, unsaved: Iterable[Envelope] = ()) -> tuple[Input, ...]:
         """The counts for health; those of forgotten streams are the last of their key, without a producer.
 

@@ -19,7 +19,7 @@ from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Grid, Raw, StatedTacho
 from fantwin.schemas.tacho import Tacho
 from fantwin.schemas.units import NS_PER_S
-from fantwin.stages.resampler import LINK_WAIT_S, ResamplerConfig, ResamplerCore
+from fantwin.stages.resampler import ResamplerConfig, ResamplerCore
 
 EPOCH_NS = 1_700_000_000_000_000_000
 
@@ -453,9 +453,10 @@ def test_row_16_a_gap_of_the_link_is_no_gap_of_the_samples():
 def test_row_16_a_gap_is_published_once_acquisition_shows_that_it_has_sent_nothing_or_after_too_long_a_doubt(
     monkeypatch,
 ):
-    core, doubts = ResamplerCore(1, FIXED), ResamplerCore(1, FIXED)
-    for each, wait_s in ((core, LINK_WAIT_S), (doubts, 20.0)):
-        monkeypatch.setattr("fantwin.stages.resampler.LINK_WAIT_S", wait_s)
+    core = ResamplerCore(1, FIXED)
+    monkeypatch.setattr("fantwin.stages.resampler.LINK_WAIT_S", 20.0)
+    doubts = ResamplerCore(1, FIXED)
+    for each in (core, doubts):
         each.step(raw(at(*np.arange(0.0, 1.0, 0.01)), np.ones(100)))
     assert silent_for(core, 3.0, is_complete=False) == []
     core.confirm_input(is_complete=True)

@@ -107,17 +107,6 @@ def test_fans_asked_for_are_drawn_from_the_first_sample_on() -> None:
     assert len(t_ns) == 500 and (np.diff(t_ns) == STEP_NS).all()
 
 
-def test_trays_with_a_plot_are_followed_for_as_long_as_they_have_it() -> None:
-    core = fleet_core(FakeSink(), show=(Fan("tray3", 1),))
-    messages = messages_of()
-    followed: list[frozenset[str]] = []
-    for message in messages:
-        play(core, [message])
-        followed.append(frozenset(core.followed() or ()))
-    assert [each for each, _ in groupby(followed)] == [{"tray3"}, {"tray2", "tray3"}, {"tray3"}]
-    assert ViewerCore("site", [TrayConfig(name="tray1", fans=3)], FakeSink()).followed() is None, "few fans: all"
-
-
 def test_a_tray_that_sends_no_more_becomes_silent_and_its_alarm_gives_up_its_plot() -> None:
     sink = FakeSink()
     core = fleet_core(sink)

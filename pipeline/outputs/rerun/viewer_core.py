@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -99,7 +99,10 @@ class ViewerCore(SiteCore):
         self._model.add_alarm(alarm)
 
     def add_score(self, envelope: Envelope) -> None:
-        """Keep it for the next flush."""
+        """Keep it for the next flush; where no fan of the tray is drawn, a few a second are enough."""
+        name = envelope.header.tray
+        if self._fleet and not self._views[name].fans and not self._model.wants_score(name):
+            return
         score = self._model.add_score(envelope, MEASURED_COLUMNS)
         if score is None:
             return
@@ -141,10 +144,6 @@ class ViewerCore(SiteCore):
             "refused_scores": self._model.refused_scores,
             **self._counts,
         }
-
-    def followed(self) -> Set[str] | None:
-        """The trays with a fan that is drawn; None if all are."""
-        return {fan.tray for fan in self._places} if self._fleet else None
 
     def problem(self) -> str:
         """Scores with another number of fans than configured, or what the sink reports; empty if there is nothing."""
