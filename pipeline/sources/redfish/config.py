@@ -9,7 +9,6 @@ from urllib.parse import urlsplit
 from pydantic import Field, field_validator
 
 from fantwin.pipeline.sources.polling import SLOWEST_S, PolledConfig
-from fantwin.schemas.tacho import LONGEST_WINDOW_S, Tacho
 
 USER_VARIABLE, PASSWORD_VARIABLE = "FANTWIN_REDFISH_USER", "FANTWIN_REDFISH_PASSWORD"
 
@@ -41,16 +40,6 @@ class RedfishConfig(PolledConfig, frozen=True):
     )
     verify: bool = Field(default=True, description="whether the certificate of the controller is checked")
     ca: Path | None = Field(default=None, description="certificate of the authority that signed the controller's")
-    average_s: float | None = Field(
-        default=None,
-        gt=0,
-        le=LONGEST_WINDOW_S,
-        description="how long the controller averages a speed; without it, readings count as instantaneous",
-    )
-    update_s: float = Field(default=0.0, ge=0, le=LONGEST_WINDOW_S, description="time between new speeds; 0: average_s")
-    delay_s: float = Field(
-        default=0.0, ge=0, le=LONGEST_WINDOW_S, description="age of a new speed when it is first shown"
-    )
 
     @field_validator("url")
     @classmethod
@@ -66,10 +55,3 @@ class RedfishConfig(PolledConfig, frozen=True):
     def why_no_commands(self) -> str:
         """fantwin never writes to a controller."""
         return "fans behind Redfish are only read"
-
-    def stated_tachos(self, fans: int) -> tuple[Tacho, ...] | None:
-        """The mean over average_s."""
-        del fans
-        if self.average_s is None:
-            return None
-        return (Tacho(kind="average", window_s=self.average_s, update_s=self.update_s, delay_s=self.delay_s),)
