@@ -9,15 +9,11 @@ import json
 import re
 import sys
 from collections.abc import Iterable, Iterator
-from functools import reduce
 from importlib import import_module
-from operator import or_
-from pathlib import Path
-from types import NoneType, UnionType
-from typing import Annotated, Any, Literal, get_args, get_origin
+from itertools import chain
+from typing import Any
 
 from pydantic import BaseModel
-from pydantic.fields import FieldInfo
 
 from fantwin.pipeline.config.loading import LARGEST_FILE_BYTES, top_level
 from fantwin.pipeline.config.models import BusConfig, LauncherConfig, SecurityConfig, TrayConfig
@@ -38,9 +34,15 @@ calibrated with.
 
 This page is made from the models in the code: `make reference`.
 """
-_TYPE_WORDS = {str: "text", int: "integer", float: "number", bool: "`true` or `false`", Path: "path"}
+Schema = dict[str, Any]
+"""of JSON, as pydantic makes it"""
+_TYPE_WORDS = {
+    **{"string": "text", "integer": "integer", "number": "number", "boolean": "`true` or `false`"},
+    **{"path": "path"},
+}
 _ELSEWHERE = "see below"
-_BOUNDS = {"gt": "above", "ge": "at least", "lt": "below", "le": "at most"}
+_SHOWN_BELOW = (SourceConfig.__name__, Tacho.__name__)
+_BOUNDS = {"exclusiveMinimum": "above", "minimum": "at least", "exclusiveMaximum": "below", "maximum": "at most"}
 
 
 def page() -> str:
@@ -99,88 +101,79 @@ def _sources() -> Iterator[str]:
 
 def tables_within(model: type[BaseModel]) -> Iterator[str]:
     """The keys of the tables that are values of keys of a source or a stage, each kind of table once."""
-    waiting, shown = [model], set[type[BaseModel]]()
+    schema = model.model_json_schema()
+    waiting, shown = [schema], set[str]()
     while waiting:
-        for key, field in waiting.pop(0).model_fields.items():
-            inner = next(filter(_is_model, _plain_types(field.annotation)), None)
-            if inner is not None and inner not in shown:
-                shown.add(inner)
+        for key, value in waiting.pop(0)["properties"].items():
+            name = next(_models_in(value), None)
+            if name is not None and name not in shown:
+                shown.add(name)
+                inner = schema["$defs"][name]
                 waiting.append(inner)
-                yield f"A table such as `{key}`: {(inner.__doc__ or '').splitlines()[0]}\n"
-                yield table(inner)
-
-
-def _plain_types(annotation: Any) -> Iterator[Any]:
-    """The types that an annotation is made of."""
-    arguments = get_args(annotation)
-    for each in arguments:
-        yield from _plain_types(each)
-    if not arguments:
-        yield annotation
-
-
-def _is_model(annotation: Any) -> bool:
-    return isinstance(annotation, type) and issubclass(annotation, BaseModel)
+                yield f"A table such as `{key}`: {inner['description'].splitlines()[0]}\n"
+                yield _rows(inner)
 
 
 def table(model: type[BaseModel], but: Iterable[str] = ()) -> str:
     """The keys of a section, one a row."""
+    return _rows(model.model_json_schema(), but)
+
+
+def _rows(schema: Schema, but: Iterable[str] = ()) -> str:
     rows = [
-        f"| `{key}` | {_values(field)} | {_default(field)} | {field.description or ''} |"
-        for key, field in model.model_fields.items()
+        f"| `{key}` | {_values(value)} | {_default(value, is_required=key in schema.get('required', ()))} "
+        f"| {value.get('description', '')} |"
+        for key, value in schema["properties"].items()
         if key not in but
     ]
     return "\n".join(["| key | value | default | |", "|---|---|---|---|", *rows, ""])
 
 
-def _values(field: FieldInfo) -> str:
-    arguments = get_args(field.annotation)
-    is_optional = NoneType in arguments
-    annotation = reduce(or_, (each for each in arguments if each is not NoneType)) if is_optional else None
-    bounds = [
-        f"{words} {_number(getattr(rule, name))}"
-        for rule in field.metadata
-        for name, words in _BOUNDS.items()
-        if getattr(rule, name, None) is not None
-    ]
-    return ", ".join([_type_words(annotation if is_optional else field.annotation), *bounds])
+def _values(value: Schema) -> str:
+    """What a key may be: its types, and their bounds."""
+    options = _options(value)
+    bounds = [f"{words} {_number(each[name])}" for each in options for name, words in _BOUNDS.items() if name in each]
+    return ", ".join([" or ".join(map(_type_words, options)), *bounds])
 
 
-def _type_words(annotation: Any) -> str:
-    origin, arguments = get_origin(annotation), get_args(annotation)
-    words = _TYPE_WORDS.get(annotation, _ELSEWHERE)
-    if origin is Annotated:
-        words = _type_words(arguments[0])
-    elif origin is Literal:
-        words = " or ".join(f"`{json.dumps(value)}`" for value in arguments)
-    elif origin is UnionType:
-        words = " or ".join(map(_type_words, arguments))
-    elif origin is dict:
-        words = f"table of {_type_words(arguments[1])}s"
-    elif origin is tuple:
-        of_one = _type_words(arguments[0])
-        words = of_one if of_one == _ELSEWHERE else "list of tables" if of_one == "table" else f"list of {of_one}"
-    elif _is_model(annotation) and annotation not in (SourceConfig, Tacho):
-        words = "table"
-    return words
+def _options(value: Schema) -> list[Schema]:
+    """The schemas of which a value has one; that there may be none is said by its default."""
+    return [each for each in value.get("anyOf", [value]) if each.get("type") != "null"]
 
 
-def _default(field: FieldInfo) -> str:
-    if field.is_required():
+def _type_words(value: Schema) -> str:
+    if name := next(_models_in(value), None):
+        return _ELSEWHERE if name in _SHOWN_BELOW else "list of tables" if value.get("type") == "array" else "table"
+    if choices := value.get("enum", [value["const"]] if "const" in value else []):
+        return " or ".join(f"`{json.dumps(each)}`" for each in choices)
+    if value["type"] == "array":
+        return f"list of {_type_words(value['items'])}"
+    if value["type"] == "object":
+        return f"table of {_type_words(value['additionalProperties'])}s"
+    return _TYPE_WORDS[value.get("format") or value["type"]]
+
+
+def _models_in(value: Any) -> Iterator[str]:
+    """The names of the models that a schema refers to."""
+    if isinstance(value, dict):
+        if "$ref" in value:
+            yield value["$ref"].rpartition("/")[2]
+        yield from chain.from_iterable(map(_models_in, value.values()))
+    elif isinstance(value, list):
+        yield from chain.from_iterable(map(_models_in, value))
+
+
+def _default(value: Schema, *, is_required: bool) -> str:
+    default = value.get("default")
+    if is_required:
         return "required"
-    if field.default is None or field.default == {} or _is_of_models(field.default):
+    models = set(_models_in(value)) - {SourceConfig.__name__}  # the keys of others say their own defaults
+    if default is None or default == {} or (default and models):
         return ""
-    if isinstance(field.default, dict):
-        return "`{ " + ", ".join(f"{key} = {json.dumps(value)}" for key, value in field.default.items()) + " }`"
-    value = str(field.default) if isinstance(field.default, Path) else field.default
-    return (
-        _number(value) if isinstance(value, int | float) and not isinstance(value, bool) else f"`{json.dumps(value)}`"
-    )
-
-
-def _is_of_models(value: Any) -> bool:
-    """Whether it is a table, or a list of tables, whose keys say their own defaults."""
-    return isinstance(value, BaseModel) or (isinstance(value, tuple) and any(map(_is_of_models, value)))
+    if isinstance(default, dict):
+        return "`{ " + ", ".join(f"{key} = {json.dumps(each)}" for key, each in default.items()) + " }`"
+    is_number = isinstance(default, int | float) and not isinstance(default, bool)
+    return _number(default) if is_number else f"`{json.dumps(default)}`"
 
 
 def _number(value: float) -> str:
