@@ -69,7 +69,7 @@ class Load:
         gap.
         """
         of_tray = '[[tray]]\nname = "{}"\nfans = {}\nspeed_unit = "rpm"\ntwin = "{}"\n'
-        timing = f"[resampler]\nrate_hz = {RATE_HZ}\nwatermark_s = 600\nstale_for_s = 1200\n"
+        timing = f"[resampler]\nrate_hz = {RATE_HZ}\nwatermark_s = 600\n"
         return timing + "".join(of_tray.format(name, FANS, TWIN) for name in self.names)
 
     def made_beforehand(self) -> dict[str, list[Raw]]:

@@ -95,7 +95,7 @@ def run(
     configuration.write_text(
         f'site = "{SITE}"\nrun_folder = "runs"\n[launcher]\nstages = {json.dumps(STAGES)}\n'
         f"shards = {{ twin_integrator = {shards}, scorer = {shards} }}\n{BUSY}"
-        f'[bus]\nendpoint = "{endpoint}"\n[resampler]\nrate_hz = {RATE_HZ:g}\nwatermark_s = 600\nstale_for_s = 1200\n'
+        f'[bus]\nendpoint = "{endpoint}"\n[resampler]\nrate_hz = {RATE_HZ:g}\nwatermark_s = 600\n'
         + "".join(tables.format(name) for name in hall.names)
     )
     raised: Raised = []

@@ -49,7 +49,7 @@ class SerialCore(AcquisitionCore):
         assert isinstance(tray.source, SerialConfig)
         self.source = SerialSource(tray.source, SourceContext(tray.fans, tray.speed_unit, Path()), link)
         self.blocks = SampleBlocks(self.source, round(config.block_s * NS_PER_S))
-        super().__init__(tray, config, self.source, self.blocks, started_t_ns, host_clock)
+        super().__init__(tray, self.source, self.blocks, started_t_ns, host_clock)
 
     def step(self, item: Item | ReadingBatch | ReceivedBytes) -> list[Raw]:
         if isinstance(item, ReceivedBytes | LinkUp | LinkDown):

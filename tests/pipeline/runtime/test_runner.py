@@ -12,7 +12,6 @@ import pytest
 
 from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.config.models import TrayConfig
-from fantwin.pipeline.runtime.inbox import INBOX_SIZE
 from fantwin.pipeline.runtime.runner import TICK_S
 from fantwin.pipeline.runtime.sessions import Sessions
 from fantwin.pipeline.runtime.silences import Silences
@@ -355,10 +354,11 @@ def test_a_stage_is_not_behind_with_messages_that_it_had_missed_and_recovered(co
     assert 0 <= health.t_ns - health.newest_input_t_ns < 60 * NS_PER_S
 
 
-def test_a_stage_that_may_drop_discards_its_oldest_items_and_counts_them(config):
+def test_a_stage_that_may_drop_discards_its_oldest_items_and_counts_them(config, monkeypatch):
+    monkeypatch.setattr("fantwin.pipeline.runtime.inbox.INBOX_SIZE", 100)
     release, newest = threading.Event(), threading.Event()
     taken: list[int] = []
-    count = INBOX_SIZE + 500
+    count = 300
 
     class Slow(Passer):
         def step(self, item: Any) -> Sequence[Message]:
