@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from fantwin.pipeline.sources.mqtt.settings import KEEPALIVE_S, BrokerSettings
-from fantwin.pipeline.sources.secret_file import read_secret, secret_of_environment
 
 if TYPE_CHECKING:
     from paho.mqtt.client import Client
@@ -41,12 +40,7 @@ def new_client(
     client = paho.Client(CallbackAPIVersion.VERSION2, client_id, clean_session=not is_kept, protocol=paho.MQTTv311)
     client.reconnect_delay_set(RECONNECT_DELAY_S, RECONNECT_DELAY_MAX_S)
     if settings.username:
-        password = None
-        if settings.password_file:
-            password = read_secret(folder / settings.password_file)
-        elif settings.password_env:
-            password = secret_of_environment(settings.password_env, process)
-        client.username_pw_set(settings.username, password)
+        client.username_pw_set(settings.username, settings.password(folder, process))
     if settings.tls:
         from fantwin.pipeline.certificates import client_context  # noqa: PLC0415  slow to import
 

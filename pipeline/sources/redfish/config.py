@@ -9,11 +9,10 @@ from urllib.parse import urlsplit
 from pydantic import Field, field_validator
 
 from fantwin.pipeline.sources.polling import SLOWEST_S, PolledConfig
+from fantwin.pipeline.sources.secret_file import LogIn
 
-USER_VARIABLE, PASSWORD_VARIABLE = "FANTWIN_REDFISH_USER", "FANTWIN_REDFISH_PASSWORD"
 
-
-class RedfishConfig(PolledConfig, frozen=True):
+class RedfishConfig(PolledConfig, LogIn, frozen=True):
     """Fans of a server by its baseboard controller. It needs the extra `devices`."""
 
     kind: Literal["redfish"] = "redfish"
@@ -33,11 +32,6 @@ class RedfishConfig(PolledConfig, frozen=True):
         default="",
         description="sensor of the air: its name (Thermal), or a key of TemperatureSummaryCelsius (ThermalSubsystem)",
     )
-    credentials: Path | None = Field(
-        default=None,
-        description=f"file of two lines, user and password; only its owner may be able to read it; without it the "
-        f"environment variables {USER_VARIABLE} and {PASSWORD_VARIABLE}",
-    )
     verify: bool = Field(default=True, description="whether the certificate of the controller is checked")
     ca: Path | None = Field(default=None, description="certificate of the authority that signed the controller's")
 
@@ -48,7 +42,7 @@ class RedfishConfig(PolledConfig, frozen=True):
         if parts.scheme not in ("http", "https") or not parts.hostname:
             raise ValueError("write the address of the controller, for example https://bmc1")
         if parts.username is not None:
-            raise ValueError("a configuration is recorded: put user and password into the file of `credentials`")
+            raise ValueError("a configuration is recorded: give username, and password_file")
         return value
 
     @property

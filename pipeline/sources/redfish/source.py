@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import logging
 import math
-import os
-import stat
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+from fantwin.pipeline.errors import UserError, refusals
 from fantwin.pipeline.extras import require
 from fantwin.pipeline.sources.polling import DeviceError, PollingSource
-from fantwin.pipeline.sources.redfish.config import PASSWORD_VARIABLE, USER_VARIABLE, RedfishConfig
+from fantwin.pipeline.sources.redfish.config import RedfishConfig
 from fantwin.pipeline.sources.source import Reading, Rejected, SourceContext
 from fantwin.schemas.channels import TEMPERATURE
 from fantwin.schemas.units import RAD_S_PER_UNIT
@@ -26,7 +25,6 @@ if TYPE_CHECKING:
 Json = Mapping[str, Any]
 TIMEOUT_S = 5.0
 """longest wait for the answer to a request: controllers are slow"""
-OTHERS_MAY_READ = stat.S_IRWXG | stat.S_IRWXO
 
 
 class RedfishSource(PollingSource):
@@ -68,7 +66,7 @@ class RedfishDevice:
 
         config = self._config
         logging.getLogger("sushy").setLevel(logging.CRITICAL)  # a failure is a line of this source already
-        user, password = self._credentials()
+        user, password = config.username, self._password()
         if user and config.url.startswith("http:"):
             raise DeviceError(f"{config.url} would send the password in the clear: use https", is_lost=True)
         # sushy takes 0 for its own number of attempts, and waits between them; the poller tries again by itself
@@ -121,29 +119,14 @@ class RedfishDevice:
             connector.close()
 
     def check(self) -> list[str]:
-        """Problems before the start: the credentials cannot be read. The controller is not asked."""
-        try:
-            self._credentials()
-        except DeviceError as error:
-            return [str(error)]
-        return []
+        """Problems before the start: the password cannot be read. The controller is not asked."""
+        return refusals(lambda: self._config.password(self._folder))
 
-    def _credentials(self) -> tuple[str, str]:
-        """User and password; both empty if there are none."""
-        if self._config.credentials is None:
-            return os.environ.get(USER_VARIABLE, ""), os.environ.get(PASSWORD_VARIABLE, "")
-        path = self._folder / self._config.credentials
+    def _password(self) -> str | None:
         try:
-            if path.stat().st_mode & OTHERS_MAY_READ:
-                raise DeviceError(f"{path}: others may read it; chmod 600 {path}", is_lost=True)
-            lines = path.read_text(encoding="utf-8").splitlines()
-        except OSError as error:
-            raise DeviceError(f"{path}: {error.strerror}; correct source.credentials", is_lost=True) from error
-        except UnicodeDecodeError as error:
-            raise DeviceError(f"{path}: is no text in UTF-8: save it as such", is_lost=True) from error
-        if len(lines) < 2:
-            raise DeviceError(f"{path}: write the user in its first line and the password in its second", is_lost=True)
-        return lines[0].strip(), lines[1]
+            return self._config.password(self._folder)
+        except UserError as error:
+            raise DeviceError(str(error), is_lost=True) from error
 
     def _asked(self, request: Any) -> Any:
         """Send a request and return the answer. Raises DeviceError, whose text has no credentials."""

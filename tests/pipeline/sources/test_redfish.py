@@ -13,7 +13,7 @@ import trustme
 from fantwin.pipeline.config.loading import parse_config
 from fantwin.pipeline.config.models import ConfigError
 from fantwin.pipeline.sources.polling import DeviceError
-from fantwin.pipeline.sources.redfish.config import PASSWORD_VARIABLE, USER_VARIABLE, RedfishConfig
+from fantwin.pipeline.sources.redfish.config import RedfishConfig
 from fantwin.pipeline.sources.redfish.source import RedfishDevice
 from fantwin.pipeline.sources.source import Reading, Rejected, SourceContext
 from fantwin.schemas.channels import TEMPERATURE
@@ -37,12 +37,6 @@ def reading(made: RedfishDevice) -> Reading:
     found = made.read()
     assert isinstance(found, Reading)
     return found
-
-
-@pytest.fixture(autouse=True)
-def _no_credentials(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in (USER_VARIABLE, PASSWORD_VARIABLE):
-        monkeypatch.delenv(name, raising=False)
 
 
 def test_the_newer_schema_gives_speed_and_percent() -> None:
@@ -103,7 +97,7 @@ def test_a_controller_that_fails_or_is_slow_is_a_failed_poll_and_one_that_is_gon
     assert caught.value.is_lost
 
 
-def test_credentials_come_from_a_file_or_the_environment_over_a_verified_line_only(
+def test_a_password_comes_from_a_file_or_the_environment_over_a_verified_line_only(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     authority = trustme.CA()
@@ -111,29 +105,26 @@ def test_credentials_come_from_a_file_or_the_environment_over_a_verified_line_on
     authority.issue_cert("127.0.0.1").configure_cert(tls)
     authority.cert_pem.write_to_path(str(tmp_path / "ca.pem"))
     file = tmp_path / "bmc.secret"
-    file.write_text(f"operator\n{SECRET}\n")
+    file.write_text(f"{SECRET}\n")
     controller = Controller(is_new=True, user="operator", password=SECRET)
     with redfish_server(controller, tls) as url:
-        settings = {"folder": tmp_path, "ca": "ca.pem", "credentials": "bmc.secret"}
-        with pytest.raises(DeviceError, match="others may read it; chmod 600"):
+        settings = {"folder": tmp_path, "ca": "ca.pem", "username": "operator", "password_file": "bmc.secret"}
+        with pytest.raises(DeviceError, match="others may read it: chmod 600"):
             connected(url, **settings)
         assert "others may read it" in device(url, **settings).check()[0]
         file.chmod(0o600)
-        file.write_bytes("root\nGeh\xe4im\n".encode("latin-1"))
-        assert device(url, **settings).check() == [f"{file}: is no text in UTF-8: save it as such"]
-        file.write_text(f"operator\n{SECRET}\n")
+        file.write_text(f"{SECRET}\n")
         made = connected(url, **settings)
         assert reading(made).speed == (4000.0, 4200.0)
         made.disconnect()
         with pytest.raises(DeviceError, match="^its certificate cannot be verified: name the authority by source.ca"):
-            connected(url, folder=tmp_path, credentials="bmc.secret")
-        monkeypatch.setenv(USER_VARIABLE, "operator")
-        monkeypatch.setenv(PASSWORD_VARIABLE, f"{SECRET}-not")
+            connected(url, folder=tmp_path, username="operator", password_file="bmc.secret")
+        monkeypatch.setenv("BMC", f"{SECRET}-not")
         with pytest.raises(DeviceError, match="^user or password is refused") as caught:
-            connected(url, folder=tmp_path, ca="ca.pem")
+            connected(url, folder=tmp_path, ca="ca.pem", username="operator", password_env="BMC")
         assert SECRET not in str(caught.value)
     with pytest.raises(DeviceError, match="would send the password in the clear"):
-        connected("http://127.0.0.1:9")
+        connected("http://127.0.0.1:9", username="operator", password_env="BMC")
     assert SECRET not in caplog.text
 
 
