@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import shutil
 import tempfile
 import threading
 import time
@@ -17,7 +18,6 @@ from pathlib import Path
 import numpy as np
 from playwright.sync_api import sync_playwright
 
-from fantwin.pipeline.cli.watch.page_picture import installed_browser
 from fantwin.pipeline.config.models import TrayConfig
 from fantwin.pipeline.outputs.web.config import GatewayConfig
 from fantwin.pipeline.runtime.stage import Context, Core
@@ -106,7 +106,7 @@ def _feed(core: Core, trays: tuple[TrayConfig, ...], stop: threading.Event) -> N
 def _measure(url: str, fans: int) -> None:
     arguments = ["--no-sandbox"] if os.geteuid() == 0 else []
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=installed_browser(), args=arguments)
+        browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=arguments)
         page = browser.new_page(viewport={"width": 1280, "height": 900})
         page.goto(url)
         page.wait_for_selector(".cell.normal")

@@ -19,6 +19,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from pathlib import Path
 
+from fantwin.pipeline.cli.watch.selftest import simulated_tray
 from fantwin.pipeline.selftest.scenarios import SCENARIOS
 from fantwin.pipeline.selftest.scratch_site import STAGES, NotKept, ScratchSite
 from fantwin.pipeline.selftest.selftest import Row, account, run_scenario
@@ -32,7 +33,7 @@ def soak(minutes: float, seed: int, folder: Path) -> tuple[list[Row], dict[str, 
     rng = random.Random(seed)
     rows: list[Row] = []
     memory: list[dict[str, float]] = []
-    with ScratchSite(folder) as site:
+    with ScratchSite(folder, simulated_tray()) as site:
         until_s = time.monotonic() + 60.0 * minutes
         while time.monotonic() < until_s:
             row = run_scenario(site, rng.choice(SHARED))

@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from fantwin.pipeline.bus.publisher import Publisher
 from fantwin.pipeline.selftest.scratch_site import FANS, SITE, STAGES, TRAY, NotKept, ScratchSite
 from fantwin.schemas.codec import encode, type_name
 from fantwin.schemas.header import Header
@@ -53,13 +54,29 @@ class Scenario:
     settings: tuple[str, ...] = ()
 
 
-def _pause(seconds: float) -> None:
-    threading.Event().wait(seconds)
-
-
 def _require(condition: object, otherwise: str) -> None:
     if not condition:
         raise NotKept(otherwise)
+
+
+def _judged(site: ScratchSite, after: str = "") -> float:
+    """Seconds until all fans were judged again. after: what, for people."""
+    took_s = site.seconds_until_judged(REPLACED_LIMIT_S)
+    if took_s is None:
+        raise NotKept(f"judging did not go on within {REPLACED_LIMIT_S:.0f} s{after}")
+    return took_s
+
+
+def _replaced(site: ScratchSite, label: str, old: int) -> float:
+    """Seconds until another process ran a stage."""
+    took_s = site.replaced(label, old, REPLACED_LIMIT_S)
+    if took_s is None:
+        raise NotKept(f"{label} was not restarted within {REPLACED_LIMIT_S:.0f} s")
+    return took_s
+
+
+def _stranger(site: ScratchSite) -> Publisher:
+    return site.bus.publisher(tray_key(SITE, TRAY, "raw"), BY_NAME["raw"], type_name(Raw), "stranger")
 
 
 def _forged(t_ns: int) -> Raw:
@@ -80,10 +97,8 @@ def _kills(site: ScratchSite) -> str:
     for label in STAGES:
         old = site.process_id(label)
         os.kill(old, signal.SIGKILL)
-        took_s = site.replaced(label, old, REPLACED_LIMIT_S)
-        if took_s is None:
-            raise NotKept(f"{label} was not restarted within {REPLACED_LIMIT_S:.0f} s")
-        _require(site.seconds_until_judged(REPLACED_LIMIT_S), f"judging did not go on after {label} was restarted")
+        took_s = _replaced(site, label, old)
+        _judged(site, f" after {label} was restarted")
         seen.append(f"{label} {took_s:.1f} s")
     return "back after " + ", ".join(seen)
 
@@ -92,44 +107,39 @@ def _hang(site: ScratchSite) -> str:
     label = "twin_integrator"
     old = site.process_id(label)
     os.kill(old, signal.SIGSTOP)
-    took_s = site.replaced(label, old, REPLACED_LIMIT_S)
-    if took_s is None:
+    try:
+        return f"killed and restarted after {_replaced(site, label, old):.0f} s"
+    except NotKept:
         os.kill(old, signal.SIGCONT)
-        raise NotKept(f"{label} still hung after {REPLACED_LIMIT_S:.0f} s")
-    return f"killed and restarted after {took_s:.0f} s"
+        raise
 
 
 def _silence(site: ScratchSite) -> str:
-    site.line.cut(True)
+    site.line.is_cut = True
     took_s = site.seconds_until(lambda: SILENCE in site.problem("resampler"), 20.0)
-    site.line.cut(False)
+    site.line.is_cut = False
     _require(took_s is not None, f"the resampler did not report {SILENCE!r} within 20 s")
     return f"reported by the resampler after {took_s:.1f} s"
 
 
 def _backlog(site: ScratchSite) -> str:
-    before = len(site.raised)
-    site.line.hold()
-    _pause(STALL_S)
-    site.line.release()
-    judged_s = site.seconds_until_judged(60.0)
-    _require(judged_s, "judging did not go on within a minute")
-    _require(len(site.raised) == before, f"{len(site.raised) - before} false alarms")
-    return f"judged again {judged_s:.1f} s after the line was back"
+    site.line.is_held = True
+    threading.Event().wait(STALL_S)
+    site.line.is_held = False
+    return f"judged again {_judged(site):.1f} s after the line was back"
 
 
 def _noise(site: ScratchSite) -> str:
     site.line.inject(bytes((index * 197 + index // 256 * 31) % 256 for index in range(NOISE_BYTES)))
-    _require(site.seconds_until_judged(60.0), "judging did not go on within a minute")
-    return f"{NOISE_BYTES:,} bytes of noise skipped"
+    return f"{NOISE_BYTES:,} bytes of noise skipped; judged again after {_judged(site):.1f} s"
 
 
 def _garbage(site: ScratchSite) -> str:
-    publisher = site.bus.publisher(tray_key(SITE, TRAY, "raw"), BY_NAME["raw"], type_name(Raw), "stranger")
+    publisher = _stranger(site)
     lost = sum(site.watcher.losses().values())
     for _ in range(GARBAGE_MESSAGES):
         publisher.put(b"\xff\xfe no message")
-    _require(site.seconds_until_judged(60.0), "judging did not go on within a minute")
+    _judged(site)
     more = sum(site.watcher.losses().values()) - lost
     _require(not more, f"counted as {more} losses of this site")
     return f"{GARBAGE_MESSAGES:,} undecodable messages, none counted as a loss"
@@ -138,12 +148,8 @@ def _garbage(site: ScratchSite) -> str:
 def _far_ahead(site: ScratchSite) -> str:
     view = site.view("resampler")
     assert view
-    t_ns = view.health.t_ns + round(FAR_AHEAD_S * 1e9)
-    publisher = site.bus.publisher(tray_key(SITE, TRAY, "raw"), BY_NAME["raw"], type_name(Raw), "stranger")
-    publisher.put(encode(_forged(t_ns)))
-    judged_s = site.seconds_until_judged(60.0)
-    _require(judged_s, "judging did not go on within a minute")
-    return f"refused; judging went on (the next hundred samples took {judged_s:.1f} s)"
+    _stranger(site).put(encode(_forged(view.health.t_ns + round(FAR_AHEAD_S * 1e9))))
+    return f"refused; judging went on (the next hundred samples took {_judged(site):.1f} s)"
 
 
 def _second_owner(site: ScratchSite) -> str:
@@ -177,7 +183,7 @@ def _full_disk(site: ScratchSite) -> str:
     took_s = site.seconds_until(lambda: site.problem("recorder"), REPLACED_LIMIT_S)
     _require(took_s, "the recorder did not report the full disk")
     reported = site.problem("recorder")
-    _require(site.seconds_until_judged(60.0), "judging did not go on while the disk was full")
+    _judged(site, " while the disk was full")
     ballast.unlink()
     again_s = site.seconds_until(lambda: not site.problem("recorder"), REPLACED_LIMIT_S)
     _require(again_s, f"recording did not resume after room was made: {site.problem('recorder')}")
@@ -186,11 +192,10 @@ def _full_disk(site: ScratchSite) -> str:
 
 def _strangers(site: ScratchSite) -> str:
     before = {label: site.memory_bytes(label) for label in STAGES}
-    publisher = site.bus.publisher(tray_key(SITE, TRAY, "raw"), BY_NAME["raw"], type_name(Raw), "stranger")
+    publisher = _stranger(site)
     for number in range(STRANGERS):
         publisher.put(encode(replace(_forged(0), header=Header(f"stranger-{number}", 0, TRAY))))
-    judged_s = site.seconds_until_judged(60.0)
-    _require(judged_s, "judging did not go on within a minute")
+    judged_s = _judged(site)
     grown = max(site.memory_bytes(label) - before[label] for label in STAGES) / 1e6
     _require(grown < STRANGERS_LIMIT_MB, f"a stage grew by {grown:.0f} MB")
     return f"judged again {judged_s:.1f} s after {STRANGERS:,} messages; no stage grew by more than {grown:.0f} MB"
@@ -198,23 +203,19 @@ def _strangers(site: ScratchSite) -> str:
 
 def _clock_back(site: ScratchSite) -> str:
     site.set_clock(-FAR_AHEAD_S)
-    judged_s = site.seconds_until_judged(60.0)
-    _require(judged_s, "judging did not go on within a minute")
+    judged_s = _judged(site)
     old = {label: site.process_id(label) for label in (STAGES[0], "resampler")}
     for process_id in old.values():
         os.kill(process_id, signal.SIGKILL)
     for label, process_id in old.items():
-        _require(site.replaced(label, process_id, REPLACED_LIMIT_S), f"{label} was not restarted")
-    again_s = site.seconds_until_judged(60.0)
-    _require(again_s, "judging did not go on within a minute after acquisition and resampler were restarted")
+        _replaced(site, label, process_id)
+    again_s = _judged(site, " after acquisition and resampler were restarted")
     return f"judged again after {judged_s:.1f} s, and {again_s:.1f} s after acquisition and resampler were restarted"
 
 
 def _clock_forward(site: ScratchSite) -> str:
     site.set_clock(FAR_AHEAD_S)
-    judged_s = site.seconds_until_judged(60.0)
-    _require(judged_s, "judging did not go on within a minute")
-    return f"judged again after {judged_s:.1f} s"
+    return f"judged again after {_judged(site):.1f} s"
 
 
 SCENARIOS = (

@@ -1,4 +1,4 @@
-"""A site of its own for a self-test: a simulated tray behind a relay, `fantwin up`, and a watcher of both."""
+"""A site of its own for a self-test: a simulated tray on a line, `fantwin up`, and a watcher of both."""
 
 from __future__ import annotations
 
@@ -8,8 +8,11 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Iterable
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -17,14 +20,15 @@ from typing import Any, Self
 from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.config.loading import load_config
 from fantwin.pipeline.errors import UserError
-from fantwin.pipeline.selftest.line_relay import LineRelay
 from fantwin.pipeline.selftest.stepped_clock import VARIABLE, set_offset_ns
 from fantwin.pipeline.site.site_state import StageView
 from fantwin.pipeline.site.site_watcher import SiteWatcher
+from fantwin.pipeline.sources.simulated.device import Device, PseudoTerminal, play, wait_for_reader
 from fantwin.schemas.codec import decode
 from fantwin.schemas.enums import Transition
 from fantwin.schemas.messages import Alarm, Score
 from fantwin.schemas.topics import tray_key
+from fantwin.schemas.units import RAD_S_PER_UNIT
 
 FANTWIN = (sys.executable, "-P", "-m", "fantwin")
 CONFIGURATION = Path(__file__).parents[1] / "demo" / "demo.toml"
@@ -32,17 +36,47 @@ SITE, TRAY, FANS = "demo", "tray1", 8
 STAGES = (f"acquisition/{TRAY}", "resampler", "twin_integrator", "scorer", "recorder")
 START_LIMIT_S = 60.0
 _POLL_S = 0.05
+_WRITE_BYTES = 1024
+"""bytes in one write: a pseudo-terminal accepts a write of this size completely or not at all"""
 
 
 class NotKept(Exception):  # noqa: N818  a result, not an error
     """A promise that was not kept; the text says what was seen instead."""
 
 
+class DisturbedLine(PseudoTerminal):
+    """The serial line of a simulated device, which can be held, cut and disturbed.
+
+    What the device sends while nobody reads, or while the line is cut, is lost, as on a real line. What it sends while
+    the line is held is delivered afterwards, as fast as the reader takes it.
+    """
+
+    def __init__(self, link: Path) -> None:
+        super().__init__(link)
+        self._waiting: deque[bytes] = deque()
+        self.is_held = self.is_cut = False
+
+    def write(self, data: bytes) -> bool:
+        """Send a frame, behind what waits."""
+        if not self.has_reader():
+            self._waiting.clear()
+            return False
+        if not self.is_cut:
+            self._waiting.append(data)
+        while self._waiting and not self.is_held and super().write(self._waiting[0]):
+            self._waiting.popleft()
+        return True
+
+    def inject(self, data: bytes) -> None:
+        """Let bytes that the device does not send arrive with its next frame."""
+        self._waiting += [data[first : first + _WRITE_BYTES] for first in range(0, len(data), _WRITE_BYTES)]
+
+
 class ScratchSite:
     """Runs from entering to leaving its context; all its processes have ended after that."""
 
-    def __init__(self, folder: Path, *settings: str) -> None:
-        """folder: for its files, empty but for `runs`. settings: further overrides, `key=value`."""
+    def __init__(self, folder: Path, device: Device, *settings: str) -> None:
+        """folder: for its files, empty but for `runs`. device: of `FANS` fans. settings: overrides, `key=value`."""
         self.folder = folder
         self.run_folder = folder / "runs"
         """what the stages write"""
@@ -53,9 +87,11 @@ class ScratchSite:
             *(f"bus.endpoint='{self.endpoint}'", "launcher.stages=" + json.dumps([s.split("/")[0] for s in STAGES])),
             *settings,
         )
-        self.line = LineRelay(folder / "device", folder / "tray")
+        self.line = DisturbedLine(folder / "tray")
+        self._unplugged = threading.Event()
+        self._device = threading.Thread(target=self._play, args=(device,), daemon=True)
         self._clock_file = folder / "clock"
-        self._processes: list[subprocess.Popen[str]] = []
+        self.up: subprocess.Popen[str] | None = None
         self.raised: list[Alarm] = []
         """the alarms raised so far"""
         self.judged = 0
@@ -81,41 +117,38 @@ class ScratchSite:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         stages = [view.health.process_id for view in self.watcher.stages() if view.alive]
-        for process in self._processes:
-            if process.poll() is None:
-                process.kill()
-            process.wait()
+        if self.up:
+            self.up.kill()
+            self.up.wait()
         for process_id in stages:
-            _kill(process_id)
+            with suppress(ProcessLookupError):
+                os.kill(process_id, signal.SIGKILL)
+        self._unplug()
         self.line.close()
         self.bus.close()
         self._log.close()
 
     def _start(self) -> None:
-        simulate = ("simulate", "--fans", FANS, "--set", "speed_unit=rpm", "--link", self.folder / "device")
-        self.tray = self.process(*simulate, "--wait-for-reader")
-        self.line.start()
-        self.up = self.process("up", *self.configured(), "--json", stdout=subprocess.PIPE)
+        self._device.start()
+        path = os.pathsep.join(filter(None, (str(self.folder), os.environ.get("PYTHONPATH", ""))))
+        environment = {**os.environ, VARIABLE: str(self._clock_file), "PYTHONPATH": path}
+        up = ("up", *self.configured(), "--json")
+        self.up = started(up, stdout=subprocess.PIPE, stderr=self._log, env=environment)
         if self.seconds_until_judged(START_LIMIT_S) is None:
             raise UserError(f"the site of the self-test did not start within {START_LIMIT_S:.0f} s: {self.last_line()}")
+
+    def _play(self, device: Device) -> None:
+        wait_for_reader(self.line, "binary", self._unplugged)
+        play(device, self.line, "binary", RAD_S_PER_UNIT["rpm"], self._unplugged)
+
+    def _unplug(self) -> None:
+        self._unplugged.set()
+        if self._device.is_alive():
+            self._device.join()
 
     def configured(self) -> tuple[str, ...]:
         """The words that give a command this site's configuration."""
         return ("-c", str(CONFIGURATION), *(word for override in self.overrides for word in ("--set", override)))
-
-    def process(self, *words: object, stdout: int | None = None) -> subprocess.Popen[str]:
-        """Start a `fantwin` command that ends with this site."""
-        process = subprocess.Popen(
-            [*FANTWIN, *map(str, words)],
-            stdin=subprocess.DEVNULL,
-            stdout=stdout or self._log,
-            stderr=self._log,
-            text=True,
-            start_new_session=True,
-            env={**os.environ, VARIABLE: str(self._clock_file), "PYTHONPATH": _path_with(self.folder)},
-        )
-        self._processes.append(process)
-        return process
 
     def command(self, *words: object, limit_s: float = START_LIMIT_S) -> subprocess.CompletedProcess[str]:
         """Run a `fantwin` command to its end.
@@ -189,12 +222,7 @@ class ScratchSite:
 
     def last_line(self) -> str:
         """The last line of what the processes have printed."""
-        lines = self.log().strip().splitlines()
-        return lines[-1] if lines else "no output"
-
-    def log(self) -> str:
-        """All lines that the processes have printed."""
-        return (self.folder / "up.log").read_text(encoding="utf-8", errors="replace")
+        return lines_of(self.folder / "up.log")[-1]
 
     def stop(self) -> tuple[int, dict[str, Any]]:
         """Stop the site as Ctrl-C does; returns its exit code and outcome.
@@ -202,13 +230,13 @@ class ScratchSite:
         Raises:
             NotKept: it does not stop.
         """
+        assert self.up
         self.up.send_signal(signal.SIGINT)
         try:
             output, _ = self.up.communicate(timeout=START_LIMIT_S)
         except subprocess.TimeoutExpired as error:
             raise NotKept(f"it did not stop within {START_LIMIT_S:.0f} s: {self.last_line()}") from error
-        self.tray.send_signal(signal.SIGINT)
-        self.tray.wait(START_LIMIT_S)
+        self._unplug()
         return self.up.returncode, json.loads(output or "{}")
 
     def recordings(self) -> list[Path]:
@@ -231,12 +259,12 @@ def free_port() -> int:
         return probe.getsockname()[1]
 
 
-def _path_with(folder: Path) -> str:
-    return os.pathsep.join(filter(None, (str(folder), os.environ.get("PYTHONPATH", ""))))
+def started(words: Iterable[object], **streams: Any) -> subprocess.Popen[str]:
+    """A `fantwin` command as a process in a session of its own, which a Ctrl-C in the terminal does not reach."""
+    command = [*FANTWIN, *map(str, words)]
+    return subprocess.Popen(command, text=True, start_new_session=True, **{"stdin": subprocess.DEVNULL, **streams})
 
 
-def _kill(process_id: int) -> None:
-    try:
-        os.kill(process_id, signal.SIGKILL)
-    except ProcessLookupError:
-        return
+def lines_of(log: Path) -> list[str]:
+    """What a command has printed into a file; one line if nothing."""
+    return log.read_text(encoding="utf-8", errors="replace").strip().splitlines() or ["no output"]

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from fantwin.pipeline.selftest.scenarios import SMALL_DISK_BYTES, Scenario
 from fantwin.pipeline.selftest.scratch_site import NotKept, ScratchSite
+from fantwin.pipeline.sources.simulated.device import Device
 
 BACK_LIMIT_S = 60.0
 LOST = 3
@@ -29,8 +30,10 @@ class Row:
     kept: bool | None
 
 
-def run_scenarios(folder: Path, scenarios: Sequence[Scenario], report: Callable[[Row], None]) -> list[Row]:
-    """Run them in order; `report` is called with each row when it is known."""
+def run_scenarios(
+    folder: Path, scenarios: Sequence[Scenario], device: Callable[[], Device], report: Callable[[Row], None]
+) -> list[Row]:
+    """Run them in order. device: makes the tray of a site. report: is called with each row when it is known."""
     rows: list[Row] = []
 
     def add(row: Row) -> None:
@@ -44,7 +47,7 @@ def run_scenarios(folder: Path, scenarios: Sequence[Scenario], report: Callable[
             if not is_there:
                 add(Row(group[0].name, group[0].promise, "not run: only root may mount a small disk", kept=None))
                 continue
-            with ScratchSite(place, *(each for scenario in group for each in scenario.settings)) as site:
+            with ScratchSite(place, device(), *(each for scenario in group for each in scenario.settings)) as site:
                 for scenario in group:
                     add(run_scenario(site, scenario))
                 add(account(site, ", ".join(scenario.name for scenario in group)))

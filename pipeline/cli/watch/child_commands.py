@@ -21,7 +21,7 @@ from fantwin.pipeline.bus.session import join_bus
 from fantwin.pipeline.config.models import Config, TrayConfig
 from fantwin.pipeline.config.registry import RECORDER
 from fantwin.pipeline.errors import UserError
-from fantwin.pipeline.selftest.scratch_site import FANTWIN
+from fantwin.pipeline.selftest.scratch_site import lines_of, started
 from fantwin.schemas.codec import CodecError, decode
 from fantwin.schemas.messages import Raw
 from fantwin.schemas.topics import tray_key
@@ -80,7 +80,7 @@ class Commands:
     def _run(self, words: Sequence[object], stdout: Any, site: RecordingSite | None = None) -> None:
         line = [str(word) for word in words]
         self.say(f"fantwin {shlex.join(line)}")
-        child = _started(line, stdout=stdout)
+        child = started(line, stdout=stdout)
         self.wait(child, site)
         if child.returncode:
             raise UserError(f"`fantwin {line[0]}` failed (exit code {child.returncode}) and has said why")
@@ -124,7 +124,7 @@ class RecordingSite:
 
     def __enter__(self) -> Self:
         with self._log.open("a", encoding="utf-8") as log:
-            self._up = _started(self._words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log)
+            self._up = started(self._words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log)
         try:
             self._bus = join_bus(self._config, listens=False)
             for tray in self._fans:
@@ -192,7 +192,7 @@ class RecordingSite:
         """That no sample of a tray has arrived for long, and the last line of `up`; empty if one has."""
         if time.monotonic() - self._last_sample_s[tray] <= SILENT_S:
             return ""
-        return f"no sample for {SILENT_S:.0f} s: {self._last_line()} (all lines: {self._log})"
+        return f"no sample for {SILENT_S:.0f} s: {lines_of(self._log)[-1]} (all lines: {self._log})"
 
     def _end(self) -> None:
         answer, _ = self._up.communicate()  # closes its standard input, at which it stops in order
@@ -201,12 +201,8 @@ class RecordingSite:
             self.recordings = [Path(name) for name in outcome["recordings"]]
             self.lost = {name: count for name, count in outcome["lost"].items() if count}
 
-    def _last_line(self) -> str:
-        lines = self._log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
-        return lines[-1] if lines else "no output"
-
     def _failed(self) -> UserError:
-        return UserError(f"recording failed: {self._last_line()} (all lines: {self._log})")
+        return UserError(f"recording failed: {lines_of(self._log)[-1]} (all lines: {self._log})")
 
     def _take(self, _key: str, payload: bytes) -> None:
         with self._lock:
@@ -223,11 +219,6 @@ def next_recording_file(config: Config) -> Path:
     folders = (file.with_name(f"commissioned-{number}") for number in count(1))
     free = next(folder for folder in folders if not (config.run_folder / folder).exists())
     return free / f"{free.name}.mcap"
-
-
-def _started(words: list[str], **streams: Any) -> subprocess.Popen[str]:
-    command = [*FANTWIN, *words]
-    return subprocess.Popen(command, text=True, start_new_session=True, **{"stdin": subprocess.DEVNULL, **streams})
 
 
 def _raw(payload: bytes) -> Raw | None:

@@ -10,30 +10,36 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Annotated
 
 import typer
 from rich.box import SIMPLE_HEAD
-from rich.console import Console
+from rich.console import Console, Group
 from rich.live import Live
 from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 from fantwin.pipeline.bus.session import Bus, join_bus
 from fantwin.pipeline.cli.options import JsonOption
 from fantwin.pipeline.cli.progress import working
-from fantwin.pipeline.cli.watch.demo_page import PICTURE, DemoPage
 from fantwin.pipeline.cli.watch.demo_report import Summary, summarise
-from fantwin.pipeline.cli.watch.demo_screen import DemoScreen
-from fantwin.pipeline.config.models import Config
+from fantwin.pipeline.cli.watch.status import stage_table
+from fantwin.pipeline.config.models import Config, TrayConfig
+from fantwin.pipeline.config.roles import roles_of
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.extras import missing_extra
-from fantwin.pipeline.launch.this_host import load_for_this_host
+from fantwin.pipeline.launch.this_host import load_for_this_host, page_addresses
 from fantwin.pipeline.runtime.signals import stop_on_signals
-from fantwin.pipeline.selftest.scratch_site import FANTWIN, free_port
-from fantwin.schemas.units import NS_PER_S
+from fantwin.pipeline.selftest.scratch_site import free_port, lines_of, started
+from fantwin.pipeline.site.fan_history import CURVES
+from fantwin.pipeline.site.fleet import Fan, FanGroup
+from fantwin.pipeline.site.site_model import SiteModel
+from fantwin.pipeline.site.site_watcher import SiteWatcher
+from fantwin.schemas.enums import FanState
+from fantwin.schemas.units import NS_PER_S, RAD_S_PER_UNIT
 from fantwin.scoring.diagnosis.shown_causes import short_name
 
 DEMO_FOLDER = Path(__file__).parents[2] / "demo"
@@ -44,14 +50,11 @@ FAULTS = (
     ("inlet", "fan=2,start=8,stop=14,size=1.8"),
     ("rotor", "fan=5,start=18,stop=24,size=0.8"),
 )
-SHOWN_FAN = 5
-"""in the picture of the page, while it is in alarm"""
 OUTPUTS = (
     *(
         "recording*.mcap*",
         "view*.rrd",
         "bands.png",
-        PICTURE,
         "summary.json",
         "truth.json",
         "up.log",
@@ -62,6 +65,7 @@ OUTPUTS = (
 )
 ERROR_PREFIX = "fantwin: "
 """start of the line in which a command says why it failed"""
+_STYLES = {FanGroup.NORMAL: "green", FanGroup.SUSPECT: "yellow", FanGroup.NOT_JUDGED: "dim", FanGroup.AT_REST: "dim"}
 _START_TIMEOUT_S = 60.0
 _STOP_TIMEOUT_S = 60.0
 
@@ -124,7 +128,6 @@ def _run(config: Config, overrides: list[str], out: Path, console: Console) -> d
     stop = threading.Event()
     stop_on_signals(stop)
     tray = config.trays[0]
-    page = DemoPage(config, out, SHOWN_FAN)
     simulate = [
         *("simulate", "--fans", str(tray.fans), "--profile", "manual", "--seed", str(SEED)),
         *("--duration", str(DURATION_S), "--set", f"speed_unit={tray.speed_unit}", "--link", str(out / "tray")),
@@ -142,11 +145,9 @@ def _run(config: Config, overrides: list[str], out: Path, console: Console) -> d
     ):
         count = len(config.stages)
         console.print(f"simulated tray of {tray.fans} fans; starting {count} stages, each as a process of its own")
-        if page.address:
-            console.print(f"operators' page, while the demo runs: {page.address}", soft_wrap=True)
-        _watch(config, bus, device, pipeline, page, stop, console)
-        if missing_because := page.finish():
-            console.print(f"no picture of the page: {missing_because}", soft_wrap=True)
+        for address in page_addresses(config):
+            console.print(f"operators' page, while the demo runs: {address}", soft_wrap=True)
+        _watch(config, bus, device, pipeline, stop, console)
         if pipeline.poll() is None:
             pipeline.send_signal(signal.SIGINT)
         try:
@@ -163,15 +164,9 @@ def _run(config: Config, overrides: list[str], out: Path, console: Console) -> d
 
 
 @contextmanager
-def _child(arguments: list[str], **streams: object) -> Iterator[subprocess.Popen[str]]:
-    """A `fantwin` command in a process and session of its own; it has ended on exit, killed if it does not stop."""
-    process = subprocess.Popen(
-        [*FANTWIN, *arguments],
-        stdin=subprocess.DEVNULL,
-        text=True,
-        start_new_session=True,
-        **streams,  # pyright: ignore[reportArgumentType, reportCallIssue]
-    )
+def _child(words: list[str], **streams: object) -> Iterator[subprocess.Popen[str]]:
+    """A `fantwin` command, which has ended on exit, killed if it does not stop."""
+    process = started(words, **streams)
     try:
         yield process
     finally:
@@ -189,33 +184,53 @@ def _watch(
     bus: Bus,
     device: subprocess.Popen[str],
     pipeline: subprocess.Popen[str],
-    page: DemoPage,
     stop: threading.Event,
     console: Console,
 ) -> None:
     """Show what happens until the tray has sent its last sample, or a process ends too early."""
-    screen = DemoScreen(config, bus)
-    started_s = time.monotonic()
-    deadline_s = started_s + _START_TIMEOUT_S
+    watcher = SiteWatcher(bus, config.site, roles_of(config), config.trays, has_scores=True)
+    began_s = time.monotonic()
     next_line_s = 0.0
-    live = Live(console=console, refresh_per_second=4, transient=True) if console.is_terminal else None
-    if live:
-        live.start()
-    try:
+    with Live(console=console, refresh_per_second=4, transient=True) if console.is_terminal else nullcontext() as live:
         while device.poll() is None and pipeline.poll() is None and not stop.wait(0.25):
-            page.look(screen.fans_in_alarm)
+            now_s = time.monotonic()
             if live:
-                live.update(screen.render())
-            elif time.monotonic() >= next_line_s:
-                next_line_s = time.monotonic() + 4.0
-                console.print(f"{time.monotonic() - started_s:5.0f} s  {screen.line()}")
-            if not screen.has_score and time.monotonic() > deadline_s:
+                live.update(Group(stage_table(watcher, config), _fan_table(config.trays[0], watcher.model)))
+            elif now_s >= next_line_s:
+                next_line_s = now_s + 4.0
+                console.print(f"{now_s - began_s:5.0f} s  {_line(config.trays[0], watcher)}")
+            if not watcher.model.trays_now() and now_s > began_s + _START_TIMEOUT_S:
                 raise UserError(
                     f"no score arrived within {_START_TIMEOUT_S:.0f} s; see up.log, and run `fantwin doctor`"
                 )
-    finally:
-        if live:
-            live.stop()
+
+
+def _line(tray: TrayConfig, watcher: SiteWatcher) -> str:
+    """The state of the fans in one line, where there is no terminal."""
+    if not watcher.model.trays_now():
+        return "waiting for the first score"
+    states = [watcher.model.fan_now(Fan(tray.name, fan)).state for fan in range(tray.fans)]
+    if len(set(states)) == 1:
+        return f"all fans {states[0]}"
+    notable = (f"fan {fan} {state}" for fan, state in enumerate(states) if state != FanState.NORMAL.words)
+    return f"{', '.join(notable)}; lost {sum(watcher.losses().values())}"
+
+
+def _fan_table(tray: TrayConfig, model: SiteModel) -> Table:
+    """Every fan beside its twin."""
+    table = Table("fan", title=f"{tray.name}, speeds in {tray.speed_unit}", title_justify="left", box=SIMPLE_HEAD)
+    for column in ("command", "measured", "twin", "residual"):
+        table.add_column(column, justify="right")
+    table.add_column("state")
+    groups = model.groups()
+    for now in model.trays_now():
+        for fan, values in enumerate(now.values):
+            measured, twin, *_, command = values[: len(CURVES)]
+            speeds = (measured / RAD_S_PER_UNIT[tray.speed_unit], twin / RAD_S_PER_UNIT[tray.speed_unit])
+            state, group = model.fan_now(Fan(tray.name, fan)).state, groups[Fan(tray.name, fan)]
+            cells = (f"{command:.2f}", *(f"{speed:.0f}" for speed in speeds), f"{speeds[0] - speeds[1]:+.0f}")
+            table.add_row(str(fan), *cells, Text(state, style=_STYLES.get(group, "bold red")))
+    return table
 
 
 def _draw(out: Path, console: Console) -> None:
@@ -234,7 +249,7 @@ def _unfinished(what: str, log: Path) -> UserError:
 
 def _reason(log: Path) -> str:
     """Why a command failed: its error, else its last line about a failed stage, else its last line."""
-    lines = log.read_text(encoding="utf-8", errors="replace").strip().splitlines() or ["no output"]
+    lines = lines_of(log)
     for mark in (ERROR_PREFIX, "ended with status", "cannot start", "not arrive", "never ready", "killed"):
         if found := [line for line in lines if mark in line]:
             return found[-1].removeprefix(ERROR_PREFIX)
@@ -262,12 +277,11 @@ def _print_report(summary: Summary, out: Path, took_s: float, console: Console) 
         soft_wrap=True,
     )
     shown, programs = (Path(os.path.relpath(path)) for path in (out, Path(sys.executable).parent))
-    about = {"bands.png": "", PICTURE: " (operators' page)"}
-    pictures = " and ".join(f"{shown / name}{words}" for name, words in about.items() if (out / name).exists())
+    picture = f"picture: {shown / 'bands.png'}" if (out / "bands.png").exists() else ""
     view = f"interactive: {programs / 'rerun'} {shown / 'view.rrd'}" if (out / "view.rrd").exists() else ""
     for line in (
         f"results: {shown / 'summary.json'} and {shown / 'recording.mcap'}",
-        "; ".join(filter(None, (pictures and f"pictures: {pictures}", view))),
+        "; ".join(filter(None, (picture, view))),
     ):
         if line:
             console.print(line, markup=False, soft_wrap=True)  # to be copied

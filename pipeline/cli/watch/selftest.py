@@ -6,7 +6,7 @@ import json
 import tempfile
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.box import SIMPLE_HEAD
@@ -16,10 +16,16 @@ from rich.text import Text
 
 from fantwin.pipeline.cli.options import JsonOption
 from fantwin.pipeline.cli.progress import working
+from fantwin.pipeline.cli.simulation.scenario import Scenario as Simulated
 from fantwin.pipeline.config.models import nearest
 from fantwin.pipeline.errors import UsageError, UserError
 from fantwin.pipeline.selftest.scenarios import SCENARIOS, Scenario
+from fantwin.pipeline.selftest.scratch_site import FANS
 from fantwin.pipeline.selftest.selftest import Row, run_scenarios
+from fantwin.schemas.tacho import INSTANTANEOUS
+
+if TYPE_CHECKING:
+    from fantwin.simulation.tray import SimulatedTray
 
 _STATES = {True: "kept", False: "NOT KEPT", None: "not run"}
 _STYLES = {True: "green", False: "red", None: "yellow"}
@@ -55,7 +61,7 @@ def selftest(
         if out and out.exists() and any(out.iterdir()):
             raise UserError(f"{out}: is not empty; name a new folder with -o")
         with working(f"running {len(chosen)} scenarios"):
-            rows = run_scenarios(folder, chosen, lambda row: console.print(_line(row), markup=False))
+            rows = run_scenarios(folder, chosen, simulated_tray, lambda row: console.print(_line(row), markup=False))
     is_kept = all(row.kept is not False for row in rows)
     if json_output:
         typer.echo(json.dumps({"rows": [asdict(row) for row in rows], "kept": is_kept}))
@@ -63,6 +69,11 @@ def selftest(
         console.print(_table(rows))
     if not is_kept:
         raise typer.Exit(1)
+
+
+def simulated_tray() -> SimulatedTray:
+    """The device of a scratch site."""
+    return Simulated(fans=FANS).tray(INSTANTANEOUS, rate_hz=100.0)
 
 
 def _chosen(names: list[str] | tuple[str, ...]) -> list[Scenario]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import shutil
 import sys
 
 import pytest
@@ -14,8 +13,6 @@ from PIL import Image
 from rich.console import Console
 
 from fantwin.pipeline.cli.watch.demo import DEMO_FOLDER, _clear, _run, demo
-from fantwin.pipeline.cli.watch.demo_page import SIZE
-from fantwin.pipeline.cli.watch.page_picture import installed_browser, take_picture
 from fantwin.pipeline.config.loading import load_config
 from fantwin.pipeline.config.models import Config
 from fantwin.pipeline.errors import UserError
@@ -31,11 +28,6 @@ def test_the_demo_finds_both_faults_and_loses_nothing(tmp_path):
     assert done.returncode == 0, done.stdout + done.stderr
     assert "Traceback" not in done.stdout + done.stderr
     assert "operators' page, while the demo runs: http://127.0.0.1:" in done.stdout
-    if installed_browser():
-        with Image.open(out / "page.png") as picture:
-            assert picture.size == SIZE
-    else:
-        assert "no picture of the page: it needs a browser" in done.stdout
 
     summary = json.loads((out / "summary.json").read_text())
     assert [(fault["fan"], fault["kind"]) for fault in summary["faults"]] == [(2, "inlet"), (5, "rotor")]
@@ -96,7 +88,9 @@ else:
 
 
 def test_a_pipeline_that_does_not_stop_is_one_line_and_is_killed(tmp_path, endpoint, monkeypatch):
-    monkeypatch.setattr("fantwin.pipeline.cli.watch.demo.FANTWIN", (sys.executable, "-c", STUBBORN, str(tmp_path)))
+    monkeypatch.setattr(
+        "fantwin.pipeline.selftest.scratch_site.FANTWIN", (sys.executable, "-c", STUBBORN, str(tmp_path))
+    )
     monkeypatch.setattr("fantwin.pipeline.cli.watch.demo._STOP_TIMEOUT_S", 0.2)
     overrides = [f"bus.endpoint='{endpoint}'", f"tray.0.port='{tmp_path / 'tray'}'"]
     config = load_config(DEMO_FOLDER / "demo.toml", overrides)
@@ -125,21 +119,11 @@ sys.exit(1)
     ],
 )
 def test_the_reason_of_a_failure_is_in_the_terminal(tmp_path, endpoint, monkeypatch, log, reason):
-    monkeypatch.setattr("fantwin.pipeline.cli.watch.demo.FANTWIN", (sys.executable, "-c", FAILING, log))
+    monkeypatch.setattr("fantwin.pipeline.selftest.scratch_site.FANTWIN", (sys.executable, "-c", FAILING, log))
     overrides = [f"bus.endpoint='{endpoint}'", f"tray.0.port='{tmp_path / 'tray'}'"]
     config = load_config(DEMO_FOLDER / "demo.toml", overrides)
     with pytest.raises(UserError, match=f"^the pipeline did not run to its end: {reason}.*full log: .*up.log"):
         _run(config, overrides, tmp_path, Console(file=io.StringIO()))
-
-
-@pytest.mark.parametrize("program", ["cat", "no-such-program"])
-def test_a_browser_that_takes_no_picture_is_one_line_and_ends(program, tmp_path, monkeypatch):
-    monkeypatch.setattr("fantwin.pipeline.cli.watch.page_picture.LIMIT_S", 1.0)
-    path = shutil.which(program) or f"/{program}"
-    missing_because = take_picture(path, "http://127.0.0.1:1/", "true", (100, 100), tmp_path / "page.png")
-    assert missing_because.startswith(f"{program} has taken none: ")
-    assert "\n" not in missing_because
-    assert not (tmp_path / "page.png").exists()
 
 
 def test_a_demo_ignores_the_state_of_an_earlier_one_and_does_not_touch_other_files(tmp_path):

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import os
+import select
 import subprocess
 import sys
 import time
+import tty
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +16,7 @@ import pytest
 
 from fantwin.pipeline.selftest import selftest
 from fantwin.pipeline.selftest.scenarios import Scenario
-from fantwin.pipeline.selftest.scratch_site import NotKept
+from fantwin.pipeline.selftest.scratch_site import DisturbedLine, NotKept
 from fantwin.pipeline.selftest.stepped_clock import set_offset_ns
 from tests.support.fantwin_command import fantwin
 
@@ -26,7 +28,7 @@ class HealthySite:
     back_s: float | None = 0.1
     status = 0
 
-    def __init__(self, folder: Path, *settings: str) -> None:
+    def __init__(self, folder: Path, _device: object, *settings: str) -> None:
         self.folder, self.settings, self.raised = folder, settings, []
 
     def __enter__(self):
@@ -79,7 +81,7 @@ FINE = Scenario("fine", "nothing happens", lambda _site: "seen")
 def rows_of(monkeypatch: pytest.MonkeyPatch, folder: Path, site: type, *scenarios: Scenario) -> list[selftest.Row]:
     monkeypatch.setattr(selftest, "ScratchSite", site)
     reported: list[selftest.Row] = []
-    rows = selftest.run_scenarios(folder, scenarios, reported.append)
+    rows = selftest.run_scenarios(folder, scenarios, lambda: None, reported.append)  # type: ignore[arg-type]
     assert rows == reported
     return rows
 
@@ -142,6 +144,30 @@ def test_the_clock_of_a_process_follows_the_file(tmp_path):
     before_ns = time.time_ns()
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
     assert before_ns <= int(done.stdout) + 3600 * 10**9 <= time.time_ns()
+
+
+def test_a_line_loses_what_is_sent_while_it_is_cut_and_delivers_what_it_held_in_order(tmp_path):
+    line = DisturbedLine(tmp_path / "port")
+    assert not line.write(b"nobody reads")
+    reader = os.open(tmp_path / "port", os.O_RDWR | os.O_NOCTTY)
+    tty.setraw(reader)
+    noise = bytes(range(256)) * 100
+    line.is_cut = True
+    line.write(b"lost")
+    line.is_cut, line.is_held = False, True
+    for number in range(5):
+        line.write(bytes([number]) * 700)
+    assert not select.select([reader], [], [], 0)[0]
+    line.is_held = False
+    line.inject(noise)
+    sent = b"".join(bytes([number]) * 700 for number in range(5)) + noise
+    got = b""
+    while len(got) < len(sent):
+        line.write(b"!")
+        got += os.read(reader, 4096)
+    os.close(reader)
+    line.close()
+    assert got[: len(sent)] == sent
 
 
 @pytest.mark.real_time
