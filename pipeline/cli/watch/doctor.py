@@ -162,7 +162,7 @@ def _check_packages() -> Iterator[tuple[bool, str]]:
     try:
         requirements = requires("fantwin") or []
     except PackageNotFoundError:
-        yield False, f"fantwin is not installed; {how_to_install('fantwin')}"
+        yield False, "fantwin is not installed: in its checkout, pip install -e ."
         return
     extras: dict[str, list[str]] = {}
     for requirement in requirements:
