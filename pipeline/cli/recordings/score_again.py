@@ -23,6 +23,14 @@ SUMS = ("hours", "samples", "lost", "restarts")
 LISTS = ("not_scored", "damage", "other_version")
 """of a result, that those of many recordings have together"""
 
+_COUNTS_OF_SAMPLES = ("equal", "different", "not_made", "not_recorded", "not_comparable")
+_OTHER_COUNTS = (
+    "inputs_different",
+    *(f"alarms_{name}" for name in ("equal", "different", "not_recorded", "not_comparable")),
+    *(f"snapshots_{name}" for name in ("equal", "different", "not_comparable")),
+)
+"""fields of a `Comparison`"""
+
 
 @dataclass(frozen=True)
 class Again:
@@ -103,19 +111,8 @@ def _result(replay_input: ReplayInput, trays: Sequence[RescoredTray]) -> dict[st
     if compared:
         result["verified"] = {
             "equal": all(one.is_equal for one in compared),
-            "samples_equal": sum(one.equal for one in compared),
-            "samples_different": sum(one.different for one in compared),
-            "inputs_different": sum(one.inputs_different for one in compared),
-            "samples_not_made": sum(one.not_made for one in compared),
-            "samples_not_recorded": sum(one.not_recorded for one in compared),
-            "alarms_equal": sum(one.alarms_equal for one in compared),
-            "alarms_different": sum(one.alarms_different for one in compared),
-            "alarms_not_recorded": sum(one.alarms_not_recorded for one in compared),
-            "samples_not_comparable": sum(one.not_comparable for one in compared),
-            "alarms_not_comparable": sum(one.alarms_not_comparable for one in compared),
-            "snapshots_equal": sum(one.snapshots_equal for one in compared),
-            "snapshots_different": sum(one.snapshots_different for one in compared),
-            "snapshots_not_comparable": sum(one.snapshots_not_comparable for one in compared),
+            **{f"samples_{name}": sum(getattr(one, name) for one in compared) for name in _COUNTS_OF_SAMPLES},
+            **{name: sum(getattr(one, name) for one in compared) for name in _OTHER_COUNTS},
             "largest_difference": max(one.largest for one in compared)._asdict(),
             "left_out": list(replay_input.metadata.left_out),
             "not_comparable": [reason for one in compared for reason in one.reasons],

@@ -36,9 +36,6 @@ from fantwin.pipeline.cli.twins.training_data import (
 from fantwin.pipeline.errors import UsageError
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
     from fantwin.twin.evaluation.accuracy import Evaluation
     from fantwin.twin.evaluation.resampling import Grid
     from fantwin.twin.evaluation.residual_analysis import ResidualAnalysis
@@ -166,24 +163,18 @@ def as_json(
 
 def residual_json(analysis: ResidualAnalysis, rad_s_per_unit: float) -> dict[str, Any]:
     """One fan's residual analysis as JSON fields, the mean in the unit of the recordings."""
-    return {
-        "samples": analysis.samples,
-        "period_s": analysis.period_s,
-        "mean": _finite(analysis.mean_rad_s / rad_s_per_unit),
-        "independent_samples": _finite(analysis.independent_samples),
-        "autocorrelation_time_s": _finite(analysis.autocorrelation_time_s),
-        "white": analysis.white,
-        "ljung_box_p": _finite(analysis.ljung_box_p),
-        "ljung_box_lags": analysis.ljung_box_lags,
-        "lags_s": analysis.lags_s.tolist(),
-        "autocorrelation": _finite_list(analysis.autocorrelation),
-        "bound_95": _finite(analysis.bound_95),
-        "cross_over_bound": _finite(analysis.cross_over_bound),
-        "cross_peak_lag_s": _finite(analysis.cross_peak_lag_s),
-        "cross_lags_s": analysis.cross_lags_s.tolist(),
-        "cross_correlation": _finite_list(analysis.cross_correlation),
-        "cross_bound_95": _finite(analysis.cross_bound_95),
-    }
+    found = vars(analysis) | {"mean": analysis.mean_rad_s / rad_s_per_unit}
+    found |= {name: getattr(analysis, name) for name in ("white", "cross_over_bound", "cross_peak_lag_s")}
+    return {name: _plain(value) for name, value in found.items() if name != "mean_rad_s"}
+
+
+def _plain(value: Any) -> Any:
+    """Arrays as lists, and None for what is not finite."""
+    if hasattr(value, "tolist"):
+        value = value.tolist()
+    if isinstance(value, list):
+        return [_plain(each) for each in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _grid(text: str) -> Grid:
@@ -248,11 +239,3 @@ def _empty_table(first: str) -> Table:
 
 def _probability(value: float | None) -> str:
     return "<0.001" if value is not None and value < 0.001 else shown(value, ".3f", "-")
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
-
-
-def _finite_list(values: NDArray[np.float64]) -> list[float | None]:
-    return [_finite(value) for value in values.tolist()]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ import numpy as np
 
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.recordings.reading import read_recording
-from fantwin.schemas.enums import Transition
+from fantwin.pipeline.replay.offline.alarm_episodes import Episode, episodes
 from fantwin.schemas.messages import Alarm, Array, Grid, Raw, Score
 from fantwin.schemas.units import NS_PER_S
 
@@ -78,9 +78,9 @@ def summarise(truth_path: Path, recordings: Iterable[Path], lost_by_stage: dict[
     """
     truth = _read_truth(truth_path)
     recorded = _read(recordings)
-    faults = [_match(fault, recorded.alarms) for fault in truth["faults"]]
-    raised = [alarm for alarm in recorded.alarms if alarm.transition == Transition.RAISED]
-    false_alarms = sum(not _is_explained(alarm, truth["faults"]) for alarm in raised)
+    alarms = episodes(recorded.alarms)
+    faults = [_match(fault, alarms) for fault in truth["faults"]]
+    false_alarms = sum(not any(_explains(fault, alarm) for fault in truth["faults"]) for alarm in alarms)
     unrecorded = max(0, truth["samples_sent"] - len(recorded.samples))
     lost = unrecorded + len(recorded.grid - recorded.scored) + sum(lost_by_stage.values())
     latency_ms: dict[str, float | None] = {"p50": None, "p99": None}
@@ -123,7 +123,6 @@ def _read(recordings: Iterable[Path]) -> _Recorded:
                 recorded.latencies_ms += ((entry.received_t_ns - message.t_ns) / 1e6).tolist()
             elif isinstance(message, Alarm):
                 recorded.alarms.append(message)
-    recorded.alarms.sort(key=lambda alarm: alarm.t_ns)
     return recorded
 
 
@@ -131,30 +130,20 @@ def _named(message: Raw | Grid | Score, names: Array) -> set[tuple[str, int]]:
     return {(message.header.tray, name) for name in names.tolist()}
 
 
-def _match(fault: dict[str, Any], alarms: list[Alarm]) -> FaultSeen:
-    mine = [alarm for alarm in alarms if alarm.fan == fault["fan"] and alarm.t_ns >= fault["start_ns"]]
-    started = [a for a in mine if a.transition == Transition.RAISED and a.t_ns <= fault["stop_ns"]]
-    seen = FaultSeen(fault["fan"], fault["kind"], fault["start_ns"], fault["stop_ns"], None, None)
-    if not started:
-        return seen
-    raised_ns = started[0].t_ns
-    cleared_ns = next((a.t_ns for a in mine if a.transition == Transition.CLEARED and a.t_ns > raised_ns), None)
-    diagnoses = [a.causes[0] for a in mine if a.causes and raised_ns <= a.t_ns <= (cleared_ns or a.t_ns)]
-    first = diagnoses[-1] if diagnoses else None
-    return replace(
-        seen,
-        alarm_ns=raised_ns,
-        cleared_ns=cleared_ns,
-        cause=first.cause if first else "",
-        probability=round(first.probability, 4) if first else 0.0,
+def _match(fault: dict[str, Any], alarms: list[Episode]) -> FaultSeen:
+    times = (fault["start_ns"], fault["stop_ns"])
+    mine = (each for each in alarms if each.fan == fault["fan"] and times[0] <= each.raised_ns <= times[1])
+    alarm = next(mine, None)
+    if alarm is None:
+        return FaultSeen(fault["fan"], fault["kind"], *times, None, None)
+    cause, probability = (alarm.causes[0].cause, alarm.causes[0].probability) if alarm.causes else ("", 0.0)
+    return FaultSeen(
+        fault["fan"], fault["kind"], *times, alarm.raised_ns, alarm.cleared_ns, cause, round(probability, 4)
     )
 
 
-def _is_explained(alarm: Alarm, faults: Iterable[dict[str, Any]]) -> bool:
-    return any(
-        fault["fan"] == alarm.fan and fault["start_ns"] <= alarm.t_ns <= fault["stop_ns"] + SETTLING_NS
-        for fault in faults
-    )
+def _explains(fault: dict[str, Any], alarm: Episode) -> bool:
+    return fault["fan"] == alarm.fan and fault["start_ns"] <= alarm.raised_ns <= fault["stop_ns"] + SETTLING_NS
 
 
 def _problems(summary: Summary) -> Iterable[str]:
