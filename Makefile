@@ -56,8 +56,7 @@ schema: $(VENV)/.development
 
 reference: $(VENV)/.development
 	$(BIN)/python -m fantwin.pipeline.config.reference_page > docs/reference/configuration.md
-	$(BIN)/python -m fantwin.pipeline.cli.reference_page > docs/reference/commands.md
-	$(BIN)/python -m fantwin.pipeline.cli.reference_tables
+	$(BIN)/python -m fantwin.pipeline.cli.reference_pages
 
 twin: $(VENV)/.development
 	sh pipeline/demo/train_twin.sh $(BIN)/fantwin

@@ -19,8 +19,8 @@ from pathlib import Path
 import pandas as pd
 from scipy.io import loadmat
 
+from fantwin.pipeline.cli.in_parallel import RecordingsInParallel
 from fantwin.pipeline.cli.recordings.import_table import write_table
-from fantwin.pipeline.cli.recordings_in_parallel import RecordingsInParallel
 from fantwin.pipeline.cli.twins.training_data import Part, read_training_data
 from fantwin.pipeline.sources.tables.measured_table import RAD_S_PER_TABLE_UNIT, read_table
 from fantwin.twin.runs import Run

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Sequence
 from contextlib import suppress
@@ -16,6 +15,7 @@ import typer
 from rich.console import Console
 
 from fantwin.pipeline.cli.options import JsonOption
+from fantwin.pipeline.cli.printing import show
 from fantwin.pipeline.cli.twins.training_data import make_folder
 from fantwin.pipeline.errors import UsageError, UserError
 from fantwin.pipeline.extras import require
@@ -71,13 +71,8 @@ def export(
         tables.finish("; ".join(arrays.damage))
     written = [table.summary() for table in tables.begun.values()]
     absent = [name for name in topics if name not in {table["topic"] for table in written}]
-    if json_output:
-        typer.echo(
-            json.dumps({"tables": written, "absent": absent, "duplicated": arrays.duplicated, "damage": arrays.damage})
-        )
-    else:
-        for table in written:
-            typer.echo(f"{table['file']}: {table['rows']} rows")
+    found = {"tables": written, "absent": absent, "duplicated": arrays.duplicated, "damage": arrays.damage}
+    show(found, *(f"{table['file']}: {table['rows']} rows" for table in written), json_output=json_output)
     for name in absent:
         typer.echo(": ".join(filter(None, (f"no {name} in this recording", left_out_hint(parts, (name,))))), err=True)
     for line in arrays.damage:

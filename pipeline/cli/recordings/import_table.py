@@ -15,6 +15,7 @@ import typer
 from pydantic import ValidationError
 
 from fantwin.pipeline.cli.options import JsonOption
+from fantwin.pipeline.cli.printing import show
 from fantwin.pipeline.config.models import NAME_PATTERN
 from fantwin.pipeline.errors import UsageError, UserError
 from fantwin.pipeline.recordings.reading import TACHO_KEY
@@ -125,15 +126,12 @@ def import_table(
         tachos = _tachos(tacho or (), table.fans)
     write_table(table, output, tray, tachos)
     hints = tacho_hints(table.t_ns / NS_PER_S, table.speed_rad_s, tachos, range(table.fans))
-    if json_output:
-        typer.echo(json.dumps(import_summary(table, output) | {"hints": hints, "notes": notes}))
-        return
     fans = "1 fan" if table.fans == 1 else f"{table.fans} fans"
     period = f"{table.median_period_s * 1e3:.3g} ms apart (median)"
-    typer.echo(f"{output}: {len(table.t_ns)} samples of {fans} over {table.duration_s:.1f} s, {period}")
-    for note in (*notes, *table.notes):
-        typer.echo(f"  {note}")
-    for hint in hints:
+    line = f"{output}: {len(table.t_ns)} samples of {fans} over {table.duration_s:.1f} s, {period}"
+    lines = (line, *(f"  {note}" for note in (*notes, *table.notes)))
+    show(import_summary(table, output) | {"hints": hints, "notes": notes}, *lines, json_output=json_output)
+    for hint in hints if not json_output else ():
         typer.echo(f"hint: {hint}; see --tacho", err=True)
 
 

@@ -1,4 +1,4 @@
-"""`fantwin info`: what a recording contains, and what is missing."""
+"""`fantwin info`: what a recording contains, and what is missing; repairs it."""
 
 from __future__ import annotations
 
@@ -10,22 +10,34 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
 from fantwin.pipeline.cli.options import JsonOption
+from fantwin.pipeline.cli.printing import show, table_of
 from fantwin.pipeline.cli.progress import working
-from fantwin.pipeline.cli.recordings.repaired import repair
 from fantwin.pipeline.errors import UsageError
 from fantwin.pipeline.recordings.clips.clip import clip_lines
-from fantwin.pipeline.recordings.contents import NO_LOSS, STILL_WRITTEN, Contents, contents_of, continuity
+from fantwin.pipeline.recordings.contents import (
+    NO_LOSS,
+    STILL_WRITTEN,
+    Contents,
+    contents_of,
+    continuity,
+    messages_as_text,
+)
+from fantwin.pipeline.recordings.contents import (
+    losses as found_losses,
+)
 from fantwin.pipeline.recordings.dates import format_clock, format_local
 from fantwin.pipeline.recordings.metadata import CONFIGURATION
 from fantwin.pipeline.recordings.reading import left_out_of
 from fantwin.pipeline.recordings.records import active_path
+from fantwin.pipeline.recordings.repair import Recovery
+from fantwin.pipeline.recordings.repair import recover as recover_file
 from fantwin.pipeline.recordings.run_recordings import RECORDING_KEY, recorded_files
+from fantwin.pipeline.recordings.scan import Scan
 from fantwin.pipeline.recordings.sequence_ledger import StreamCounts, sum_by_key
 from fantwin.pipeline.site.loss_accounting import label, losses
 from fantwin.pipeline.site.refused_input import refused, refused_lines
@@ -159,14 +171,8 @@ def _part_as_json(part: Contents) -> dict[str, Any]:
 
 
 def _counts_as_json(counts: StreamCounts) -> dict[str, Any]:
-    return {
-        "messages": counts.messages,
-        "missing": counts.missing,
-        "duplicated": counts.duplicated,
-        "first_ns": counts.first_ns,
-        "last_ns": counts.last_ns,
-        "rate_hz": _rate_hz(counts),
-    }
+    names = ("messages", "missing", "duplicated", "first_ns", "last_ns")
+    return {name: getattr(counts, name) for name in names} | {"rate_hz": _rate_hz(counts)}
 
 
 def _show(parts: Sequence[Contents], breaks: Iterable[str]) -> None:
@@ -232,10 +238,8 @@ def _about(part: Contents) -> list[str]:
 
 
 def _table(part: Contents) -> Table:
-    table = Table(box=SIMPLE_HEAD, padding=0, pad_edge=False, show_edge=False)
-    table.add_column("topic", no_wrap=True)
-    for column in ("messages", "missing", "duplicated", "first", "last", "per s"):
-        table.add_column(column, justify="right", no_wrap=True)
+    columns = ("messages", "missing", "duplicated", "first", "last", "per s")
+    table = table_of(["topic"], columns, padding=0, pad_edge=False, show_edge=False)
     for key, counts in sum_by_key(part.streams.items()).items():
         missing = f"[red]{counts.missing}[/red]" if counts.missing else "0"
         rate_hz = _rate_hz(counts)
@@ -278,3 +282,57 @@ def _tray(key: str) -> str:
 
 def _time(t_ns: int | None) -> str:
     return "" if t_ns is None else format_clock(t_ns)
+
+
+def repair(file: Path, output: Path | None, *, json_output: bool) -> None:
+    """Repair a truncated or damaged recording, and print what it contains and what is missing.
+
+    output: without it the repaired recording takes the name of `file`, which is kept as `file`.original.
+
+    Raises:
+        UserError: nothing can be recovered, or it cannot be written.
+        typer.Exit: data were lost, or may have been.
+    """
+    with working(f"reading {file}"):
+        recovery = recover_file(file, output)
+    show(_repair_as_json(file, recovery), *_repair_lines(file, recovery), json_output=json_output)
+    if found_losses(recovery.found):
+        raise typer.Exit(3)
+
+
+def _repair_lines(file: Path, recovery: Recovery) -> list[str]:
+    found = recovery.found
+    if found.is_intact:
+        copied = f"; copied to {recovery.path}" if recovery.path != file else ""
+        lines = [f"{file}: intact, with {messages_as_text(found.messages)}; nothing to recover{copied}"]
+    else:
+        kept = f"; the original is kept as {recovery.original}" if recovery.original else ""
+        lines = [f"{file}: {messages_as_text(found.messages)} recovered in {recovery.path}{kept}"]
+    for topic, counts in _by_topic(found).items():
+        last = f", the last at {format_local(counts.last_ns)}" if counts.last_ns is not None else ""
+        missing = f", {counts.missing} missing" if counts.missing else ""
+        lines.append(f"  {topic}: {messages_as_text(counts.messages)}{missing}{last}")
+    lost = found_losses(found)
+    return lines + (["lost:", *(f"  {line}" for line in lost)] if lost else ["nothing was lost"])
+
+
+def _repair_as_json(file: Path, recovery: Recovery) -> dict[str, Any]:
+    """The output of --json."""
+    found = recovery.found
+    unrecorded = {} if found.is_ended else found.counts.ledger.unrecorded()
+    names = ("messages", "discarded_bytes", "damaged_chunks", "damaged_attachments", "damaged_records")
+    return {
+        "file": str(file),
+        "output": str(recovery.path),
+        "original": str(recovery.original) if recovery.original else None,
+        "was_intact": found.is_intact,
+        "had_ended": found.is_ended,
+        **{name: getattr(found, name) for name in names},
+        "topics": {topic: _counts_as_json(counts) for topic, counts in _by_topic(found).items()},
+        "published_after_the_last": {f"{key} {producer}": count for (key, producer), count in unrecorded.items()},
+        "lost": found_losses(found),
+    }
+
+
+def _by_topic(found: Scan) -> dict[str, StreamCounts]:
+    return sum_by_key(found.streams.items()) | found.counts.others

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import threading
 import time
@@ -13,9 +12,10 @@ from typing import Annotated
 
 import typer
 
+from fantwin.pipeline.cli.in_parallel import JobsOption, RecordingsInParallel, SkipBadOption
 from fantwin.pipeline.cli.options import JsonOption, SetOption
+from fantwin.pipeline.cli.printing import show
 from fantwin.pipeline.cli.progress import Reporter
-from fantwin.pipeline.cli.recordings_in_parallel import JobsOption, RecordingsInParallel, SkipBadOption
 from fantwin.pipeline.errors import UsageError, UserError
 from fantwin.pipeline.recordings.dates import format_utc
 from fantwin.pipeline.recordings.left_out import left_out_hint
@@ -132,8 +132,7 @@ def replay(
     if not 0.0 <= start < min(end, LONGEST_S) or (end > LONGEST_S and not math.isinf(end)):
         raise UsageError("--start and --end: give 0 <= --start < --end, in seconds")
     if offline:
-        from fantwin.pipeline.cli.recordings.replay_offline import run_offline  # noqa: PLC0415  loads the stages
-        from fantwin.pipeline.cli.recordings.score_again import Again  # noqa: PLC0415
+        from fantwin.pipeline.cli.recordings.replay_offline import Again, run_offline  # noqa: PLC0415  loads the stages
 
         again = Again(config, tuple(overrides or ()), twin, verify, start, end)
         run_offline(files, again, output, RecordingsInParallel(jobs, skip_bad), json_output=json_output)
@@ -156,7 +155,7 @@ def replay(
 
         shown_s = 0.0
 
-        def show(progress: Progress) -> None:
+        def show_progress(progress: Progress) -> None:
             nonlocal shown_s
             if not console.is_terminal or (time.monotonic() - shown_s < _SHOWN_EVERY_S and not progress.paused):
                 return
@@ -173,17 +172,15 @@ def replay(
                 stop,
                 loop=loop,
                 keys=keys.pressed,
-                show=show,
+                show=show_progress,
                 report=lambda line: console.print(line, markup=False, soft_wrap=True),
             )
         for line in outcome.damage:
             console.print(line, markup=False, soft_wrap=True)
         for name in outcome.behind:
             console.print(f"{name} has not received all messages: see `fantwin status`", markup=False, soft_wrap=True)
-    if json_output:
-        typer.echo(json.dumps({"files": [str(file) for file in playback.files], **asdict(outcome)}))
-    else:
-        typer.echo(_summary(outcome))
+    found = {"files": [str(file) for file in playback.files], **asdict(outcome)}
+    show(found, _summary(outcome), json_output=json_output)
     if outcome.exit_code:
         raise typer.Exit(outcome.exit_code)
 

@@ -1,26 +1,31 @@
-"""`fantwin simulate`: plays a simulated tray or a measured file on a serial line, or serves or records a simulated
-tray."""
+"""`fantwin simulate`: plays a simulated tray or a measured file on a line, or serves or records a simulated tray."""
 
 from __future__ import annotations
 
-import json
+import threading
 import time as clock
+from collections.abc import Callable
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from fantwin.pipeline.cli.options import JsonOption, SetOption
+from fantwin.pipeline.cli.printing import show
 from fantwin.pipeline.cli.progress import Reporter
 from fantwin.pipeline.cli.simulation.scenario import Scenario, read_scenario
-from fantwin.pipeline.cli.simulation.serving import serve_hwmon, serve_line
-from fantwin.pipeline.cli.simulation.simulated_hwmon import RATE_HZ, tachos_of
-from fantwin.pipeline.cli.simulation.summary import count_text, save, save_start, summary_of_file, summary_of_tray
 from fantwin.pipeline.errors import UsageError, UserError
 from fantwin.pipeline.recordings.simulated import record
-from fantwin.pipeline.sources.simulated.device import PlaybackCounts
-from fantwin.schemas.tacho import INSTANTANEOUS
+from fantwin.pipeline.runtime.signals import stop_on_signals
+from fantwin.pipeline.sources.hwmon.chips import chip_of
+from fantwin.pipeline.sources.simulated.device import PlaybackCounts, PseudoTerminal, play, wait_for_reader
+from fantwin.pipeline.sources.simulated.hwmon import FAULT_FILE, HwmonTree, play_hwmon
+from fantwin.pipeline.sources.simulated.table import TableDevice
+from fantwin.schemas import wire
+from fantwin.schemas.tacho import INSTANTANEOUS, Tacho
+from fantwin.schemas.units import RAD_S_PER_UNIT, SpeedUnit
 
 if TYPE_CHECKING:
     from fantwin.simulation.tray import SimulatedTray
@@ -109,10 +114,176 @@ def simulate(
         played = serve_line(device, link, wanted.protocol, wanted.speed_unit, on_start, wait=wait, err=json_output)
     summary = summary_of(played, complete=True)
     save(truth, summary)
-    typer.echo(json.dumps(summary) if json_output else count_text(played))
+    show(summary, count_text(played), json_output=json_output)
 
 
 def _length_s(wanted: Scenario) -> float:
     if wanted.duration_s is None:
         raise UsageError("a recording needs its length in seconds: --duration S")
     return wanted.duration_s
+
+
+def serve_line(
+    device: SimulatedTray | TableDevice,
+    link: Path | None,
+    protocol: wire.Protocol,
+    speed_unit: SpeedUnit,
+    on_start: Callable[[int], None],
+    *,
+    wait: bool,
+    err: bool,
+) -> PlaybackCounts:
+    """Play the device on a pseudo-terminal. wait: for a reader. err: say on stderr where it is."""
+    stop = threading.Event()
+    stop_on_signals(stop)
+    line = PseudoTerminal(link)
+    try:
+        fans_on = "1 fan on" if device.fans == 1 else f"{device.fans} fans on"
+        typer.echo(f"{fans_on} {link or line.port}: {protocol}, speeds in {speed_unit}", err=err)
+        if wait:
+            wait_for_reader(line, protocol, stop)
+        return play(device, line, protocol, RAD_S_PER_UNIT[speed_unit], stop, on_start)
+    finally:
+        line.close()
+
+
+def serve_hwmon(tray: SimulatedTray, root: Path, chip: str, *, err: bool) -> PlaybackCounts:
+    """Run the tray behind a tree of files until Ctrl-C. err: say where on stderr."""
+    stop = threading.Event()
+    stop_on_signals(stop)
+    tree = HwmonTree(root, chip, tray.fans)
+    try:
+        typer.echo(
+            f"{tray.fans} fans of {chip} in {root}; faults: echo tacho-stuck:fan=0 > {root / FAULT_FILE}", err=err
+        )
+        return play_hwmon(tray, tree, stop, InjectedFaults(tray, root).follow)
+    finally:
+        tree.close()
+
+
+RATE_HZ = 20.0
+"""at which the files are served"""
+
+
+def tachos_of(chip: str) -> tuple[Tacho, ...]:
+    """The tacho behind the driver of a chip; instantaneous where it is not known, with a note if the chip is not."""
+    row = chip_of(chip)
+    if row is None:
+        typer.echo(f"note: the driver of chip {chip!r} is not known: readings are instantaneous", err=True)
+    return (row.tacho,) if row and row.tacho else INSTANTANEOUS
+
+
+class InjectedFaults:
+    """The faults that a file names, one a line as on the command line, besides those of the schedule.
+
+    They begin when the file is written, and end when it no longer names them.
+    """
+
+    def __init__(self, tray: SimulatedTray, root: Path) -> None:
+        self._tray = tray
+        self._file = root / FAULT_FILE
+        self._modified_ns = 0
+        self._active: dict[str, int] = {}
+        """number of the fault in the schedule, by its line"""
+
+    def follow(self) -> None:
+        """Read the file again if it has changed."""
+        try:
+            modified_ns = self._file.stat().st_mtime_ns
+            if modified_ns == self._modified_ns:
+                return
+            lines = [line.strip() for line in self._file.read_text(encoding="utf-8", errors="replace").splitlines()]
+        except OSError:
+            return
+        self._modified_ns = modified_ns
+        wanted = dict.fromkeys(filter(None, lines))
+        for line in [line for line in self._active if line not in wanted]:
+            self._end(self._active.pop(line))
+            typer.echo(f"fault removed: {line}", err=True)
+        for line in wanted:
+            if line not in self._active:
+                self._begin(line)
+
+    def _begin(self, line: str) -> None:
+        from fantwin.simulation.errors import SimulationError  # noqa: PLC0415  loaded only by the commands that need it
+        from fantwin.simulation.faults import parse_fault  # noqa: PLC0415
+
+        tray = self._tray
+        faults = tray.settings.faults
+        try:
+            fault = parse_fault(line)
+            begun = replace(fault, start_s=fault.start_s + tray.t_s, stop_s=fault.stop_s + tray.t_s)
+            tray.set_faults((*faults, begun))
+        except SimulationError as error:
+            typer.echo(f"{self._file}: {error}", err=True)
+            return
+        self._active[line] = len(faults)
+        typer.echo(f"fault injected: {line}", err=True)
+
+    def _end(self, number: int) -> None:
+        faults = list(self._tray.settings.faults)
+        faults[number] = replace(faults[number], stop_s=max(self._tray.t_s, faults[number].start_s + 1e-3))
+        self._tray.set_faults(tuple(faults))
+
+
+Summary = dict[str, Any]
+
+
+def _counts(played: PlaybackCounts) -> Summary:
+    counts = asdict(played)
+    del counts["start_ns"]
+    return counts
+
+
+def summary_of_tray(tray: SimulatedTray, played: PlaybackCounts, *, complete: bool) -> Summary:
+    """The ground truth of a simulated tray, and how many of its samples were sent, dropped and lost."""
+    from fantwin.simulation.truth import truth  # noqa: PLC0415
+
+    return truth(tray, played.start_ns, complete=complete, counts=_counts(played))
+
+
+def summary_of_file(path: Path, table: TableDevice, played: PlaybackCounts, *, complete: bool) -> Summary:
+    """The same for a played file, whose faults are not known."""
+    return {
+        "complete": complete,
+        "start_ns": played.start_ns,
+        **_counts(played),
+        "faults": [],
+        "fans": table.fans,
+        "file": str(path),
+    }
+
+
+def save(path: Path | None, summary: Summary) -> None:
+    """Write the summary, where a file is named.
+
+    Raises:
+        UserError: it cannot be written.
+    """
+    from fantwin.simulation.truth import write_truth  # noqa: PLC0415
+
+    if path is None:
+        return
+    try:
+        write_truth(path, summary)
+    except OSError as error:
+        raise UserError(f"{path}: cannot be written: {error.strerror}; name another file with --truth") from error
+
+
+def save_start(path: Path | None, summary_of: Callable[..., Summary], start_ns: int) -> None:
+    """Write the summary with the start of the playback, ns since the epoch, before any sample is counted."""
+    save(path, summary_of(PlaybackCounts(start_ns=start_ns), complete=False))
+
+
+def count_text(played: PlaybackCounts) -> str:
+    """How many samples were sent, dropped and lost, in one line."""
+    parts = [f"{played.samples_sent} samples sent"]
+    if played.samples_dropped:
+        parts.append(f"{played.samples_dropped} lost as simulated")
+    if played.samples_unsent:
+        parts.append(f"{played.samples_unsent} not sent because no program read the port, or too slowly")
+    if played.bytes_unread:
+        parts.append(f"the last {played.bytes_unread} bytes were not read")
+    if played.samples_late:
+        parts.append(f"{played.samples_late} sent late, by up to {played.worst_lateness_s * 1e3:.0f} ms")
+    return "; ".join(parts)

@@ -14,13 +14,11 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
+from fantwin.pipeline.cli.in_parallel import JobsOption, RecordingsInParallel, SkipBadOption
 from fantwin.pipeline.cli.options import JsonOption, SetOption
 from fantwin.pipeline.cli.progress import interruptible, show_part
-from fantwin.pipeline.cli.recordings_in_parallel import JobsOption, RecordingsInParallel, SkipBadOption
-from fantwin.pipeline.cli.twins.calibration_check import Check, check_declared_rate
 from fantwin.pipeline.cli.twins.drops_found import drop_lines, drops_found
-from fantwin.pipeline.cli.twins.marked_running import marked_running
-from fantwin.pipeline.cli.twins.outlier_run_check import outlier_warnings
+from fantwin.pipeline.cli.twins.healthy_evidence import Check, check_declared_rate, marked_running, outlier_warnings
 from fantwin.pipeline.cli.twins.training_data import FromOption, ToOption, twin_errors
 from fantwin.pipeline.errors import UsageError, UserError
 from fantwin.pipeline.files import replace_file

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import replace
@@ -11,13 +10,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.box import SIMPLE_HEAD
-from rich.console import Console
 from rich.table import Table
 
+from fantwin.pipeline.cli.in_parallel import JobsOption, RecordingsInParallel, SkipBadOption
 from fantwin.pipeline.cli.options import JsonOption, fan_numbers
+from fantwin.pipeline.cli.printing import table_of
 from fantwin.pipeline.cli.progress import interruptible
-from fantwin.pipeline.cli.recordings_in_parallel import JobsOption, RecordingsInParallel, SkipBadOption
 from fantwin.pipeline.cli.twins.figures import figures_in, sentence, shown
 from fantwin.pipeline.cli.twins.training_data import (
     FansOption,
@@ -92,11 +90,9 @@ def evaluate(
     result = as_json(
         summary, assessment, [(grid, of.evaluation()) for grid, of in zip(grids, on_grids, strict=True)], about
     )
-    if json_output:
-        typer.echo(json.dumps(result | pool.as_json()))
-    else:
-        _print(result)
-    pool.end()
+    lines = (result["headline"], sentence(result, result["speed_unit"]), _fan_table(result))
+    grid_tables = [_grid_table(result)] if grids else []
+    pool.end_with(result, *lines, *grid_tables, warnings=result["warnings"], json_output=json_output)
 
 
 def _known_of(path: Path, part: Part) -> tuple[TrainingData, Extent]:
@@ -124,16 +120,6 @@ def _sums_of(path: Path, part: Part, twin: Path, extent: Extent, grids: Sequence
 
 def _added(sums: list[Any], others: list[Any]) -> list[Any]:
     return [one + other for one, other in zip(sums, others, strict=True)]
-
-
-def _print(result: dict[str, Any]) -> None:
-    typer.echo(f"{result['headline']}\n{sentence(result, result['speed_unit'])}")
-    console = Console()
-    console.print(_fan_table(result))
-    if result["grids"]:
-        console.print(_grid_table(result))
-    for warning in result["warnings"]:
-        typer.echo(warning, err=True)
 
 
 def as_json(
@@ -191,18 +177,9 @@ def _grid(text: str) -> Grid:
 
 def _fan_table(result: dict[str, Any]) -> Table:
     unit = result["speed_unit"]
-    table = _empty_table("fan")
-    expected = f"in ±2σ\n({EXPECTED_COVERAGE:.1%})"
-    for header in (
-        f"rmse\n{unit}",
-        f"max error\n{unit}",
-        "R2",
-        f"one step\n{unit}",
-        expected,
-        "white p",
-        "cross\n/ bound",
-    ):
-        table.add_column(header, justify="right", no_wrap=True)
+    figures = (f"rmse\n{unit}", f"max error\n{unit}", "R2", f"one step\n{unit}")
+    tests = (f"in ±2σ\n({EXPECTED_COVERAGE:.1%})", "white p", "cross\n/ bound")
+    table = table_of(["fan"], (*figures, *tests), padding=0)  # narrow: numbers are whole on a terminal of 80 columns
     for figures in result["fans"]:
         residual = figures["residual"]
         tests = (_probability(residual["ljung_box_p"]), shown(residual["cross_over_bound"], ".1f", "-"))
@@ -215,9 +192,8 @@ def _fan_table(result: dict[str, Any]) -> Table:
 def _grid_table(result: dict[str, Any]) -> Table:
     """Figures of all fans together on the recorded grid and on the others."""
     unit = result["speed_unit"]
-    table = _empty_table("grid")
-    for header in ("samples", f"rmse\n{unit}", f"max error\n{unit}", "R2", f"one step\n{unit}", "in ±2σ"):
-        table.add_column(header, justify="right", no_wrap=True)
+    figures = ("samples", f"rmse\n{unit}", f"max error\n{unit}", "R2", f"one step\n{unit}", "in ±2σ")
+    table = table_of(["grid"], figures, padding=0)
     for grid in ({"rate": None} | result, *result["grids"]):
         rate = grid["rate"]
         name = "recorded" if rate is None else rate if rate == "irregular" else f"{rate:g} Hz"
@@ -228,13 +204,6 @@ def _grid_table(result: dict[str, Any]) -> Table:
 def _cells(figures: dict[str, Any]) -> tuple[str, ...]:
     formats = {"rmse": ".4g", "max_error": ".4g", "r2": ".4f", "one_step_rmse": ".4g", "coverage_2_sigma": ".1%"}
     return tuple(shown(figures[name], form, "-") for name, form in formats.items())
-
-
-def _empty_table(first: str) -> Table:
-    """Narrow, so that numbers are whole on a terminal of 80 columns."""
-    table = Table(box=SIMPLE_HEAD, padding=0)
-    table.add_column(first, no_wrap=True)
-    return table
 
 
 def _probability(value: float | None) -> str:

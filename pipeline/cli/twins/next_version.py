@@ -23,7 +23,6 @@ import numpy as np
 
 from fantwin.pipeline.cli.twins.calibrate import calibrate
 from fantwin.pipeline.cli.twins.drops_found import drops_found
-from fantwin.pipeline.cli.twins.excerpts import read_excerpts
 from fantwin.pipeline.cli.twins.fan_changes import (
     changed_fans,
     changes_from_list,
@@ -34,7 +33,14 @@ from fantwin.pipeline.cli.twins.fan_changes import (
 )
 from fantwin.pipeline.cli.twins.train import fit_twin
 from fantwin.pipeline.cli.twins.training_data import TrainingData, twin_errors
-from fantwin.pipeline.cli.twins.version_data import Split, newest_long, newest_recordings, split, spread_parts
+from fantwin.pipeline.cli.twins.version_data import (
+    Split,
+    newest_long,
+    newest_recordings,
+    read_excerpts,
+    split,
+    spread_parts,
+)
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.files import replace_file
 from fantwin.pipeline.learning.healthy_history import healthy_recordings, recordings_near_alarms

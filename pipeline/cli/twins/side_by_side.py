@@ -7,21 +7,19 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-import typer
-from rich import box
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from fantwin.pipeline.cli.in_parallel import RecordingsInParallel
 from fantwin.pipeline.cli.options import make_folder
+from fantwin.pipeline.cli.printing import table_of
 from fantwin.pipeline.cli.progress import training_progress
-from fantwin.pipeline.cli.recordings_in_parallel import RecordingsInParallel
 from fantwin.pipeline.cli.twins.figures import figures_in, shown
 from fantwin.pipeline.cli.twins.training_data import TrainingData, data_cards
 from fantwin.pipeline.errors import UsageError, UserError
 
 if TYPE_CHECKING:
-    from fantwin.twin.comparison import Candidate, Contender, Source
+    from fantwin.twin.comparison import Candidate, Contender
 
 Data: TypeAlias = tuple[TrainingData, TrainingData | None, TrainingData | None]
 """of training, of validation and of the test"""
@@ -87,27 +85,13 @@ def train_side_by_side(
         "warnings": training_data.with_fan_numbers(winner.twin.identification.warnings if winner.twin else []),
     }
     _write(folder / "comparison.json", json.dumps(result, indent=2) + "\n")
-    if json_output:
-        typer.echo(json.dumps(result | pool.as_json()))
-    else:
-        _print(result, folder)
-    pool.end()
-
-
-def _print(result: dict[str, Any], folder: Path) -> None:
-    source: Source = result["evaluated_on"]
-    Console().print(table(result))
-    typer.echo(f"* best: smallest free-run rmse over {SOURCE_MEANING[source]}.")
-    if floor := next(
-        its["figures"][source]["tacho_floor"] for its in result["models"] if its["model"] == result["best"]
-    ):
-        typer.echo(f"The tacho alone would leave a perfect model an rmse of {shown(floor)} {result['speed_unit']}.")
-    typer.echo(f"{folder}: the twins and comparison.json")
-    for its in result["models"]:
-        if its["invalid_reason"]:
-            typer.echo(f"{its['title']}: not trained: {its['invalid_reason']}", err=True)
-    for warning in result["warnings"]:
-        typer.echo(warning, err=True)
+    lines = [f"* best: smallest free-run rmse over {SOURCE_MEANING[source]}."]
+    if floor := next(m["figures"][source]["tacho_floor"] for m in result["models"] if m["model"] == result["best"]):
+        lines.append(f"The tacho alone would leave a perfect model an rmse of {shown(floor)} {result['speed_unit']}.")
+    lines.append(f"{folder}: the twins and comparison.json")
+    failed = (f"{m['title']}: not trained: {m['invalid_reason']}" for m in result["models"] if m["invalid_reason"])
+    warnings = (*failed, *result["warnings"])
+    pool.end_with(result, table(result), *lines, warnings=warnings, json_output=json_output)
 
 
 def as_json(contender: Contender, training_data: TrainingData, folder: Path) -> dict[str, Any]:
@@ -137,11 +121,9 @@ def table(result: dict[str, Any]) -> Table:
     """The models side by side: all figures over the data that decide the comparison, the rmse over all data."""
     source, unit = result["evaluated_on"], result["speed_unit"]
     sources = [name for name in ("held-out", "test") if any(name in m.get("figures", {}) for m in result["models"])]
-    rows = Table(box=box.SIMPLE_HEAD, padding=0, caption=f"rmse and error in {unit}", caption_justify="left")
-    rows.add_column("model", no_wrap=True)
     rmse = (SOURCE_HEADER[name] for name in sources)
-    for header in ("para-\nmeters", "train\nrmse", *rmse, "max\nerror", "R2", "in\n±2σ", "1-step\nrmse", "train\ns"):
-        rows.add_column(header, justify="right", no_wrap=True)
+    columns = ("para-\nmeters", "train\nrmse", *rmse, "max\nerror", "R2", "in\n±2σ", "1-step\nrmse", "train\ns")
+    rows = table_of(["model"], columns, padding=0, caption=f"rmse and error in {unit}")
     for its in result["models"]:
         if its["invalid_reason"]:
             rows.add_row(escape(its["title"]), *("-" for _ in rows.columns[1:]))

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -12,10 +11,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
 
 import typer
 
-from fantwin.pipeline.cli.networks_in_parallel import NetworksInParallel
+from fantwin.pipeline.cli.in_parallel import JobsOption, NetworksInParallel, RecordingsInParallel, SkipBadOption
 from fantwin.pipeline.cli.options import JsonOption
 from fantwin.pipeline.cli.progress import interruptible, training_progress
-from fantwin.pipeline.cli.recordings_in_parallel import JobsOption, RecordingsInParallel, SkipBadOption
 from fantwin.pipeline.cli.twins.figures import figures_in, sentence, shown
 from fantwin.pipeline.cli.twins.side_by_side import Data, train_side_by_side
 from fantwin.pipeline.cli.twins.training_data import (
@@ -177,11 +175,8 @@ def train(
     result = as_json(trained, training_data, output)
     if type_twin:
         result |= {"of_type": trained.card.training.of_type}
-    if json_output:
-        typer.echo(json.dumps(result | pool.as_json()))
-    else:
-        _print(result, training_data, trained.card.conditions)
-    pool.end()
+    lines = _lines(result, training_data, trained.card.conditions)
+    pool.end_with(result, *lines, warnings=result["warnings"], json_output=json_output)
 
 
 def _read(
@@ -226,17 +221,17 @@ def _place(
     )
 
 
-def _print(result: dict[str, Any], training_data: TrainingData, conditions: ReferenceConditions | None) -> None:
+def _lines(
+    result: dict[str, Any], training_data: TrainingData, conditions: ReferenceConditions | None
+) -> Iterator[str]:
     networks = f"{result['network_parameters']} network parameters"
     of = f"the type of {result['of_type']}" if "of_type" in result else networks
-    typer.echo(f"{result['twin']}: {result['model']} of {result['fans']} fan(s), {of}")
-    typer.echo(f"  {result['evaluated_on']} data, {sentence(result, training_data.speed_unit)}")
-    typer.echo(f"  {balance_sentence(result)}")
+    yield f"{result['twin']}: {result['model']} of {result['fans']} fan(s), {of}"
+    yield f"  {result['evaluated_on']} data, {sentence(result, training_data.speed_unit)}"
+    yield f"  {balance_sentence(result)}"
     if conditions:
         columns = f"column{'s' * (len(conditions.needed) > 1)} {' and '.join(conditions.needed)}"
-        typer.echo(f"  allows for {conditions.in_words}, and needs the {columns}")
-    for warning in result["warnings"]:
-        typer.echo(warning, err=True)
+        yield f"  allows for {conditions.in_words}, and needs the {columns}"
 
 
 def fit_twin(

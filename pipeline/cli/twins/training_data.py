@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Annotated, TypeAlias
 import typer
 from pydantic import ValidationError
 
+from fantwin.pipeline.cli.in_parallel import RecordingsInParallel
 from fantwin.pipeline.cli.options import fan_numbers, make_folder
-from fantwin.pipeline.cli.recordings_in_parallel import RecordingsInParallel
 from fantwin.pipeline.errors import UsageError, UserError
 from fantwin.pipeline.recordings.checksum import sha256_of
 from fantwin.pipeline.recordings.remote import matching, recording_path

@@ -1,16 +1,194 @@
-"""Which parts of the healthy history the next version of a twin is trained, validated, compared and checked on."""
+"""Parts of the healthy history: those that the next version of a twin is trained, validated, compared and checked on.
+
+Windows are chosen by how much they show of a fan: the sum of the square roots of the time in each tenth of the range of
+its commands, and of the changes into each. The next minute at a command shows less than the first one, and a command
+that is rare counts.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
+import typer
+from numpy.typing import NDArray
 
-from fantwin.pipeline.cli.twins.excerpts import MOST_HZ, Excerpt
-from fantwin.pipeline.cli.twins.windows import Windows, joined, windows_of
+from fantwin.pipeline.cli.twins.training_data import TrainingData, joined, training_data_of, twin_errors
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.learning.history_recordings import HistoryRecording
+from fantwin.pipeline.recordings.excerpts import ExcerptReader
+
+if TYPE_CHECKING:
+    from fantwin.schemas.messages import Array
+
+MOST_HZ = 100.0
+"""samples of faster lines are thinned to at most about this rate, that of the fastest grid by default"""
+NEARLY = 0.05
+"""a rate that is higher by this share is not thinned"""
+
+
+@dataclass(frozen=True)
+class Excerpt:
+    """A part of a recording, in seconds since its first sample."""
+
+    path: Path
+    from_s: float
+    to_s: float
+
+
+def read_excerpts(excerpts: Iterable[Excerpt]) -> TrainingData:
+    """The samples of excerpts together, those of fast lines thinned. Damage is reported on stderr.
+
+    Raises:
+        UserError: they cannot be read, or are not in one unit.
+    """
+    return joined(list(each_excerpt(excerpts)))
+
+
+def each_excerpt(excerpts: Iterable[Excerpt]) -> Iterator[TrainingData]:
+    """The samples of each excerpt by itself. Raises as `read_excerpts`."""
+    path, reader = None, None
+    for excerpt in excerpts:
+        if reader is None or excerpt.path != path:
+            path, reader = excerpt.path, ExcerptReader(excerpt.path)
+        found = reader.read(excerpt.from_s, excerpt.to_s)
+        if found.damage:
+            typer.echo(found.damage, err=True)
+        yield _thinned(training_data_of(found))
+
+
+def _thinned(data: TrainingData) -> TrainingData:
+    with twin_errors():
+        from fantwin.twin.evaluation.resampling import thinned  # noqa: PLC0415  the command line loads twin only when it is needed
+
+        runs = [thinned(run, every_of(1.0 / run.median_period_s)) for run in data.runs]
+    sources = [replace(source, samples=run.samples) for source, run in zip(data.sources, runs, strict=True)]
+    return replace(data, runs=runs, sources=sources)
+
+
+def every_of(rate_hz: float) -> int:
+    """Of how many samples of a line one is used."""
+    return max(1, math.ceil(rate_hz / MOST_HZ - NEARLY))
+
+
+LOOK_S = 1.0
+"""between two commands that are looked at"""
+TENTHS = 10
+"""equal parts of the range of a fan's commands"""
+CHANGE_COUNTS_S = 10.0
+"""a change by more than a tenth counts as so many seconds at a command"""
+ROUNDING = 1e-6
+LEAST_KNOWN = 0.5
+"""of the samples of other windows: with fewer a window is not used"""
+
+
+@dataclass(frozen=True, eq=False)
+class Windows:
+    """Windows of equal length, in order of time.
+
+    activity: (windows, fans, 2 x TENTHS) seconds in each tenth of the range of a fan's commands, and changes into each.
+    """
+
+    excerpts: tuple[Excerpt, ...]
+    activity: Array
+
+    def __len__(self) -> int:
+        return len(self.excerpts)
+
+    def of(self, wanted: NDArray[np.intp] | NDArray[np.bool_]) -> Windows:
+        """Some of them, by index or flag."""
+        numbers = np.arange(len(self))[wanted]
+        return replace(
+            self, excerpts=tuple(self.excerpts[k] for k in numbers.tolist()), activity=self.activity[numbers]
+        )
+
+    def chosen(self, count: int) -> Windows:
+        """At most so many: half of them evenly spread, the others those that add most to what these show.
+
+        Always the same ones for the same windows.
+        """
+        if len(self) <= count:
+            return self
+        spread = ((np.arange(count // 2) + 0.5) * len(self) / (count // 2)).astype(np.intp)
+        taken = np.zeros(len(self), np.bool_)
+        taken[spread] = True
+        shown = self.activity[spread].sum(axis=0)
+        order = np.random.default_rng(0).permutation(len(self))  # equal ones are not neighbours
+        for _ in range(count - len(spread)):
+            left = order[~taken[order]]
+            gain = np.sqrt(shown + self.activity[left]).sum(axis=(1, 2))
+            best = left[np.argmax(gain)]
+            taken[best] = True
+            shown = shown + self.activity[best]
+        return self.of(taken)
+
+    @property
+    def tenths(self) -> Array:
+        """(fans,) how many tenths of its range the command of each fan is in for some seconds."""
+        return (self.activity[:, :, :TENTHS].sum(axis=0) >= CHANGE_COUNTS_S).sum(axis=1)
+
+
+def windows_of(recordings: Sequence[HistoryRecording], window_s: float) -> Windows:
+    """Successive windows of the recordings, without those that lack many samples.
+
+    Raises:
+        UserError: a recording cannot be read, or the number of fans changes.
+    """
+    traces = [ExcerptReader(each.path).commands(LOOK_S) for each in recordings]
+    commands = np.concatenate([command for _, command in _of_one_number_of_fans(traces)])
+    low, high = np.nanmin(commands, axis=0), np.nanmax(commands, axis=0)
+    width = np.where(high > low, (high - low) / TENTHS, 1.0)
+    excerpts: list[Excerpt] = []
+    activity: list[Array] = []
+    known: list[Array] = []
+    for each, (t_s, command) in zip(recordings, traces, strict=True):
+        count = max(1, int(each.seconds / window_s + ROUNDING))
+        excerpts += [Excerpt(each.path, k * window_s, (k + 1) * window_s) for k in range(count)]
+        window = np.clip(t_s // window_s, 0, count).astype(np.intp)
+        activity.append(_activity(window, (command - low) / width, count))
+        known.append(np.bincount(window, minlength=count + 1)[:count])
+    samples = np.concatenate(known)
+    found = Windows(tuple(excerpts), np.concatenate(activity))
+    return found.of(samples >= max(2.0, LEAST_KNOWN * float(np.median(samples))))
+
+
+def joined_excerpts(excerpts: Sequence[Excerpt]) -> tuple[Excerpt, ...]:
+    """The same parts of recordings, adjoining ones as one."""
+    parts: list[Excerpt] = []
+    for each in excerpts:
+        if parts and parts[-1].path == each.path and parts[-1].to_s == each.from_s:
+            parts[-1] = replace(parts[-1], to_s=each.to_s)
+        else:
+            parts.append(each)
+    return tuple(parts)
+
+
+def _of_one_number_of_fans(traces: Sequence[tuple[Array, Array]]) -> Sequence[tuple[Array, Array]]:
+    fans = {command.shape[1] for _, command in traces}
+    if len(fans) > 1:
+        numbers = " and ".join(map(str, sorted(fans)))
+        raise UserError(f"the healthy history has recordings of {numbers} fans: mark those of other fans as faulty")
+    return traces
+
+
+def _activity(window: NDArray[np.intp], place: Array, count: int) -> Array:
+    """(count, fans, 2 x TENTHS). window: (n,) of each sample. place: (n, fans) in the range, from 0 to TENTHS."""
+    fans = place.shape[1]
+    found = np.zeros((count + 1, fans, 2 * TENTHS))  # the last one: what is after the last window
+    known = np.isfinite(place)
+    tenth = np.clip(np.where(known, place, 0.0), 0, TENTHS - 1).astype(np.intp)
+    at = (np.broadcast_to(window[:, np.newaxis], tenth.shape), np.broadcast_to(np.arange(fans), tenth.shape))
+    np.add.at(found, (*at, tenth), np.where(known, LOOK_S, 0.0))
+    changed = np.abs(np.diff(place, axis=0)) > 1.0  # False where one is not known
+    changed &= (np.diff(window) == 0)[:, np.newaxis]
+    into = tuple(index[1:] for index in (*at, TENTHS + tenth))
+    np.add.at(found, into, np.where(changed, CHANGE_COUNTS_S, 0.0))
+    return found[:count]
+
 
 WINDOW_S = 60.0
 """long enough for many time constants of a fan; windows are longer where samples are few"""
@@ -69,7 +247,7 @@ def split(recordings: Sequence[HistoryRecording], rate_hz: float, fans: int) -> 
         training, held_out = windows.of(~is_kept_out), windows.of(is_kept_out)
     most = int(MOST_READINGS / (fans * rate_hz * window_s))
     trained = training.chosen(min(max(most, LEAST_WINDOWS), MOST_WINDOWS))
-    return Split(joined(trained.excerpts), *_halves(held_out))
+    return Split(joined_excerpts(trained.excerpts), *_halves(held_out))
 
 
 def _halves(held_out: Windows) -> tuple[tuple[Excerpt, ...], tuple[Excerpt, ...]]:

@@ -12,6 +12,7 @@ import typer
 from rich.console import Console
 from rich.text import Text
 
+from fantwin.pipeline.cli.printing import duration_text
 from fantwin.pipeline.cli.progress import working
 from fantwin.pipeline.config.models import Config
 from fantwin.pipeline.config.shards import own_file, shards_of
@@ -92,7 +93,8 @@ def _dated(rate: ObservedRate) -> str:
 
 def _line(alarm: Episode) -> Text:
     """One alarm, for people."""
-    lasted = f"for {_length(alarm.cleared_ns - alarm.onset_ns)}" if alarm.cleared_ns is not None else "not over"
+    length_s = None if alarm.cleared_ns is None else (alarm.cleared_ns - alarm.onset_ns) / NS_PER_S
+    lasted = "not over" if length_s is None else f"for {duration_text(length_s)}"
     cause = f"  {with_share(alarm.causes[0])}" if alarm.causes else ""
     by = f" by {alarm.feedback_by}" if alarm.feedback_by else ""
     reason = f": {alarm.feedback_reason}" if alarm.feedback_reason else ""
@@ -103,14 +105,6 @@ def _line(alarm: Episode) -> Text:
         f"  {lasted}{cause}  ",
         (said, "" if alarm.feedback == Feedback.NONE else "bold"),
     )
-
-
-def _length(length_ns: int) -> str:
-    seconds = length_ns / NS_PER_S
-    for unit, size in (("h", 3600), ("min", 60)):
-        if seconds >= 2 * size:
-            return f"{seconds / size:.0f} {unit}"
-    return f"{seconds:.1f} s"
 
 
 def _recorded(paths: Sequence[Path]) -> _Past:

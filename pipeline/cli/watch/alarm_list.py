@@ -15,7 +15,8 @@ from rich.console import Console
 from rich.text import Text
 
 from fantwin.pipeline.bus.session import Bus
-from fantwin.pipeline.cli.watch.live_stages import wait_for_stages
+from fantwin.pipeline.cli.printing import duration_text
+from fantwin.pipeline.cli.watch.scorers import wait_for_stages
 from fantwin.pipeline.config.models import Config
 from fantwin.pipeline.config.roles import roles_of
 from fantwin.pipeline.config.shards import process_list
@@ -140,7 +141,9 @@ def alarm_lines(current: CurrentAlarm, now: str = "") -> Text:
     style = _STYLES.get(alarm.severity, "bold red") if is_presented(alarm) else "dim"
     text = Text.assemble((f"{name_of(alarm)}  {alarm.severity.name:7}", style), f"  {', '.join(words)}")
     if alarm.severity != Severity.NONE:
-        text.append(f"  since {clock(alarm.onset_t_ns)} ({_age(time.time_ns() - alarm.onset_t_ns)})")
+        text.append(
+            f"  since {clock(alarm.onset_t_ns)} ({duration_text(max(0, time.time_ns() - alarm.onset_t_ns) / NS_PER_S)})"
+        )
     if current.causes:
         evidence = current.causes[0].evidence
         is_shown = not evidence or evidence in current.message
@@ -173,11 +176,3 @@ def probable(causes: Iterable[Diagnosis]) -> str:
     return ", ".join(
         with_share(each) for number, each in enumerate(causes) if not number or each.probability >= MIN_PROBABILITY
     )
-
-
-def _age(age_ns: int) -> str:
-    seconds = max(0, age_ns // NS_PER_S)
-    for unit, size in (("d", 86400), ("h", 3600), ("min", 60)):
-        if seconds >= 2 * size:
-            return f"{seconds // size} {unit}"
-    return f"{seconds} s"

@@ -19,8 +19,7 @@ from fantwin.pipeline.bus.session import join_bus
 from fantwin.pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
 from fantwin.pipeline.cli.watch.alarm_history import show_history
 from fantwin.pipeline.cli.watch.alarm_list import show_list, word
-from fantwin.pipeline.cli.watch.live_stages import wait_for_stages
-from fantwin.pipeline.cli.watch.request import ask
+from fantwin.pipeline.cli.watch.scorers import ask, wait_for_stages
 from fantwin.pipeline.config.loading import load_config
 from fantwin.pipeline.config.models import Config
 from fantwin.pipeline.config.roles import OPERATOR, roles_of

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import glob
-import json
 import re
 import socket
 from collections.abc import Iterable, Sequence
@@ -15,9 +14,6 @@ from typing import Annotated
 
 import typer
 from cryptography.hazmat.primitives.serialization import Encoding
-from rich.box import SIMPLE_HEAD
-from rich.console import Console
-from rich.table import Table
 
 from fantwin.pipeline.bus.credentials import of_role, warning
 from fantwin.pipeline.certificates import (
@@ -31,6 +27,7 @@ from fantwin.pipeline.certificates import (
     write_pair,
 )
 from fantwin.pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
+from fantwin.pipeline.cli.printing import show, table_of
 from fantwin.pipeline.config.loading import load_config
 from fantwin.pipeline.config.models import ROLE_PLACE, Config, SecurityConfig, nearest
 from fantwin.pipeline.config.roles import default_roles, roles_of
@@ -131,16 +128,14 @@ def certs(
     if action is Action.INIT and (roles or tray):
         raise UsageError("init takes no role: it makes the authority; `fantwin certs issue` makes certificates")
     made, kept = {Action.INIT: _init, Action.ISSUE: _issue, Action.RENEW: _renew}[action](request)
-    if json_output:
-        typer.echo(json.dumps({"made": [_as_json(each) for each in made], "kept": [str(path) for path in kept]}))
-        return
-    for each in made:
-        what = "authority" if each.is_authority else f"certificate of {each.role}"
-        typer.echo(f"{_shown(each.path)}: {what}, until {in_words(each.not_after)}")
-    for path in kept:
-        typer.echo(f"{_shown(path)}: exists, left as it is")
-    if action is not Action.RENEW:
-        _say_what_is_next(request, action)
+    found = {"made": [_as_json(each) for each in made], "kept": [str(path) for path in kept]}
+    lines = [
+        f"{_shown(each.path)}: {'authority' if each.is_authority else f'certificate of {each.role}'}, "
+        f"until {in_words(each.not_after)}"
+        for each in made
+    ]
+    lines += [f"{_shown(path)}: exists, left as it is" for path in kept]
+    show(found, *lines, *_next_steps(settings, action), json_output=json_output)
 
 
 def _with_trays(config: Config, roles: Sequence[str], trays: Sequence[str]) -> list[str]:
@@ -256,22 +251,15 @@ def _show(request: _Request, *, json_output: bool) -> None:
     if not found:
         raise UserError(f"{request.security.certificate.parent}: no certificates: start with `fantwin certs init`")
     now, roles = datetime.now(UTC), roles_of(request.config)
-    if json_output:
-        typer.echo(json.dumps([_as_json(each) for each in found]))
-    else:
-        table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
-        columns = ("role", "until", "days", "used by", *(["hosts"] if request.roles else []))
-        for column in columns:
-            table.add_column(column, overflow="fold")
-        for each in found:
-            known = roles.get(each.role)
-            about = "authority of the site" if each.is_authority else known.about if known else "no role of this site"
-            row = (each.role, f"{each.not_after:%Y-%m-%d}", str((each.not_after.date() - now.date()).days), about)
-            table.add_row(*row, *([" ".join(each.hosts)] if request.roles else []))
-        Console().print(table)
-        for each in found:
-            if problem := warning(each):
-                typer.echo(problem)
+    table = table_of((), (), ("role", "until", "days", "used by", *(["hosts"] if request.roles else [])))
+    for column in table.columns:
+        column.overflow = "fold"
+    for each in found:
+        known = roles.get(each.role)
+        about = "authority of the site" if each.is_authority else known.about if known else "no role of this site"
+        row = (each.role, f"{each.not_after:%Y-%m-%d}", str((each.not_after.date() - now.date()).days), about)
+        table.add_row(*row, *([" ".join(each.hosts)] if request.roles else []))
+    show([_as_json(each) for each in found], table, *filter(None, map(warning, found)), json_output=json_output)
     if any(each.time_problem(now) for each in found):
         raise typer.Exit(1)
 
@@ -293,10 +281,10 @@ def _as_json(each: Certificate) -> dict[str, object]:
     }
 
 
-def _say_what_is_next(request: _Request, action: Action) -> None:
-    config = request.config
+def _next_steps(config: Config, action: Action) -> list[str]:
     if action is Action.INIT:
-        typer.echo(f"next: fantwin certs issue -c {config.path}")
-    elif config.bus.security is None:
+        return [f"next: fantwin certs issue -c {config.path}"]
+    if action is Action.ISSUE and config.bus.security is None:
         place = config.bus.endpoint.partition("/")[2]
-        typer.echo(f'next: write into {config.path}: endpoint = "tls/{place}" in [bus], and a section [bus.security]')
+        return [f'next: write into {config.path}: endpoint = "tls/{place}" in [bus], and a section [bus.security]']
+    return []

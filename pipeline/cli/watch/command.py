@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import threading
 from typing import Annotated
 
@@ -19,6 +18,7 @@ from fantwin.pipeline.cli.options import (
     SafeOption,
     SetOption,
 )
+from fantwin.pipeline.cli.printing import show
 from fantwin.pipeline.cli.watch.commanding import (
     CommandSender,
     chosen_tray,
@@ -88,9 +88,7 @@ def command(
         sender.send(message)
         sender.confirm()
     kind, unit = ("set-point", f" {chosen.speed_unit}") if set_point else ("command", "")
-    if json_output:
-        typer.echo(json.dumps({"tray": chosen.name, "fan": number, "kind": kind, "value": value, "unit": unit.strip()}))
-    else:
-        typer.echo(f"{chosen.name}, fan {number}: {kind} {value:g}{unit} sent")
+    found = {"tray": chosen.name, "fan": number, "kind": kind, "value": value, "unit": unit.strip()}
+    show(found, f"{chosen.name}, fan {number}: {kind} {value:g}{unit} sent", json_output=json_output)
     if not set_point and (note := share_note(chosen, value)):
         typer.echo(note, err=True)

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from fantwin.pipeline.cli.recordings_in_parallel import RecordingsInParallel
+from fantwin.pipeline.cli.in_parallel import RecordingsInParallel
 from fantwin.pipeline.cli.twins.training_data import Part, read_training_data
 from fantwin.pipeline.cli.watch.child_commands import RECORDING_ONLY, Commands, RecordingSite, Stopped
 from fantwin.pipeline.config.models import Config, TrayConfig

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.box import SIMPLE_HEAD
 from rich.console import Console, Group
 from rich.live import Live
 from rich.markup import escape
@@ -24,6 +23,7 @@ from rich.text import Text
 
 from fantwin.pipeline.bus.session import Bus, join_bus
 from fantwin.pipeline.cli.options import JsonOption
+from fantwin.pipeline.cli.printing import table_of
 from fantwin.pipeline.cli.progress import working
 from fantwin.pipeline.cli.watch.demo_report import Summary, summarise
 from fantwin.pipeline.cli.watch.status import stage_table
@@ -218,10 +218,8 @@ def _line(tray: TrayConfig, watcher: SiteWatcher) -> str:
 
 def _fan_table(tray: TrayConfig, model: SiteModel) -> Table:
     """Every fan beside its twin."""
-    table = Table("fan", title=f"{tray.name}, speeds in {tray.speed_unit}", title_justify="left", box=SIMPLE_HEAD)
-    for column in ("command", "measured", "twin", "residual"):
-        table.add_column(column, justify="right")
-    table.add_column("state")
+    columns = ("command", "measured", "twin", "residual")
+    table = table_of(["fan"], columns, ["state"], title=f"{tray.name}, speeds in {tray.speed_unit}")
     groups = model.groups()
     for now in model.trays_now():
         for fan, values in enumerate(now.values):
@@ -257,10 +255,9 @@ def _reason(log: Path) -> str:
 
 
 def _print_report(summary: Summary, out: Path, took_s: float, console: Console) -> None:
-    table = Table("fault", title="what happened, seconds since the first sample", title_justify="left", box=SIMPLE_HEAD)
-    for column in ("fan", "start", "alarm", "delay", "removed", "cleared"):
-        table.add_column(column, justify="right")
-    table.add_column("probable cause")
+    columns = ("fan", "start", "alarm", "delay", "removed", "cleared")
+    title = "what happened, seconds since the first sample"
+    table = table_of(["fault"], columns, ["probable cause"], title=title)
     for fault in summary.faults:
         times = (fault.start_ns, fault.alarm_ns, None, fault.stop_ns, fault.cleared_ns)
         cells = ["missed" if t is None else f"{(t - summary.start_ns) / NS_PER_S:.2f}" for t in times]

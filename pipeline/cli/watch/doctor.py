@@ -26,9 +26,8 @@ from fantwin.pipeline.bus.opening import credentials_of
 from fantwin.pipeline.bus.session import join_bus
 from fantwin.pipeline.cli.exposure import exposure_problem, is_exposed
 from fantwin.pipeline.cli.options import DEFAULT_CONFIG, JsonOption, SetOption
-from fantwin.pipeline.cli.watch.found_fans import find_fans
 from fantwin.pipeline.cli.watch.line_check import check_line
-from fantwin.pipeline.cli.watch.trial_messages import send_test_messages
+from fantwin.pipeline.cli.watch.other_checks import find_fans, send_test_messages
 from fantwin.pipeline.config.models import Config, ConfigError
 from fantwin.pipeline.config.registry import RECORDER, STAGES
 from fantwin.pipeline.config.roles import READERS, role_names

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import threading
 from pathlib import Path
 from typing import Annotated
@@ -14,6 +13,7 @@ from fantwin.pipeline.bus.opening import credentials_of
 from fantwin.pipeline.bus.router import open_router
 from fantwin.pipeline.cli.exposure import InsecureOption, checked_exposure
 from fantwin.pipeline.cli.options import DEFAULT_CONFIG, JsonOption, SetOption
+from fantwin.pipeline.cli.printing import show
 from fantwin.pipeline.config.loading import load_config
 from fantwin.pipeline.config.models import BusConfig, Config
 from fantwin.pipeline.config.roles import ROUTER
@@ -70,11 +70,8 @@ def router(
         checked_exposure(bus, lambda line: typer.echo(line, err=True), insecure=insecure),
         open_router(bus.endpoint, credentials, site, bus.zenoh, connect or ()),
     ):
-        if json_output:
-            typer.echo(json.dumps({"listening": bus.endpoint}))
-        else:
-            rules = f": TLS, {len(site.roles)} roles of site {site.site!r}" if site else ""
-            typer.echo(f"router listening on {bus.endpoint}{rules}")
+        rules = f": TLS, {len(site.roles)} roles of site {site.site!r}" if site else ""
+        show({"listening": bus.endpoint}, f"router listening on {bus.endpoint}{rules}", json_output=json_output)
         while True:
             if credentials and (warning := credentials.warning()):
                 typer.echo(warning, err=True)

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import json
 import tempfile
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
 from fantwin.pipeline.cli.options import JsonOption
+from fantwin.pipeline.cli.printing import show, table_of
 from fantwin.pipeline.cli.progress import working
 from fantwin.pipeline.cli.simulation.scenario import Scenario as Simulated
 from fantwin.pipeline.config.models import nearest
@@ -33,12 +32,14 @@ _STYLES = {True: "green", False: "red", None: "yellow"}
 
 def selftest(
     names: Annotated[
-        list[str] | None, typer.Argument(metavar="[SCENARIO]...", help="Scenarios to run; default: all.")
+        list[str] | None,
+        typer.Argument(
+            metavar="[SCENARIO]...", help=f"Default: all of {', '.join(scenario.name for scenario in SCENARIOS)}."
+        ),
     ] = None,
     out: Annotated[
         Path | None, typer.Option("-o", "--out", help="Folder for the files; default: a temporary one.")
     ] = None,
-    list_scenarios: Annotated[bool, typer.Option("--list", help="List the scenarios and their promises.")] = False,
     json_output: JsonOption = False,
 ) -> None:
     """Kill, freeze and flood the stages of a simulated site, and check that fantwin keeps its promises.
@@ -52,10 +53,6 @@ def selftest(
     """
     chosen = _chosen(names or ())
     console = Console(stderr=json_output, highlight=False, soft_wrap=True)
-    if list_scenarios:
-        for scenario in chosen:
-            console.print(f"{scenario.name:14} {scenario.promise}")
-        return
     with tempfile.TemporaryDirectory(prefix="fantwin-selftest-") as temporary:
         folder = out.resolve() if out else Path(temporary)
         if out and out.exists() and any(out.iterdir()):
@@ -63,10 +60,7 @@ def selftest(
         with working(f"running {len(chosen)} scenarios"):
             rows = run_scenarios(folder, chosen, simulated_tray, lambda row: console.print(_line(row), markup=False))
     is_kept = all(row.kept is not False for row in rows)
-    if json_output:
-        typer.echo(json.dumps({"rows": [asdict(row) for row in rows], "kept": is_kept}))
-    else:
-        console.print(_table(rows))
+    show({"rows": [asdict(row) for row in rows], "kept": is_kept}, _table(rows), json_output=json_output)
     if not is_kept:
         raise typer.Exit(1)
 
@@ -89,7 +83,7 @@ def _line(row: Row) -> str:
 
 
 def _table(rows: list[Row]) -> Table:
-    table = Table("", "scenario", "promised", "seen", box=SIMPLE_HEAD)
+    table = table_of(("", "scenario"), (), ("promised", "seen"))
     for row in rows:
         table.add_row(Text(_STATES[row.kept], style=_STYLES[row.kept]), row.name, row.promise, row.seen)
     return table

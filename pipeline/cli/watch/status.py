@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 import threading
 import time
@@ -10,14 +9,13 @@ from collections.abc import Sequence
 from typing import Annotated
 
 import typer
-from rich.box import SIMPLE_HEAD
 from rich.console import Console, Group
 from rich.live import Live
-from rich.table import Table
 from rich.text import Text
 
 from fantwin.pipeline.bus.session import Bus, join_bus
 from fantwin.pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
+from fantwin.pipeline.cli.printing import duration_text, show, table_of
 from fantwin.pipeline.config.models import Config
 from fantwin.pipeline.config.registry import STAGES
 from fantwin.pipeline.config.roles import READERS, role_names, roles_of
@@ -91,10 +89,8 @@ def status(
             _listen(watcher, settings, stop)
             watcher.ask_for_past_alarms()
             _require_a_stage(watcher, settings)
-            if json_output:
-                typer.echo(json.dumps(as_json(watcher, settings)))
-            else:
-                Console().print(stage_table(watcher, settings, of_bus))
+            found = as_json(watcher, settings) if json_output else {}
+            show(found, stage_table(watcher, settings, of_bus), json_output=json_output)
         else:
             watcher.ask_for_past_alarms()
             with Live(console=Console(), refresh_per_second=4) as live:
@@ -127,10 +123,8 @@ def _probe(config: Config, process: StageProcess, stop: threading.Event, *, json
             if is_at_work or time.monotonic() > until_s or stop.wait(_POLL_S):
                 break
     problem = state.view.health.problem if state.view else ""
-    if json_output:
-        typer.echo(json.dumps(_state_as_json(state, state.view.health.lost if state.view else 0)))
-    else:
-        typer.echo(f"{state.label}: {state.word}{''.join(f': {each}' for each in (state.detail, problem) if each)}")
+    line = f"{state.label}: {state.word}{''.join(f': {each}' for each in (state.detail, problem) if each)}"
+    show(_state_as_json(state, state.view.health.lost if state.view else 0), line, json_output=json_output)
     if not is_at_work:
         raise typer.Exit(1)
 
@@ -168,14 +162,12 @@ def stage_table(watcher: SiteWatcher, config: Config, of_bus: Sequence[Text] = (
 
     of_bus: lines on the bus itself.
     """
-    table = Table(title="stages", title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    columns = ("up", "in /s", "out /s", "p50 ms", "p99 ms", "lost")
+    table = table_of(("stage", "state"), columns, title="stages")
     lost = watcher.losses()
     states = watcher.states(process_list(config))
-    names_width = max((len(state.label) for state in states), default=0)
-    table.add_column("stage", no_wrap=True, min_width=names_width)  # a name that is cut may be any stage's
-    table.add_column("state")
-    for column in ("up", "in /s", "out /s", "p50 ms", "p99 ms", "lost"):
-        table.add_column(column, justify="right")
+    # a name that is cut may be any stage's
+    table.columns[0].min_width = max((len(state.label) for state in states), default=0)
     is_anyone_there = any(state.view and state.view.alive for state in states)
     problems = [] if is_anyone_there else [Text(_no_stage(config), style="red")]
     for state in states:
@@ -234,12 +226,7 @@ def _figures(view: StageView | None, lost: int) -> list[str | Text]:
     health = view.health
     latency = (f"{health.latency_p50_ms:.1f}", f"{health.latency_p99_ms:.1f}") if health.latency_p99_ms else ("", "")
     rates = (f"{view.rate_in_hz:.0f}", f"{view.rate_out_hz:.0f}")
-    return [_duration(health.uptime_s), *rates, *latency, Text(str(lost), style="red" if lost else "")]
-
-
-def _duration(seconds: float) -> str:
-    units = (("d", 86_400.0), ("h", 3600.0), ("min", 60.0))
-    return next((f"{seconds / size:.0f} {unit}" for unit, size in units if seconds >= 2 * size), f"{seconds:.0f} s")
+    return [duration_text(health.uptime_s), *rates, *latency, Text(str(lost), style="red" if lost else "")]
 
 
 def _alarm_line(current: CurrentAlarm, now: str) -> Text:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import queue
 import threading
@@ -13,6 +12,7 @@ import numpy as np
 import typer
 
 from fantwin.pipeline.bus.session import Bus, join_bus
+from fantwin.pipeline.cli.printing import show
 from fantwin.pipeline.cli.watch.commanding import (
     CommandSender,
     NotReceivedError,
@@ -91,19 +91,11 @@ def sweep(
             raise UserError(f"{ended}; the fans are left at these commands: {left_at}") from error
         finally:
             _leave(line, at_end, ended)
-    if json_output:
-        known = {str(fan): value if math.isfinite(value) else None for fan, value in constants_s.items()}
-        left = {str(fan): value for fan, value in at_end.items()}
-        content = {
-            "tray": chosen.name,
-            "time_constants_s": known,
-            "steps": steps,
-            "left_at": left,
-            "stopped": is_stopped,
-        }
-        typer.echo(json.dumps(content))
-    else:
-        typer.echo(f"{'stopped' if is_stopped else 'done'}; the fans are left at these commands: {left_at}")
+    known = {str(fan): value if math.isfinite(value) else None for fan, value in constants_s.items()}
+    found = {"tray": chosen.name, "time_constants_s": known, "steps": steps}
+    found |= {"left_at": {str(fan): value for fan, value in at_end.items()}, "stopped": is_stopped}
+    end = "stopped" if is_stopped else "done"
+    show(found, f"{end}; the fans are left at these commands: {left_at}", json_output=json_output)
     if is_stopped:
         raise typer.Exit(1)
 

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import sys
-from collections.abc import Mapping
 from enum import StrEnum
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from fantwin.pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
+from fantwin.pipeline.cli.printing import show
 from fantwin.pipeline.config.loading import load_config
 from fantwin.pipeline.errors import UsageError, UserError
 from fantwin.pipeline.outputs.opcua.config import OpcuaConfig
@@ -53,7 +51,9 @@ def users(
     path = settings.folder / named
     found = read_users(path) if path.exists() else {}
     if action == UserAction.LIST:
-        _list(path, found, json_output=json_output)
+        listed = [{"name": user.name, "role": str(user.role)} for user in found.values()]
+        lines = [f"{user.name}  {user.role}" for user in found.values()]
+        show(listed, *(lines or [f"{path}: no users: add one with `fantwin users add NAME`"]), json_output=json_output)
         return
     if name is None:
         raise UsageError(f"name a user: fantwin users {action} NAME")
@@ -65,20 +65,7 @@ def users(
         found[name] = _asked_for(name, role)
         done = f"{found[name].role} now"
     write_users(path, found)
-    if json_output:
-        typer.echo(json.dumps({"name": name, "done": done}))
-    else:
-        typer.echo(f"{path}: {name}: {done}")
-
-
-def _list(path: Path, found: Mapping[str, User], *, json_output: bool) -> None:
-    if json_output:
-        typer.echo(json.dumps([{"name": user.name, "role": str(user.role)} for user in found.values()]))
-        return
-    for user in found.values():
-        typer.echo(f"{user.name}  {user.role}")
-    if not found:
-        typer.echo(f"{path}: no users: add one with `fantwin users add NAME`")
+    show({"name": name, "done": done}, f"{path}: {name}: {done}", json_output=json_output)
 
 
 def _asked_for(name: str, role: str) -> User:

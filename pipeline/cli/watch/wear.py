@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import threading
 from collections.abc import Iterable
@@ -11,15 +10,14 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.box import SIMPLE_HEAD
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
 from fantwin.pipeline.bus.session import join_bus
 from fantwin.pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
+from fantwin.pipeline.cli.printing import show, table_of
 from fantwin.pipeline.cli.progress import working
-from fantwin.pipeline.cli.watch.live_stages import wait_for_stages
+from fantwin.pipeline.cli.watch.scorers import wait_for_stages
 from fantwin.pipeline.config.loading import load_config
 from fantwin.pipeline.config.roles import roles_of
 from fantwin.pipeline.errors import UserError
@@ -86,13 +84,8 @@ def wear(
         raise UserError(
             f"no data yet for any fan of {', '.join(tray for tray, *_ in found)}: {_NEEDED}; try again later"
         )
-    if json_output:
-        rows = [row for tray, t_ns, state in found for row in wear_rows(tray, t_ns, state)]
-        typer.echo(json.dumps({"wear": rows}))
-    else:
-        console = Console(soft_wrap=True, highlight=False)
-        for tray, t_ns, state in found:
-            console.print(_table(tray, t_ns, state))
+    rows = [row for each in found for row in wear_rows(*each)]
+    show({"wear": rows}, *(_table(*each) for each in found), json_output=json_output)
     for line in damage:
         typer.echo(line, err=True)
     if damage:
@@ -132,19 +125,9 @@ def _table(tray: str, t_ns: int, state: dict[str, Any]) -> Table:
     limit = f"{100 * LIMIT_SHARE:.0f} %"
     caption = ["% of the speed, ± 95 %, since commissioning; beside: the change of the fans beside it"]
     caption += [f"no data yet for fan {', '.join(map(str, without))}: {_NEEDED}"] if without else []
-    table = Table(
-        "fan",
-        title=f"wear of {escape(tray)} up to {_minute(t_ns)}",
-        title_justify="left",
-        caption="\n".join(caption),
-        caption_justify="left",
-        box=SIMPLE_HEAD,
-        padding=(0, 0, 0, 1),
-    )
-    table.add_column("at", no_wrap=True)
-    for column in ("change", "beside", "per day"):
-        table.add_column(column, justify="right", no_wrap=True)
-    table.add_column(f"{limit} reached")
+    title, reached = f"wear of {escape(tray)} up to {_minute(t_ns)}", f"{limit} reached"
+    columns = ("fan", "at"), ("change", "beside", "per day"), (reached,)
+    table = table_of(*columns, title=title, caption="\n".join(caption), padding=(0, 0, 0, 1))
     for row in rows:
         per_day, beside = row["per_day"], row["beside"]
         significant = per_day and not per_day["low"] <= 0.0 <= per_day["high"]

@@ -313,7 +313,7 @@ def test_row_10_an_answer_of_a_stranger_is_none_and_a_scorer_that_does_not_answe
 
 @pytest.mark.parametrize("words", [(), ("ack", TRAY, 3)], ids=["list", "ack"])
 def test_without_a_scorer_one_line_says_that_nothing_is_known(endpoint, words, monkeypatch):
-    monkeypatch.setattr("fantwin.pipeline.cli.watch.live_stages._DISCOVERY_S", 0.3)
+    monkeypatch.setattr("fantwin.pipeline.cli.watch.scorers._DISCOVERY_S", 0.3)
     error = error_of("alarms", *words, "-c", DEMO / "demo.toml", "--set", f"bus.endpoint='{endpoint}'")
     assert f"alarms unknown: no scorer of site '{SITE}' answers at {endpoint}" in error
 

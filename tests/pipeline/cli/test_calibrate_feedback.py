@@ -10,10 +10,9 @@ from typing import Any
 
 import pytest
 
+from fantwin.pipeline.cli.in_parallel import RecordingsInParallel
 from fantwin.pipeline.cli.main import expand_variadic
-from fantwin.pipeline.cli.recordings_in_parallel import RecordingsInParallel
-from fantwin.pipeline.cli.twins.calibration_check import check_declared_rate
-from fantwin.pipeline.cli.twins.marked_running import marked_running
+from fantwin.pipeline.cli.twins.healthy_evidence import check_declared_rate, marked_running
 from fantwin.pipeline.recordings.writing import RecordingWriter
 from fantwin.pipeline.replay.offline.marked_alarms import LeftOut, alarms_in, concerning, marked_alarms
 from fantwin.pipeline.site.alarm_history import AlarmHistory

@@ -187,7 +187,7 @@ def test_running_from_files_without_an_installation_is_a_problem(capsys, monkeyp
     monkeypatch.setattr(module, "requires", not_installed)
     code, found = examine(capsys)
     assert code == 1
-    assert found["problems"] == [f"fantwin is not installed; {how_to_install('fantwin')}"]
+    assert found["problems"] == ["fantwin is not installed: in its checkout, pip install -e ."]
 
 
 def test_little_disk_is_a_problem(capsys, tmp_path, port, monkeypatch):

@@ -18,7 +18,7 @@ import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 from typer.testing import Result
 
-from fantwin.pipeline.cli.recordings_in_parallel import RecordingsInParallel
+from fantwin.pipeline.cli.in_parallel import RecordingsInParallel
 from fantwin.pipeline.cli.twins.training_data import Part, read_recording_data
 from fantwin.pipeline.errors import UserError
 from fantwin.twin.evaluation.resampling import thinned

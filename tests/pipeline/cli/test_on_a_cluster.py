@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from fantwin.pipeline.cli.recordings_in_parallel import RecordingsInParallel
+from fantwin.pipeline.cli.in_parallel import RecordingsInParallel
 from fantwin.pipeline.errors import UserError
 from tests.pipeline.cli.test_many_recordings import RECORDINGS, folder, outcome_of, run_all
 from tests.support.fantwin_command import error_of
@@ -59,6 +59,6 @@ def test_a_worker_that_is_killed_is_an_error_of_one_line(folder: Path) -> None:
 
 
 def test_no_scheduler_there_is_one_line(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("fantwin.pipeline.cli.recordings_in_parallel.CONNECT_S", 0.2)
+    monkeypatch.setattr("fantwin.pipeline.cli.in_parallel.CONNECT_S", 0.2)
     error = error_of("report", folder / "a.mcap", "--jobs", "tcp://127.0.0.1:1")
     assert error == "--jobs tcp://127.0.0.1:1: no Dask scheduler answers there"

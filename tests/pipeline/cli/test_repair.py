@@ -49,13 +49,8 @@ def test_the_json_says_the_same(tmp_path, truncated):
     assert shown["output"] == str(tmp_path / "out.mcap")
     assert shown["original"] is None
     assert shown["messages"] == 20
-    assert shown["topics"][RAW_KEY] == {
-        "messages": 20,
-        "missing": 0,
-        "duplicated": 0,
-        "first_ns": 1000,
-        "last_ns": 1019,
-    }
+    counts = {"messages": 20, "missing": 0, "duplicated": 0, "first_ns": 1000, "last_ns": 1019}
+    assert counts.items() <= shown["topics"][RAW_KEY].items()
     assert shown["discarded_bytes"] > 0
     assert truncated.exists(), "with -o the truncated file stays what it is"
 

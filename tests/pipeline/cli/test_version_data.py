@@ -8,10 +8,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fantwin.pipeline.cli.twins.excerpts import Excerpt, every_of, read_excerpts
 from fantwin.pipeline.cli.twins.train import TrainingSettings, fit_twin
-from fantwin.pipeline.cli.twins.version_data import CHECKED_PART_S, CHECKED_PARTS, split, spread_parts
-from fantwin.pipeline.cli.twins.windows import windows_of
+from fantwin.pipeline.cli.twins.version_data import (
+    CHECKED_PART_S,
+    CHECKED_PARTS,
+    Excerpt,
+    every_of,
+    read_excerpts,
+    split,
+    spread_parts,
+    windows_of,
+)
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.learning.healthy_history import healthy_recordings
 from fantwin.pipeline.learning.history_recordings import HistoryRecording

@@ -179,6 +179,6 @@ def test_a_scorer_that_has_noted_nothing_yet_is_one_line(site):
 
 
 def test_without_a_scorer_one_line_says_that_nothing_is_known(endpoint, monkeypatch):
-    monkeypatch.setattr("fantwin.pipeline.cli.watch.live_stages._DISCOVERY_S", 0.3)
+    monkeypatch.setattr("fantwin.pipeline.cli.watch.scorers._DISCOVERY_S", 0.3)
     error = error_of("wear", "-c", DEMO / "demo.toml", "--set", f"bus.endpoint='{endpoint}'")
     assert f"wear unknown: no scorer of site '{SITE}' answers at {endpoint}" in error

@@ -12,7 +12,7 @@ from typing import Any, NoReturn
 
 import pytest
 
-from fantwin.pipeline.cli.recordings_in_parallel import RecordingsInParallel
+from fantwin.pipeline.cli.in_parallel import RecordingsInParallel
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.replay.offline import healthy_runs, kept_bins
 from fantwin.pipeline.replay.offline.healthy_runs import DecidedRun, HealthyPart, HealthyRuns, LearnedRun, Limit

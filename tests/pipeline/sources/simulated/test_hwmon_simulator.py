@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from fantwin.pipeline.cli.simulation.simulated_hwmon import InjectedFaults, tachos_of
+from fantwin.pipeline.cli.simulation.simulate import InjectedFaults, tachos_of
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.sources.hwmon.config import HwmonConfig
 from fantwin.pipeline.sources.hwmon.source import HwmonDevice

@@ -1,8 +1,7 @@
-"""`fantwin doctor find`: the fans and serial ports of this computer, with a [[tray]] to paste for each."""
+"""`fantwin doctor find` and `fantwin doctor notify`: the fans and serial ports of this computer, and a test message."""
 
 from __future__ import annotations
 
-import json
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -13,7 +12,12 @@ from typing import Any
 import typer
 from rich.console import Console
 
-from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.cli.printing import show
+from fantwin.pipeline.config.loading import load_config
+from fantwin.pipeline.errors import UsageError, UserError
+from fantwin.pipeline.outputs.notify.config import NotifierConfig
+from fantwin.pipeline.outputs.notify.targets import send_test
+from fantwin.pipeline.outputs.notify.wording import Place
 from fantwin.pipeline.sources.hwmon.config import ROOT
 from fantwin.pipeline.sources.hwmon.discovery import Found, discover_hwmon, discover_serial
 
@@ -34,11 +38,8 @@ def find_fans(root: Path, write: Path | None, *, writable: bool, json_output: bo
         if shows_progress:
             typer.echo(f"{each.title} ...", err=True)
         found.append(each)
-    if json_output:
-        typer.echo(json.dumps([asdict(each) | {"toml": each.toml} for each in found]))
-    else:
-        for each in found:
-            _show(each)
+    lines = (line for each in found for line in _lines(each))
+    show([asdict(each) | {"toml": each.toml} for each in found], *lines, json_output=json_output)
     if write:
         for line in _written(write, found):
             typer.echo(line, err=json_output)
@@ -46,13 +47,9 @@ def find_fans(root: Path, write: Path | None, *, writable: bool, json_output: bo
         raise typer.Exit(1)
 
 
-def _show(found: Found) -> None:
-    console = Console(soft_wrap=True, highlight=False)
-    if found.tray:
-        console.print(found.toml, markup=False)
-        return
-    for line in found.missing or ("cannot be watched",):
-        console.print(f"{found.kind}: {found.title}: {line}", markup=False)
+def _lines(found: Found) -> list[str]:
+    missing = found.missing or ("cannot be watched",)
+    return [found.toml] if found.tray else [f"{found.kind}: {found.title}: {line}" for line in missing]
 
 
 def _written(path: Path, found: Sequence[Found]) -> list[str]:
@@ -108,3 +105,37 @@ def _chips_in(path: Path) -> set[tuple[str, ...]]:
             f"{path}: exists, cannot be read as a configuration ({reason}), and was not changed: name a new file"
         ) from error
     return {_chip(tray) for tray in trays if isinstance(tray, Mapping)} if isinstance(trays, list) else set()
+
+
+def send_test_messages(config: Path, overrides: Sequence[str], targets: Sequence[str], *, json_output: bool) -> None:
+    """Send a test message to the targets of the notifier, which need not be running. targets: names; empty for all.
+
+    Raises:
+        UserError: there is no such target, or one did not accept its message.
+    """
+    settings = load_config(config, overrides, stages=("notifier",))
+    section = settings.sections["notifier"]
+    assert isinstance(section, NotifierConfig)
+    known = {target.name: target for target in section.target}
+    if not known:
+        raise UserError(f"{config}: no targets: add a table [[notifier.target]] with a name and url_file")
+    if unknown := [name for name in targets if name not in known]:
+        raise UsageError(f"{config}: no target {', '.join(unknown)}: there is {', '.join(known)}")
+
+    def resolve(path: Path) -> Path:
+        return path if path.is_absolute() else settings.folder / path
+
+    place = Place(settings.site, section.page, section.zone)
+    failed: list[str] = []
+    for name in targets or known:
+        try:
+            failure = send_test(known[name], resolve, place)
+            reason = failure.reason if failure else ""
+        except UserError as error:
+            reason = str(error)
+        if reason:
+            failed.append(name)
+        line = f"{name}: {f'not delivered: {reason}' if reason else 'delivered'}"
+        show({"target": name, "delivered": not reason, "reason": reason}, line, json_output=json_output)
+    if failed:
+        raise UserError(f"no test message for {', '.join(failed)}")

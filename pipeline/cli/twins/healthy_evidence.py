@@ -1,25 +1,143 @@
-"""Whether a declared false-alarm rate is kept: counts alarms on other healthy recordings."""
+"""What healthy recordings say for and against a calibration: alarms that operators marked, fans that were probably not
+healthy, and whether a declared rate of false alarms is kept.
+"""
 
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from fantwin.pipeline.cli.recordings_in_parallel import RecordingsInParallel
+import numpy as np
+
+from fantwin.pipeline.cli.in_parallel import RecordingsInParallel
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.prediction.tray_twin import TrayTwin, load_tray_twin
 from fantwin.pipeline.recordings.checksum import sha256_of
+from fantwin.pipeline.recordings.clips.clip import require_no_clip
+from fantwin.pipeline.recordings.contents import contents_of
 from fantwin.pipeline.replay.offline.alarm_episodes import episodes
-from fantwin.pipeline.replay.offline.calibration_of_twin import calibration_in, number_text
-from fantwin.pipeline.replay.offline.healthy_runs import HealthyPart
-from fantwin.pipeline.replay.offline.marked_alarms import LeftOut, concerning
+from fantwin.pipeline.replay.offline.calibration_of_twin import CalibratedTwin, calibration_in, number_text
+from fantwin.pipeline.replay.offline.healthy_runs import DecidedRun, HealthyPart, LearnedRun
+from fantwin.pipeline.replay.offline.marked_alarms import LeftOut, MarkedAlarm, alarms_in, concerning, marked_alarms
 from fantwin.pipeline.replay.offline.rescoring import rescore
+from fantwin.schemas.enums import Feedback
+from fantwin.schemas.messages import Alarm
 from fantwin.scoring.calibration.alarm_rate import daily_interval
 from fantwin.scoring.calibration.calibration import Calibration, expected_alarms, is_exceeded
+from fantwin.scoring.model.priors import Priors
+
+
+@dataclass(frozen=True)
+class MarkedRunning:
+    """The alarms that concern some recordings."""
+
+    alarms: tuple[MarkedAlarm, ...]
+
+    @property
+    def left_out(self) -> tuple[LeftOut, ...]:
+        """Times of fans that are not learned from."""
+        return tuple(span for each in self.alarms if (span := each.left_out) is not None)
+
+    @property
+    def lines(self) -> list[str]:
+        """One for each alarm that is marked, and one for all others."""
+        lines = [each.line for each in self.alarms if each.line]
+        unmarked = sum(each.alarm.feedback == Feedback.NONE for each in self.alarms)
+        if unmarked:
+            are = "alarm in the recordings is" if unmarked == 1 else "alarms in the recordings are"
+            lines.append(f"{unmarked} {are} not marked as true or false: used as healthy running")
+        return lines
+
+    def as_json(self) -> list[dict[str, Any]]:
+        """For --json."""
+        return [each.as_json() for each in self.alarms]
+
+
+def marked_running(
+    recordings: Sequence[Path], feedback: Sequence[Path], tray: str | None, pool: RecordingsInParallel
+) -> MarkedRunning:
+    """What operators said of the alarms in recordings. feedback: other files in which they said it. tray: the only one
+    that is used.
+
+    Raises:
+        UserError: one cannot be read, or a recording is the clip of an alarm.
+    """
+    found = [*pool.map(_of_recording, recordings, "looking for alarms in recordings"), *map(_named, feedback)]
+    alarms = [each for each in marked_alarms(found) if tray in (None, each.alarm.tray)]
+    if feedback:
+        spans = [(contents.first_ns or 0, contents.last_ns or 0) for contents in map(contents_of, recordings)]
+        alarms = [each for each in alarms if each.first_file in recordings or _is_within(each, spans)]
+    return MarkedRunning(tuple(alarms))
+
+
+def _of_recording(path: Path) -> tuple[Path, list[tuple[str, Alarm]]]:
+    require_no_clip(path, "and no picture of healthy running")
+    return _named(path)
+
+
+def _named(path: Path) -> tuple[Path, list[tuple[str, Alarm]]]:
+    return path, alarms_in(path)
+
+
+def _is_within(marked: MarkedAlarm, spans: Sequence[tuple[int, int]]) -> bool:
+    alarm = marked.alarm
+    return any(
+        alarm.onset_ns <= last_ns and (alarm.cleared_ns is None or alarm.cleared_ns >= first_ns)
+        for first_ns, last_ns in spans
+    )
+
+
+LEAST_FANS = 4
+"""fans, counted over all runs: with fewer the median says little"""
+OUTLIER_RATIO = 5.0
+"""times the median: one healthy fan in a thousand differs from its twin by so much more than the others"""
+SO_LEAVE_IT_OUT = "if something was wrong there, calibrate without this recording"
+
+
+def outlier_warnings(found: CalibratedTwin) -> list[str]:
+    """A line for the fan whose mean speed differs most, and one for the fan with most alarms, where that is much."""
+    warnings = [_of_mean(found.learned)]
+    if found.calibration.limit_factor > 1.0 or found.calibration.is_exceeded:
+        warnings.append(_of_alarms(found.by_theory))
+    return [warning for warning in warnings if warning]
+
+
+def _of_mean(runs: Sequence[LearnedRun]) -> str:
+    shares = [
+        (abs(float(share)), float(share), run, fan)
+        for run in runs
+        for fan, share in enumerate(run.sums.mean_share)
+        if math.isfinite(share)
+    ]
+    if len(shares) < LEAST_FANS:
+        return ""
+    median = float(np.median([size for size, *_ in shares]))
+    size, share, run, fan = max(shares, key=lambda each: each[0])
+    if size <= max(OUTLIER_RATIO * median, Priors().twin_share):
+        return ""
+    than = "faster" if share > 0.0 else "slower"
+    return (
+        f"{run.tray.path}: {run.tray.tray} fan {fan} is {100 * size:.2g} % {than} than its twin in the "
+        f"mean, half of all differ by {100 * median:.2g} % or less: {SO_LEAVE_IT_OUT}"
+    )
+
+
+def _of_alarms(runs: Sequence[DecidedRun]) -> str:
+    alarms = [(count, run, fan) for run in runs for fan, count in enumerate(run.alarms)]
+    total = sum(count for count, *_ in alarms)
+    most, run, fan = max(alarms, key=lambda each: each[0])
+    if 2 * most <= total or len(alarms) == 1:
+        return ""
+    return (
+        f"{run.tray.path}: {run.tray.tray} fan {fan} has {most} of the {total} alarms that the limit by theory "
+        f"raises: {SO_LEAVE_IT_OUT}"
+    )
+
 
 NS_PER_HOUR = 3.6e12
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from fantwin.pipeline.cli.reference_tables import MADE, PAGES, with_topics, with_values
+from fantwin.pipeline.cli.reference_pages import MADE, PAGES, with_topics, with_values
 
 ROOT = Path(__file__).parents[3]
 

@@ -1,4 +1,4 @@
-"""Work on many recordings, on the cores of this host or of a cluster: the same for each, with results in their order.
+"""Work on many recordings or networks, on the cores of this host or of a cluster: the same for each, results in order.
 
 A recording is the unit. What is done with one is a function of it that another process can be given: a function of a
 module, or a `partial` of one. Its result is small, or is needed whole; the command joins the results in the order of
@@ -8,8 +8,10 @@ its arguments, so it does not matter how many jobs there were.
 from __future__ import annotations
 
 import logging
+import signal
+import warnings
 from collections import deque
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -19,10 +21,11 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any, TypeAlias, TypeVar
 
 import typer
-from joblib import cpu_count
+from joblib import Parallel, cpu_count, delayed, parallel_config
+from joblib.externals.loky import BrokenProcessPool, get_reusable_executor
 from threadpoolctl import threadpool_limits
 
-from fantwin.pipeline.cli.processes import ENDED_FROM_OUTSIDE, end_processes, in_processes
+from fantwin.pipeline.cli.printing import show
 from fantwin.pipeline.cli.progress import recordings_progress
 from fantwin.pipeline.errors import UsageError, UserError
 from fantwin.pipeline.extras import require
@@ -30,6 +33,50 @@ from fantwin.pipeline.recordings.remote import local_copies
 
 if TYPE_CHECKING:
     from distributed import Client
+    from rich.console import RenderableType
+
+    from fantwin.twin.progress import Progress
+
+ENDED_FROM_OUTSIDE = "a process that worked on {what} was ended from outside, as the system does if memory is short"
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+
+def in_processes(work: Callable[[Item], Result], items: Sequence[Item], jobs: int, what: str) -> Generator[Result]:
+    """What `work` returns for each item, as results come. When it is closed early, no further item is begun.
+
+    what: the items are, for people.
+
+    Raises:
+        UserError: a process was ended from outside.
+    """
+    with parallel_config("loky", initializer=_leave_ctrl_c_to_the_command):
+        options: Any = {"batch_size": 1, "return_as": "generator"}
+        parallel: Any = Parallel(jobs, **options)
+    try:
+        outcomes = parallel(delayed(work)(item) for item in items)
+        try:
+            for outcome in outcomes:  # noqa: UP028  the end below must come before they are closed
+                yield outcome
+        finally:
+            with warnings.catch_warnings():  # of tasks that are cancelled, as is wanted
+                warnings.simplefilter("ignore")
+                outcomes.close()
+    except BrokenProcessPool as error:
+        raise UserError(f"{ENDED_FROM_OUTSIDE.format(what=what)}: fewer --jobs than {jobs} need less") from error
+
+
+def end_processes() -> None:
+    """End those of in_processes, busy or not."""
+    running: Any = {"reuse": True}
+    get_reusable_executor(**running).shutdown(kill_workers=True)
+
+
+def _leave_ctrl_c_to_the_command() -> None:
+    """A terminal sends it to all processes; the command ends its workers itself."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
 
 JobsOption: TypeAlias = Annotated[
     str | None,
@@ -55,7 +102,6 @@ RECORDINGS = "recordings"
 
 Recording = TypeVar("Recording", Path, tuple[Path, ...])
 """a file, or the parts of one recording"""
-Result = TypeVar("Result")
 
 
 @dataclass(frozen=True)
@@ -166,6 +212,18 @@ class RecordingsInParallel:
         """The skipped recordings, for --json; empty where none are to be skipped."""
         return {"skipped": [asdict(each) for each in self.skipped]} if self._skip_bad else {}
 
+    def end_with(
+        self, found: dict[str, Any], *lines: RenderableType, warnings: Iterable[str], json_output: bool
+    ) -> None:
+        """Print a result and what was skipped, and end the command. warnings: beside the lines, on stderr.
+
+        Raises as `end`.
+        """
+        show(found | self.as_json(), *lines, json_output=json_output)
+        for warning in () if json_output else warnings:
+            typer.echo(warning, err=True)
+        self.end()
+
     def end(self, exit_code: int = 0) -> None:
         """Name the recordings that were skipped, on stderr, and end the command.
 
@@ -231,3 +289,50 @@ def _connected(scheduler: str) -> Iterator[Client]:
 
 def _versions() -> str:
     return ", ".join(f"{package} {version(package)}" for package in SAME_VERSIONS)
+
+
+class NetworksInParallel:
+    """A twin.networks.ForEachNetwork with processes. A context manager: its end is theirs."""
+
+    def __init__(self, jobs: int | None = None) -> None:
+        """jobs: networks at a time; None: one for each core."""
+        self._jobs = jobs or cpu_count()
+        self._has_processes = False
+
+    def __enter__(self) -> NetworksInParallel:
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        if self._has_processes:
+            end_processes()
+
+    def __call__(
+        self, work: Callable[[Item, Progress], Result], items: Sequence[Item], doing: str, progress: Progress
+    ) -> list[Result]:
+        """See twin.networks.ForEachNetwork.
+
+        Raises:
+            UserError: a process was ended from outside.
+        """
+        from fantwin.twin.networks import one_after_another  # noqa: PLC0415  loaded only when it is needed
+
+        jobs = min(self._jobs, len(items))
+        if jobs == 1:
+            with threadpool_limits(1):
+                return one_after_another(work, items, doing, progress)
+        self._has_processes = True
+        part, results = f"{doing}, {jobs} networks at a time", list[Result]()
+        with closing(in_processes(partial(_alone, work), items, jobs, "a network")) as found:
+            progress(part, 0, len(items), float("nan"))
+            for result in found:
+                results.append(result)
+                progress(part, len(results), len(items), float("nan"))
+        return results
+
+
+def _alone(work: Callable[[Item, Progress], Result], item: Item) -> Result:
+    """Runs in another process. With several threads linear algebra rounds in another order: there is one everywhere."""
+    from fantwin.twin.progress import unreported  # noqa: PLC0415
+
+    with threadpool_limits(1):
+        return work(item, unreported)

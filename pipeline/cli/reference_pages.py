@@ -1,0 +1,188 @@
+"""Pages of docs/reference that are made of the code: commands, topics, keys of a scenario, and values of bounds.
+
+`make reference` writes them again. The words of bounds.md are its own; each row names a constant, whose value is filled
+in here.
+"""
+
+from __future__ import annotations
+
+import inspect
+import json
+import re
+from collections.abc import Callable, Iterator, Sequence
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import typer
+from typer.main import get_command
+
+from fantwin.pipeline.cli.main import COMMANDS, PANELS, VARIADIC, app, function_of
+from fantwin.pipeline.cli.simulation.scenario import ClockScenario, FileScenario, Scenario, SurroundingsScenario
+from fantwin.pipeline.config.reference_page import table, tables_within
+from fantwin.pipeline.config.registry import STAGES
+from fantwin.schemas.topics import KIB, MIB, TOPICS
+
+_INTRODUCTION = f"""# Commands
+
+`fantwin COMMAND --help` says the same on a terminal. Every command prints JSON for machines with `--json`, and what
+went wrong as one line on standard error.
+
+{app.info.epilog}
+
+This page is made from the commands in the code: `make reference`. Options of several commands:
+"""
+_HEAD = ("| | default | |", "|---|---|---|")
+
+
+def page() -> str:
+    """commands.md: every command with its options, from the functions that are the commands."""
+    group = typer.Typer()
+    for name in COMMANDS:
+        group.command(name)(function_of(name))
+    commands: dict[str, Any] = get_command(group).commands  # pyright: ignore[reportAttributeAccessIssue]
+    common = _in_several(commands)
+    parts = [_INTRODUCTION, "\n".join([*_HEAD, *common, ""])]
+    for folder, heading in PANELS.items():
+        parts.append(f"## {heading}\n")
+        for name in (name for name, (module, _) in COMMANDS.items() if module.startswith(f"{folder}.")):
+            parts += _command(name, commands[name], common)
+    parts += [
+        "### The keys of a scenario\n",
+        f"{inspect.getdoc(Scenario)}\n",
+        table(Scenario),
+        *tables_within(Scenario),
+    ]
+    return "\n".join(parts)
+
+
+def _command(name: str, command: Any, common: Sequence[str]) -> Iterator[str]:
+    arguments = [each for each in command.params if each.param_type_name == "argument"]
+    options = [each for each in command.params if each.param_type_name == "option" and not each.hidden]
+    options = [each for each in options if each.name != "help"]
+    usage = " ".join(each.metavar or each.name.upper() for each in arguments)
+    yield f"### `fantwin {' '.join(filter(None, (name, usage)))}`\n"
+    about, *examples = (inspect.cleandoc(command.help).split("\n\nExample: ")) if command.help else ("",)
+    yield f"{about}\n"
+    if examples:
+        yield "\n".join(f"    {' '.join(example.split())}" for example in examples) + "\n"
+    rows = [f"| `{each.metavar or each.name.upper()}` | | {_text(each.help)} |" for each in arguments]
+    rows += [_row(each, name) for each in options if _row(each, name) not in common]
+    shared = [each.opts[0] for each in options if _row(each, name) in common]
+    yield "\n".join([*_HEAD, *rows, ""] if rows else [])
+    if shared:
+        yield f"{'And' if rows else 'Options:'} {', '.join(f'`{each}`' for each in shared)}.\n"
+
+
+def _row(option: Any, command: str = "") -> str:
+    return f"| {_names(option, command)} | {_default(option)} | {_text(option.help)} |"
+
+
+def _in_several(commands: dict[str, Any]) -> list[str]:
+    """The rows of the options that are the same in three commands or more."""
+    rows = [_row(each) for command in commands.values() for each in command.params if each.param_type_name == "option"]
+    return [row for row in dict.fromkeys(rows) if rows.count(row) > 2 and "`--help`" not in row]
+
+
+def _names(option: Any, command: str) -> str:
+    names = ", ".join(f"`{each}`" for each in (*option.opts, *option.secondary_opts))
+    if option.is_flag:
+        return names
+    more = "..." if option.opts[-1] in VARIADIC.get(command, ()) else ""
+    plain = str(option.display_type(None)).strip("<>").removesuffix(" range").upper()
+    value = (option.metavar or plain).removesuffix("...")
+    return f"{names} `{value}{more}`".replace("|", "\\|")
+
+
+def _default(option: Any) -> str:
+    default = option.default
+    if default is None or default is False or default == () or default == float("inf"):
+        return ""
+    is_number = isinstance(default, int | float) and not isinstance(default, bool)
+    return f"{default:g}" if is_number else f"`{json.dumps(default, default=str)}`"
+
+
+def _text(text: str | None) -> str:
+    return " ".join((text or "").split()).replace("|", "\\|")
+
+
+PAGES = Path("docs", "reference")
+_BOUND = re.compile(r"^\| `([\w.]+)\.([A-Z_]+)` \|[^|]*\|", re.MULTILINE)
+_TOPICS = re.compile(r"^\| topic \|.*?\n\n", re.MULTILINE | re.DOTALL)
+_BESIDE_PIPELINE = ("client", "schemas", "scoring")
+_KEYS = re.compile(r"^<!-- (\w+) -->\n(?:\|.*\n)*", re.MULTILINE)
+_SCENARIO = {model.__name__: model for model in (Scenario, ClockScenario, SurroundingsScenario, FileScenario)}
+_TABLES_OF_SCENARIO = ("tacho", "clock", "surroundings", "file")
+_OTHER_WRITERS = {
+    "health": "every stage",
+    "consumed": "stages that make samples from samples",
+    "clock": "`fantwin replay`",
+}
+_EXACT = 1 << 53  # from here on a power of two is easier to read
+_PER_SECOND = {"_S": 1, "_MS": 1_000, "_US": 1_000_000, "_NS": 1_000_000_000}
+
+
+def with_topics(page: str) -> str:
+    """The page of messages, with the table of topics as the code has it."""
+    return _TOPICS.sub(lambda _: _topics() + "\n", page, count=1)
+
+
+def with_values(page: str) -> str:
+    """The page of bounds, with the value of each constant that it names.
+
+    Raises:
+        ModuleNotFoundError, AttributeError: there is no such constant.
+    """
+    return _BOUND.sub(lambda row: f"| `{row[1]}.{row[2]}` | {_value(row[1], row[2])} |", page)
+
+
+def with_keys(page: str) -> str:
+    """The page of the simulated tray, with the keys of a scenario below the comment that names their model."""
+    return _KEYS.sub(lambda found: f"<!-- {found[1]} -->\n{table(_SCENARIO[found[1]], but=_TABLES_OF_SCENARIO)}", page)
+
+
+def _topics() -> str:
+    rows = [
+        "| topic | message | | written by | read by | rate | longest | kept |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for topic in TOPICS:
+        writers = ", ".join(
+            [name for name, row in STAGES.items() if topic.name in row.topics()[1]] + ["programs"] * topic.is_of_people
+        )
+        readers = ", ".join(name for name, row in STAGES.items() if topic.name in row.topics()[0])
+        about = topic.about if topic.recorded else f"{topic.about}; not recorded"
+        rows.append(
+            f"| `{topic.name}` | `{topic.message.__name__}` | {about} "
+            f"| {_OTHER_WRITERS.get(topic.name, writers)} | {readers or 'stages that a replay feeds'} | {topic.rate} "
+            f"| {_bytes(topic.largest_bytes)} | {topic.kept:,} |"
+        )
+    return "\n".join(rows) + "\n"
+
+
+def _value(module: str, name: str) -> str:
+    """The value of a constant, with the unit that is in its name."""
+    room = "fantwin" if module.partition(".")[0] in _BESIDE_PIPELINE else "fantwin.pipeline"
+    value = float(getattr(import_module(f"{room}.{module}"), name))
+    if "BYTES" in name:
+        return _bytes(round(value))
+    unit = name[name.rindex("_") :]
+    if unit in _PER_SECOND and not name.endswith("_PER_S"):
+        return f"{value / _PER_SECOND[unit]:,.10g} s"
+    return f"2^{round(value).bit_length() - 1}" if value >= _EXACT else f"{value:,.10g}"
+
+
+def _bytes(size: int) -> str:
+    return f"{size // MIB} MiB" if size % MIB == 0 else f"{size // KIB} KiB"
+
+
+MADE: dict[str, Callable[[str], str]] = {
+    "commands.md": lambda _: page(),
+    "messages.md": with_topics,
+    "bounds.md": with_values,
+    "simulated-tray.md": with_keys,
+}
+
+if __name__ == "__main__":
+    for name, made in MADE.items():
+        (PAGES / name).write_text(made((PAGES / name).read_text(encoding="utf-8")), encoding="utf-8")
