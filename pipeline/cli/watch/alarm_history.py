@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-import typer
-from rich.console import Console
 from rich.text import Text
 
-from fantwin.pipeline.cli.printing import duration_text
+from fantwin.pipeline.cli.printing import duration_text, show
 from fantwin.pipeline.cli.progress import working
 from fantwin.pipeline.config.models import Config
 from fantwin.pipeline.config.shards import own_file, shards_of
@@ -68,22 +65,13 @@ def show_history(recordings: Sequence[Path], config: Config | None, *, json_outp
         assert config is not None
         past = _kept_by_gateway(config)
     rates = list(past.rates.values())
-    if json_output:
-        shown = {"alarms": [each.as_json() for each in past.alarms], "notes": past.notes}
-        shown |= {"rates": {tray: rate.as_json() for tray, rate in past.rates.items()}}
-        typer.echo(json.dumps(shown | {"rate": together(rates).as_json()}))
-        return
-    console = Console(soft_wrap=True, highlight=False)
-    for each in past.alarms:
-        console.print(_line(each))
-    if not past.alarms:
-        console.print(Text("no alarms", style="green"))
-    for tray, rate in past.rates.items():
-        console.print(Text(f"{tray}: {_dated(rate)}"))
-    if len(rates) > 1:
-        console.print(Text(f"together: {_dated(together(rates))}"))
-    for note in past.notes:
-        console.print(Text(note, style="yellow"))
+    found = {"alarms": [each.as_json() for each in past.alarms], "notes": past.notes}
+    found |= {"rates": {tray: rate.as_json() for tray, rate in past.rates.items()}, "rate": together(rates).as_json()}
+    named = list(past.rates.items()) + ([("together", together(rates))] if len(rates) > 1 else [])
+    lines = [_line(each) for each in past.alarms] or [Text("no alarms", style="green")]
+    lines += [Text(f"{name}: {_dated(rate)}") for name, rate in named]
+    lines += [Text(note, style="yellow") for note in past.notes]
+    show(found, *lines, json_output=json_output)
 
 
 def _dated(rate: ObservedRate) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import queue
 import threading
 import time
@@ -11,11 +10,10 @@ from dataclasses import replace
 from datetime import datetime
 
 import typer
-from rich.console import Console
 from rich.text import Text
 
 from fantwin.pipeline.bus.session import Bus
-from fantwin.pipeline.cli.printing import duration_text
+from fantwin.pipeline.cli.printing import duration_text, show
 from fantwin.pipeline.cli.watch.scorers import wait_for_stages
 from fantwin.pipeline.config.models import Config
 from fantwin.pipeline.config.roles import roles_of
@@ -52,28 +50,21 @@ def show_list(
     watcher = SiteWatcher(bus, config.site, roles, trays, has_scores=True, hear_alarm=news.put)
     wait_for_stages(bus, watcher, config, stop)
     watcher.ask_for_past_alarms()
-    console = Console(soft_wrap=True, highlight=False)
     lacking = _wait_until_judged(watcher, config, stop)
     for _ in range(news.qsize()):
         news.get()
     found = [each for each in watcher.current_alarms() if show_all or is_listed(each.newest)]
     found = as_judged(found, lacking)
     slow = _slow_changes(watcher)
-    if json_output:
-        shown = {"alarms": [each.as_json() for each in found], "not_judged": [each.as_json() for each in lacking]}
-        shown |= {"at_rest": [each.as_json() for each in at_rest(watcher.model)], "slow_changes": slow}
-        typer.echo(json.dumps(shown))
-    else:
-        words_now = watcher.model.words_now([Fan(each.newest.header.tray, each.newest.fan) for each in found])
-        for each, now in zip(found, words_now, strict=True):
-            console.print(alarm_lines(each, now))
-        lines = [Text(line, style="yellow") for line in slow] + [Text(each.line(), style="red") for each in lacking]
-        for line in lines:
-            console.print(line)
-        if not found and not lacking:
-            console.print(Text("no alarms", style="green"))
+    shown = {"alarms": [each.as_json() for each in found], "not_judged": [each.as_json() for each in lacking]}
+    shown |= {"at_rest": [each.as_json() for each in at_rest(watcher.model)], "slow_changes": slow}
+    words_now = watcher.model.words_now([Fan(each.newest.header.tray, each.newest.fan) for each in found])
+    lines = [alarm_lines(each, now) for each, now in zip(found, words_now, strict=True)]
+    lines += [Text(line, style="yellow") for line in slow] + [Text(each.line(), style="red") for each in lacking]
+    none = [] if found or lacking else [Text("no alarms", style="green")]
+    show(shown, *lines, *none, json_output=json_output)
     if watch:
-        _watch(news, watcher, config, JudgedChanges(lacking), stop, console, json_output=json_output)
+        _watch(news, watcher, config, JudgedChanges(lacking), stop, json_output=json_output)
     elif lacking:
         raise typer.Exit(1)
 
@@ -84,7 +75,6 @@ def _watch(
     config: Config,
     changes: JudgedChanges,
     stop: threading.Event,
-    console: Console,
     *,
     json_output: bool,
 ) -> None:
@@ -103,10 +93,8 @@ def _watch(
             for line in changes.lines(lacking) if has_scorer else ():
                 typer.echo(f"{datetime.now():%H:%M:%S}  {line}", err=True)
             continue
-        if json_output:
-            typer.echo(json.dumps({"transition": word(alarm), **current_alarm([alarm]).as_json()}))
-        else:
-            console.print(_transition_line(alarm))
+        found = {"transition": word(alarm), **current_alarm([alarm]).as_json()}
+        show(found, _transition_line(alarm), json_output=json_output)
 
 
 def _slow_changes(watcher: SiteWatcher) -> list[str]:

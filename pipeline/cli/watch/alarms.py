@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import getpass
-import json
 import os
 import re
 import threading
@@ -17,6 +16,7 @@ import typer
 
 from fantwin.pipeline.bus.session import join_bus
 from fantwin.pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
+from fantwin.pipeline.cli.printing import show
 from fantwin.pipeline.cli.watch.alarm_history import show_history
 from fantwin.pipeline.cli.watch.alarm_list import show_list, word
 from fantwin.pipeline.cli.watch.scorers import ask, wait_for_stages
@@ -199,16 +199,14 @@ def _login_name() -> str:
 
 def _report(asked: OperatorAction, tray: str, answers: list[Alarm], json_output: bool) -> None:
     refused = [alarm for alarm in answers if alarm.transition == Transition.REFUSED]
-    if json_output:
-        rows = [
-            {"fan": alarm.fan, "transition": word(alarm), "message": alarm.message, **current_alarm([alarm]).as_json()}
-            | {"marked_onset_t_ns": alarm.marked_onset_t_ns}
-            for alarm in answers
-        ]
-        typer.echo(json.dumps({"tray": tray, "action": str(asked), "answers": rows}))
-    else:
-        for alarm in answers if len(answers) > 1 else set(answers) - set(refused):
-            typer.echo(f"{tray}: {_granted(alarm)}")
+    rows = [
+        {"fan": alarm.fan, "transition": word(alarm), "message": alarm.message, **current_alarm([alarm]).as_json()}
+        | {"marked_onset_t_ns": alarm.marked_onset_t_ns}
+        for alarm in answers
+    ]
+    shown = answers if len(answers) > 1 else set(answers) - set(refused)
+    lines = (f"{tray}: {_granted(alarm)}" for alarm in shown)
+    show({"tray": tray, "action": str(asked), "answers": rows}, *lines, json_output=json_output)
     if len(refused) == len(answers):
         raise UserError(f"{tray}: {refused[0].message if len(refused) == 1 else f'{asked} refused for all fans'}")
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import shutil
@@ -16,7 +15,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
+from rich.text import Text
 
 from fantwin.pipeline.bus.access_rules import SiteRoles
 from fantwin.pipeline.bus.credentials import of_role
@@ -26,6 +25,7 @@ from fantwin.pipeline.bus.opening import credentials_of
 from fantwin.pipeline.bus.session import join_bus
 from fantwin.pipeline.cli.exposure import exposure_problem, is_exposed
 from fantwin.pipeline.cli.options import DEFAULT_CONFIG, JsonOption, SetOption
+from fantwin.pipeline.cli.printing import show
 from fantwin.pipeline.cli.watch.line_check import check_line
 from fantwin.pipeline.cli.watch.other_checks import find_fans, send_test_messages
 from fantwin.pipeline.config.models import Config, ConfigError
@@ -118,14 +118,9 @@ def _check(
     problems, good = [], []
     for ok, line in _findings(config, overrides, listen_s, trays or []):
         (good if ok else problems).append(line)
-    if json_output:
-        typer.echo(json.dumps({"ok": not problems, "problems": problems, "good": good}))
-    else:
-        console = Console(soft_wrap=True, highlight=False)
-        for mark, style, lines in (("ok  ", "green", good), ("FIX ", "bold red", problems)):
-            for line in lines:
-                console.print(f"[{style}]{mark}[/{style}] ", end="")
-                console.print(line, markup=False)
+    marked = [(("ok  ", "green"), line) for line in good] + [(("FIX ", "bold red"), line) for line in problems]
+    lines = (Text.assemble(mark, f" {line}") for mark, line in marked)
+    show({"ok": not problems, "problems": problems, "good": good}, *lines, json_output=json_output)
     if problems:
         raise typer.Exit(1)
 

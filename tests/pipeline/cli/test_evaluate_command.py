@@ -27,7 +27,6 @@ from tests.pipeline.cli.conftest import MadeOnce
 from tests.pipeline.cli.test_train_commands import record
 from tests.support import fan_data
 from tests.support.fantwin_command import fantwin
-from tests.support.twin_files import write_twin
 
 
 def parameters_of(**values: float) -> Array:
@@ -241,12 +240,3 @@ def test_a_card_names_the_fans_it_is_of_and_a_fan_is_judged_by_its_own_parameter
     parameters = OnnxTwin(twin).parameters
     assert f'<data value="{parameters[1, 0]}">' in page.read_text()
     assert f'<data value="{parameters[0, 0]}">' not in page.read_text()
-
-
-def test_a_twin_made_before_cards_named_fans_is_still_read_and_serves_as_many(tray: Path, tmp_path: Path) -> None:
-    training = {"trainer": "none", "physics": "fixed", "seed": 0, "iterations": 0, "duration_s": 0.0, "data": []}
-    old = write_twin(tmp_path / "old.onnx", fans=2, training=training)
-    assert OnnxTwin(old).card.training.fans == ()
-    for options in (("two.mcap",), ("three.mcap", "--fans", "0,2")):
-        result = json.loads(fantwin("evaluate", old, tray / options[0], *options[1:], "--json").stdout)
-        assert len(result["fans"]) == 2

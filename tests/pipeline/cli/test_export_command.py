@@ -2,7 +2,6 @@
 
 import json
 import re
-import sys
 import tracemalloc
 from dataclasses import replace
 from importlib.metadata import version
@@ -14,7 +13,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from fantwin.pipeline.recordings import read_arrays
-from fantwin.pipeline.recordings.tables import PIECE_ROWS, open_table, table_columns
+from fantwin.pipeline.recordings.tables import table_columns
 from fantwin.pipeline.recordings.writing import RecordingWriter
 from fantwin.schemas.codec import proto_type
 from fantwin.schemas.enums import FanState, Statistic
@@ -229,13 +228,6 @@ def test_a_tray_of_any_name_has_a_file_of_a_plain_name(tmp_path):
     assert result.stdout == f"{tmp_path}/out/r.a_b__[31m.raw.csv: 20 rows\n"
 
 
-def test_without_pyarrow_csv_works(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "pyarrow", None)
-    monkeypatch.setitem(sys.modules, "pyarrow.parquet", None)
-    path = recording(tmp_path)
-    assert fantwin("export", path, "--to", "csv", "-o", tmp_path).exit_code == 0
-
-
 def test_the_examples_of_the_documentation_run(tmp_path, monkeypatch, capsys):
     recording(tmp_path).rename(tmp_path / "recording.mcap")
     monkeypatch.chdir(tmp_path)
@@ -254,19 +246,6 @@ def test_every_topic_has_a_table_of_plain_columns():
         assert ("fan" in found) == (kind.__name__ not in ("Health", "Clock", "Consumed", "NewTwin", "ScorerSnapshot"))
         assert all(column.dtype.kind in "iufbO" for column in found.values())
     assert not {"inputs", "outputs", "counters"} & set(table_columns(Health))
-
-
-def test_parquet_is_written_in_pieces(tmp_path):
-    fans = 1000
-    path = write(tmp_path / "r.mcap", (raw(n, samples=50, fans=fans) for n in range(4)))
-    (block,) = read_arrays(path, "raw")
-    table_file = open_table("parquet", tmp_path / "t.parquet", "raw", {})
-    table_file.add(block)
-    table_file.close()
-    metadata = pq.read_metadata(tmp_path / "t.parquet")
-    assert metadata.num_rows == 200 * fans
-    sizes = [metadata.row_group(number).num_rows for number in range(metadata.num_row_groups)]
-    assert max(sizes) <= PIECE_ROWS < sum(sizes)
 
 
 def test_memory_does_not_grow_with_the_recording(tmp_path):

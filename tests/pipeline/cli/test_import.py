@@ -160,16 +160,3 @@ def test_an_existing_recording_is_replaced_only_when_forced(tmp_path):
     assert recording.read_bytes() == b"precious"
     assert fantwin(*arguments, "--force").exit_code == 0
     assert len(list(read_recording(recording))) == 14
-
-
-def test_training_reads_the_numbers_of_the_table(tmp_path):
-    path, values = measured(tmp_path)
-    fantwin("import", path, *ARGUMENTS, "-o", tmp_path / "r.mcap")
-    found = read_runs(tmp_path / "r.mcap", fans=[1], from_s=2.0, to_s=6.0)
-    (run,) = found.runs
-    t_s = values[:, 0] - values[0, 0]
-    part = (t_s >= 2.0) & (t_s < 6.0)
-    np.testing.assert_allclose(run.t_s, t_s[part], rtol=0, atol=1e-9)
-    np.testing.assert_array_equal(run.command[:, 0], values[part, 1])
-    np.testing.assert_allclose(run.speed_rad_s[:, 0] * 60 / (2 * np.pi), values[part, 3])
-    assert (found.speed_unit, found.damage) == ("rpm", "")

@@ -10,8 +10,6 @@ from typing import Any
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
-from fantwin.pipeline.recordings import contents
-from fantwin.pipeline.recordings.contents import contents_of
 from fantwin.pipeline.recordings.sequence_ledger import SequenceLedger
 from fantwin.pipeline.recordings.writing import RecordingWriter
 from fantwin.schemas.enums import StageStatus
@@ -176,12 +174,6 @@ def test_a_file_that_is_still_being_written_is_shown_up_to_what_is_on_disk(tmp_p
     assert error.endswith(f"; it is still being written: name {tmp_path}/r.mcap.active")
     assert found["damage"] == ["it is still being written"]
     assert found["topics"][RAW_KEY]["messages"] == 1
-
-
-def test_with_index_and_ledger_the_file_is_not_read_in_full(tmp_path, monkeypatch):
-    path = recording(tmp_path / "r.mcap")
-    monkeypatch.setattr(contents, "scan", None)
-    assert contents_of(path).messages == 8
 
 
 def three_parts(folder: Path, *firsts: int) -> list[Path]:

@@ -1,14 +1,14 @@
 import json
 import os
 import signal
-import subprocess
-import sys
 import termios
 import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -23,30 +23,24 @@ from fantwin.pipeline.sources.simulated.table import TableSample
 from fantwin.schemas import wire
 from fantwin.schemas.messages import Raw
 from fantwin.schemas.tacho import Tacho
-from tests.support.running_chain import eventually
+from tests.support.running_chain import RunningCommand, eventually
 
-FANTWIN = (
-    sys.executable,
-    "-P",
-    "-c",
-    "import typer; from fantwin.pipeline.cli.simulation.simulate import simulate as s; typer.run(s)",
-)
 KEEP = float("nan")
 
 
 @contextmanager
-def simulated(folder: Path, *options: str) -> Iterator[subprocess.Popen[str]]:
-    """`fantwin simulate` in a process of its own, once its line is there; link and truth lie in the folder."""
-    arguments = (*FANTWIN, "--link", str(folder / "tray"), "--truth", str(folder / "truth.json"), *options)
-    process = subprocess.Popen(arguments, stdout=subprocess.PIPE, text=True)
-    assert process.stdout
-    try:
-        assert " on /" in process.stdout.readline()
-        yield process
-    finally:
-        process.kill()
-        process.wait()
-        process.stdout.close()
+def simulated(folder: Path, *words: Path, **options: Any) -> Iterator[tuple[threading.Event, threading.Thread]]:
+    """`fantwin simulate` in a thread, once its line is there, and what stops it; link and truth lie in the folder."""
+    stops: list[threading.Event] = []
+    files = {"link": folder / "tray", "truth": folder / "truth.json", "wait": True}
+    thread = threading.Thread(target=simulate, args=words, kwargs=files | options)
+    with patch("fantwin.pipeline.cli.simulation.simulate.stop_on_signals", stops.append):
+        thread.start()
+        eventually((folder / "tray").is_symlink, "the line is there")
+    yield stops[0], thread
+    stops[0].set()
+    thread.join(10.0)
+    assert not thread.is_alive()
 
 
 def truth_of(folder: Path) -> dict:
@@ -101,12 +95,10 @@ def test_a_reader_gets_every_sample_of_the_tray_that_a_recording_holds_and_the_t
     simulate(
         recording=recording, duration=2.0, seed=9, overrides=["epoch_ns=0"], fault=["inlet:fan=1,start=0.5,stop=1"]
     )
-    options = ("--duration", "2", "--seed", "9", "--wait-for-reader", "--fault", "inlet:fan=1,start=0.5,stop=1")
-    with simulated(tmp_path, *options) as process:
+    with simulated(tmp_path, duration=2.0, seed=9, fault=["inlet:fan=1,start=0.5,stop=1"]):
         opened_ns = time.time_ns()
         reader = Reader(tmp_path / "tray")
         reader.read_all()
-        assert process.wait(10.0) == 0
     truth = truth_of(tmp_path)
     assert reader.faults == []
     assert [sample.sequence for sample in reader.samples] == list(range(200))
@@ -127,28 +119,19 @@ def test_a_reader_gets_every_sample_of_the_tray_that_a_recording_holds_and_the_t
     assert np.array_equal(speeds.astype(np.float32), [sample.speed for sample in reader.samples])
 
 
-def test_simulated_losses_are_gaps_in_the_sequence(tmp_path: Path) -> None:
-    options = ("--duration", "1", "--set", "lost=0.2", "--set", "protocol=text", "--wait-for-reader")
-    with simulated(tmp_path, *options) as process:
-        reader = Reader(tmp_path / "tray", "text")
-        reader.read_all()
-        assert process.wait(10.0) == 0
-    truth = truth_of(tmp_path)
-    sequence = [sample.sequence for sample in reader.samples]
-    assert sequence == [number for number in range(100) if number in sequence], "text, each whole"
-    assert truth["samples_sent"] == len(sequence)
-    assert truth["samples_sent"] + truth["samples_dropped"] == 100
-    assert 5 <= truth["samples_dropped"] <= 40
-
-
-def test_when_stopped_it_completes_the_truth_and_removes_the_link(tmp_path: Path) -> None:
-    with simulated(tmp_path, "--wait-for-reader", "--fault", "rotor:fan=0,start=0") as process:
+def test_a_signal_completes_the_truth_and_removes_the_link(tmp_path: Path) -> None:
+    files = ("--link", tmp_path / "tray", "--truth", tmp_path / "truth.json")
+    process = RunningCommand(["simulate", *files, "--wait-for-reader", "--fault", "rotor:fan=0,start=0"])
+    try:
+        eventually((tmp_path / "tray").is_symlink, "the line is there")
         reader = Reader(tmp_path / "tray")
         reader.read_until(5)
         running = truth_of(tmp_path)
-        process.send_signal(signal.SIGTERM)
+        process.process.send_signal(signal.SIGTERM)
         reader.read_all()
-        assert process.wait(10.0) == 0
+        assert process.process.wait(10.0) == 0
+    finally:
+        process.kill()
     assert not running["complete"]
     truth = truth_of(tmp_path)
     assert truth["complete"]
@@ -159,9 +142,8 @@ def test_when_stopped_it_completes_the_truth_and_removes_the_link(tmp_path: Path
 
 
 def test_when_stopped_before_anybody_reads_the_truth_is_that_nothing_happened(tmp_path: Path) -> None:
-    with simulated(tmp_path, "--wait-for-reader", "--fault", "rotor:fan=0,start=0") as process:
-        process.send_signal(signal.SIGINT)
-        assert process.wait(10.0) == 0
+    with simulated(tmp_path, fault=["rotor:fan=0,start=0"]) as (stop, _):
+        stop.set()
     truth = truth_of(tmp_path)
     assert truth["complete"]
     assert truth["samples_sent"] == 0
@@ -170,14 +152,14 @@ def test_when_stopped_before_anybody_reads_the_truth_is_that_nothing_happened(tm
 
 
 def test_unread_samples_are_counted_and_a_later_reader_sees_the_gap(tmp_path: Path) -> None:
-    with simulated(tmp_path, "--wait-for-reader", "--duration", "1.5") as process:
+    with simulated(tmp_path, duration=1.5) as (_, playing):
         first = Reader(tmp_path / "tray")
         first.read_until(10)
         first.serial.close()
         second = Reader(tmp_path / "tray")
         second.read_until(10)
         second.serial.close()
-        assert process.wait(10.0) == 0
+        playing.join(10.0)
     truth = truth_of(tmp_path)
     first_end, second_start = first.samples[-1].sequence, second.samples[0].sequence
     assert first_end is not None
@@ -188,8 +170,7 @@ def test_unread_samples_are_counted_and_a_later_reader_sees_the_gap(tmp_path: Pa
 
 
 def test_commands_and_set_points_show_in_the_samples(tmp_path: Path) -> None:
-    silent = ("--set", "speed_unit=rpm", "--set", "noise_rad_s=0")
-    with simulated(tmp_path, "--fans", "2", "--wait-for-reader", *silent) as process:
+    with simulated(tmp_path, fans=2, overrides=["speed_unit=rpm", "noise_rad_s=0"]) as (stop, _):
         reader = Reader(tmp_path / "tray", fans=2)
         reader.read_until(1)
         reader.send(wire.CommandFrame((0.25, KEEP)))
@@ -198,9 +179,8 @@ def test_commands_and_set_points_show_in_the_samples(tmp_path: Path) -> None:
         spoilt[-3] ^= 3
         reader.serial.write(b"\0hello\0" + spoilt)
         reader.read_until(300)
-        process.send_signal(signal.SIGINT)
+        stop.set()
         reader.read_all()
-        assert process.wait(10.0) == 0
     assert reader.samples[299].command[0] == 0.25
     assert reader.samples[299].speed[1] == pytest.approx(3000.0, rel=0.05)
     truth = truth_of(tmp_path)
@@ -409,10 +389,9 @@ def test_a_measured_file_is_played_with_its_recorded_times_and_units(tmp_path: P
     scenario = tmp_path / "played.toml"
     columns = 'time = "t ms:ms"\ncommand = ["duty"]\nspeed = ["rpm:rpm", "rpm2:rpm"]\n'
     scenario.write_text(f'speed_unit = "rpm"\n[file]\npath = "run.csv"\nto_s = 1\n{columns}', encoding="utf-8")
-    with simulated(tmp_path, str(scenario), "--wait-for-reader") as process:
+    with simulated(tmp_path, scenario):
         reader = Reader(tmp_path / "tray", fans=2)
         reader.read_all()
-        assert process.wait(10.0) == 0
     assert [sample.clock_us for sample in reader.samples] == [0, 4000, 4500, 300_000]
     assert [sample.command for sample in reader.samples] == [(10.0, 10.0), (20.0, 20.0), (30.0, 30.0), (40.0, 40.0)]
     assert [sample.speed[0] for sample in reader.samples] == pytest.approx([0.0, 60.0, 120.0, 180.0])

@@ -10,7 +10,7 @@ import re
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from typing import Any
 
@@ -140,22 +140,6 @@ def document(watcher: SiteWatcher) -> Any:
 def status_words(site: Site) -> list[object]:
     endpoint = f"bus.endpoint='{site.buses[0]._config.endpoint}'"
     return ["status", "-c", DEMO / "demo.toml", "--set", endpoint, "--set", ONLY_THE_SCORER]
-
-
-def later(health: Health, seconds: float, received: int, published: int) -> Health:
-    (line,), (output,) = health.inputs, health.outputs
-    return replace(
-        health,
-        t_ns=health.t_ns + round(seconds * NS_PER_S),
-        inputs=(replace(line, received=received),),
-        outputs=(replace(output, published=published),),
-    )
-
-
-def test_rates_are_what_came_between_two_healths():
-    seen = StageView(later(HEALTH, 2.0, 300, 90), HEALTH, alive=True)
-    assert (seen.rate_in_hz, seen.rate_out_hz) == (100.0, 20.0)
-    assert StageView(HEALTH, None, alive=True).rate_in_hz == 0.0
 
 
 def test_row_18_the_loss_of_a_stage_that_was_restarted_while_it_is_watched_does_not_start_at_0_again(site):
@@ -340,53 +324,43 @@ def test_on_a_terminal_a_live_view_that_found_no_stage_says_so_at_the_end(endpoi
     live.kill()
 
 
-def test_into_a_pipe_a_running_site_is_shown_once_and_a_loss_is_exit_code_3(site, monkeypatch):
-    monkeypatch.setattr(status_command, "_LISTEN_S", 0.5)
-    monkeypatch.setattr(status_command, "_LISTEN_MAX_S", 60.0)
+@contextmanager
+def beating(site: Site, health: Health, alarm: Alarm | None = None) -> Iterator[None]:
+    """A stage that reports its health and judges its fans, ten times a second, beside the block."""
     stop = threading.Event()
 
     def beat() -> None:
         for number in itertools.count():
-            site.health.put(encode(replace(HEALTH, t_ns=HEALTH.t_ns + number)))
+            site.health.put(encode(replace(health, t_ns=HEALTH.t_ns + number)))
             site.score.put(encode(one_sample(FANS)))
+            if alarm:
+                site.alarm.put(encode(replace(alarm, header=Header("scorer-all-1", number, TRAY))))
             if stop.wait(0.1):
                 return
 
-    beating = threading.Thread(target=beat)
-    beating.start()
-    name, *words = status_words(site)
+    thread = threading.Thread(target=beat)
+    thread.start()
     try:
+        yield
+    finally:
+        stop.set()
+        thread.join()
+
+
+def test_into_a_pipe_a_running_site_is_shown_once_and_a_loss_is_exit_code_3_and_a_problem_1(site, monkeypatch):
+    monkeypatch.setattr(status_command, "_LISTEN_S", 0.5)
+    monkeypatch.setattr(status_command, "_LISTEN_MAX_S", 60.0)
+    name, *words = status_words(site)
+    with beating(site, HEALTH):
         for more in (("--json",), ()):
             done = fantwin_here(str(name), *words, *more)
             assert done.exit_code == 3 and "scorer" in done.stdout, done
-    finally:
-        stop.set()
-        beating.join()
-
-
-def test_a_problem_of_a_stage_is_exit_code_1_and_a_text_of_an_alarm_moves_no_cursor(site, monkeypatch):
-    monkeypatch.setattr(status_command, "_LISTEN_S", 0.5)
-    monkeypatch.setattr(status_command, "_LISTEN_MAX_S", 60.0)
-    stop = threading.Event()
     broken = replace(HEALTH, lost=0, inputs=(), status=StageStatus.DEGRADED, problem="NOTHING IS RECORDED: \x1b[2Jfull")
-
-    def beat() -> None:
-        for number in itertools.count():
-            site.health.put(encode(replace(broken, t_ns=HEALTH.t_ns + number)))
-            site.score.put(encode(one_sample(FANS)))
-            site.alarm.put(encode(replace(ALARM, header=Header("scorer-all-1", number, TRAY), message="\x1b[31mslow")))
-            if stop.wait(0.1):
-                return
-
-    beating = threading.Thread(target=beat)
-    beating.start()
-    try:
-        done = fantwin_here(*map(str, status_words(site)))
-    finally:
-        stop.set()
-        beating.join()
+    with beating(site, replace(broken, t_ns=HEALTH.t_ns), replace(ALARM, message="\x1b[31mslow")):
+        done = fantwin_here(str(name), *words)
     assert done.exit_code == 1, done
-    assert "NOTHING IS RECORDED" in done.stdout and "[31mslow" in done.stdout and "\x1b" not in done.stdout
+    assert "NOTHING IS RECORDED" in done.stdout and "[31mslow" in done.stdout
+    assert "\x1b" not in done.stdout, "a text of an alarm moves no cursor"
 
 
 def test_a_probe_asks_for_one_process_only_and_is_answered_as_soon_as_that_is_known(site, monkeypatch):

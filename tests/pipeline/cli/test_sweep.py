@@ -5,11 +5,11 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
 
-from fantwin.pipeline.acquisition.device_commands import DeviceCommands
 from fantwin.pipeline.cli.watch import sweep as sweep_module
 from fantwin.pipeline.cli.watch.commanding import NotReceivedError
 from fantwin.pipeline.cli.watch.excitation import (
@@ -28,10 +28,6 @@ from fantwin.pipeline.config.models import TrayConfig
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.learning.ordinary_operation import OrdinaryOperation
 from fantwin.pipeline.sources.serial.config import SerialConfig
-from fantwin.schemas.codec import decode
-from fantwin.schemas.health import Counter, Health, Input, Note
-from fantwin.schemas.messages import Command
-from tests.support import made_messages
 from tests.support.fantwin_command import error_of
 from tests.support.running_chain import DEMO
 
@@ -182,73 +178,23 @@ def test_a_fan_that_reads_0_at_the_lowest_command_is_named_at_once() -> None:
     assert not [line for line in said if "reads 0" in line], "it is meant to stand still"
 
 
-TRAY_OF_SIX = TrayConfig(name="tray1", fans=6, source=SerialConfig(port="line"))
-
-
-class RefusesFan4:
-    """A source whose device refuses each command that moves fan 4."""
-
-    name = "line"
-
-    def send(self, command: tuple[float, ...], _set_point: tuple[float, ...]) -> str:
-        return "unit 1 refuses 97" if np.isfinite(command[4]) else ""
-
-
-class AcquisitionOfRefusals:
-    """The bus and the acquisition of a tray at once."""
-
-    def __init__(self) -> None:
-        self.id, self.published = "1", 0
-        self.is_there = True
-        self.commands = DeviceCommands(TRAY_OF_SIX, RefusesFan4())  # type: ignore[arg-type]
-
-    def publisher(self, *_: object) -> AcquisitionOfRefusals:
-        return self
-
-    def subscribe(self, *_: object) -> None: ...
-
-    def watch_alive(self, *_: object) -> None: ...
-
-    def put(self, payload: bytes) -> None:
-        command = decode(Command, payload)
-        assert isinstance(command, Command)
-        self.producer, self.published = command.header.producer, self.published + 1
-        self.commands.send(command, None)
-
-    def health(self) -> Health | None:
-        if not self.is_there:
-            return None
-        received = Input(
-            key="", producer=self.producer, received=self.published, missing=0, duplicated=0, next_sequence=0
-        )
-        texts = (f"refused input: garbage {self.published}", *self.commands.notes())
-        counters = tuple(Counter(name=name, value=value) for name, value in self.commands.counts.items())
-        notes = tuple(Note(tray="tray1", text=text) for text in texts)
-        return made_messages.health(
-            "acquisition", producer="acquisition-1", sequence=1, inputs=(received,), counters=counters, notes=notes
-        )
-
-
-def line_to(acquisition: AcquisitionOfRefusals, monkeypatch: pytest.MonkeyPatch) -> sweep_module._BusLine:
-    monkeypatch.setattr("fantwin.pipeline.cli.watch.commanding.TrayAcquisition", lambda *_: acquisition)
-    return sweep_module._BusLine(acquisition, "plant", TRAY_OF_SIX, threading.Event())  # type: ignore[arg-type]
-
-
-def test_a_refused_command_is_no_failure_of_those_after_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    acquisition = AcquisitionOfRefusals()
-    line = line_to(acquisition, monkeypatch)
-    why = "tray tray1: the command failed: unit 1 refuses 97"
-    with pytest.raises(UserError, match=rf"send these by hand: fan 4 0.5 \({why}\)$"):
-        sweep_module._leave(line, dict.fromkeys(range(6), 0.5), "")
-    assert acquisition.commands.notes() == ["2 commands not taken by the device, the last one: unit 1 refuses 97"]
-    assert acquisition.published == 7, "all at once, then each by itself"
-
-
 def test_ctrl_c_while_a_command_is_on_its_way_is_no_missing_acquisition(monkeypatch: pytest.MonkeyPatch) -> None:
-    acquisition = AcquisitionOfRefusals()
-    line = line_to(acquisition, monkeypatch)
-    acquisition.is_there = False
-    line.stop.set()
+    class Deaf:
+        stop: threading.Event
+
+        def __init__(self, *_: object) -> None: ...
+
+        def send(self, _message: object) -> None: ...
+
+        def confirm(self) -> None:
+            raise NotReceivedError("no acquisition of tray tray1 received the command")
+
+    monkeypatch.setattr(sweep_module, "CommandSender", Deaf)
+    tray, stop = TrayConfig(name="tray1", fans=1, source=SerialConfig(port="line")), threading.Event()
+    line = sweep_module._BusLine(MagicMock(), "plant", tray, stop)
+    with pytest.raises(NotReceivedError):
+        line.send({0: 0.5})
+    stop.set()
     with pytest.raises(StoppedError):
         line.send({0: 0.5})
 

@@ -117,17 +117,6 @@ def test_the_tacho_of_a_recording_counts_and_readings_that_speak_for_another_are
     assert OnnxTwin(tmp_path / "twin.onnx").card.tacho == (tacho,)
 
 
-def test_the_hint_at_the_tacho_comes_before_what_its_absence_spoils(tmp_path):
-    run = counted_run(1, Tacho(kind="count", window_s=0.53), 60.0)
-    recording = record(tmp_path / "undeclared.mcap", replace(run, tacho=INSTANTANEOUS))
-    for command, options in (("report", ()), ("train", ("--model", "physical", "-o", tmp_path / "twin.onnx"))):
-        hint, consequence, *after = fantwin(command, recording, *options).output.splitlines()
-        assert hint.startswith("hint: fan 0: readings are multiples of 56.6 rpm")
-        assert consequence.endswith("what follows, warnings too, may come from that")
-        assert any("rmse" in line for line in after)
-        assert not any(line.startswith("hint") for line in after)
-
-
 def test_ctrl_c_during_training_leaves_no_twin(folder, tmp_path, monkeypatch):
     def interrupted(*_arguments, **_options):
         raise KeyboardInterrupt

@@ -69,12 +69,6 @@ def test_a_recording_reports_what_wears_and_when_its_limit_is_reached(tmp_path, 
     assert found[HEALTHY]["unknown_reason"]
 
 
-def test_parts_in_any_order_give_the_last_snapshot(tmp_path, notes):
-    first, second = (recording(tmp_path / f"{k}.mcap", [note]) for k, note in enumerate(notes))
-    assert rows(second, first) == rows(second)
-    assert rows(first) != rows(second)
-
-
 def test_people_are_shown_a_table_that_says_when_its_values_hold(tmp_path, notes):
     done = fantwin("wear", recording(tmp_path / "r.mcap", notes))
     assert done.exit_code == 0
