@@ -15,13 +15,12 @@ import typer
 from rich.console import Console
 
 from fantwin.pipeline.cli.in_parallel import JobsOption, RecordingsInParallel, SkipBadOption
-from fantwin.pipeline.cli.options import JsonOption, SetOption
+from fantwin.pipeline.cli.options import JsonOption, SetOption, write_whole
 from fantwin.pipeline.cli.progress import interruptible, show_part
 from fantwin.pipeline.cli.twins.drops_found import drop_lines, drops_found
 from fantwin.pipeline.cli.twins.healthy_evidence import Check, check_declared_rate, marked_running, outlier_warnings
 from fantwin.pipeline.cli.twins.training_data import FromOption, ToOption, twin_errors
 from fantwin.pipeline.errors import UsageError, UserError
-from fantwin.pipeline.files import replace_file
 from fantwin.pipeline.prediction.tray_twin import load_tray_twin
 from fantwin.pipeline.recordings.remote import matching, recording_path
 from fantwin.pipeline.replay.offline.calibration_of_twin import (
@@ -243,10 +242,7 @@ def _write(twin: Path, output: Path, calibration: Calibration) -> None:
         from fantwin.twin.export.card_entries import with_card_entries  # noqa: PLC0415  the command line loads twin only when needed
 
         content = with_card_entries(twin.read_bytes(), {"calibration": json.loads(calibration.model_dump_json())})
-    try:
-        replace_file(output, content)
-    except OSError as error:
-        raise UserError(f"{output}: cannot write the twin: {error.strerror}") from error
+    write_whole(output, content)
 
 
 def _print(output: Path, calibration: Calibration, drops: Sequence[str]) -> None:

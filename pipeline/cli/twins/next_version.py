@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from fantwin.pipeline.cli.options import write_whole
 from fantwin.pipeline.cli.twins.calibrate import calibrate
 from fantwin.pipeline.cli.twins.drops_found import drops_found
 from fantwin.pipeline.cli.twins.fan_changes import (
@@ -42,7 +43,6 @@ from fantwin.pipeline.cli.twins.version_data import (
     spread_parts,
 )
 from fantwin.pipeline.errors import UserError
-from fantwin.pipeline.files import replace_file
 from fantwin.pipeline.learning.healthy_history import healthy_recordings, recordings_near_alarms
 from fantwin.pipeline.learning.history_recordings import HistoryRecording
 from fantwin.pipeline.learning.versions import Check, Drop, Outcome, TwinVersions, Version, VersionList, overlap
@@ -114,7 +114,7 @@ def _next_version(
             versions.add_check(check)
             return None
         version, content = work.offered(check.found) if check.found else work.taken()
-    _write(versions.file(name), content)
+    write_whole(versions.file(name), content, "")  # the list must never name a file that is not there
     try:
         versions.add(version, listed, check)
     except UserError:
@@ -129,14 +129,6 @@ def _is_too_little_new(healthy: Sequence[HistoryRecording], listed: VersionList)
     """
     needed_s = LEAST_CHECKED_S if listed.newest_t_ns == listed.commissioned_t_ns else CHECKED_S
     return sum(each.seconds for each in healthy if each.span[0] >= listed.newest_t_ns) < needed_s
-
-
-def _write(path: Path, content: bytes) -> None:
-    """The list must never name a file that is not there."""
-    try:
-        replace_file(path, content)
-    except OSError as error:
-        raise UserError(f"{path}: cannot be written: {error.strerror}") from error
 
 
 class _Work:

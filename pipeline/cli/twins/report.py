@@ -11,7 +11,7 @@ import typer
 from rich.table import Table
 
 from fantwin.pipeline.cli.in_parallel import JobsOption, RecordingsInParallel, SkipBadOption
-from fantwin.pipeline.cli.options import JsonOption, fan_numbers
+from fantwin.pipeline.cli.options import JsonOption, fan_numbers, write_whole
 from fantwin.pipeline.cli.printing import table_of
 from fantwin.pipeline.cli.progress import interruptible, training_progress, working
 from fantwin.pipeline.cli.twins.drops_found import drop_lines, drops_found
@@ -32,7 +32,7 @@ from fantwin.pipeline.cli.twins.training_data import (
     show_hints,
     twin_errors,
 )
-from fantwin.pipeline.errors import UsageError, UserError
+from fantwin.pipeline.errors import UsageError
 from fantwin.pipeline.extras import require
 from fantwin.pipeline.recordings.remote import matching, recording_path
 
@@ -118,10 +118,7 @@ def _write_page(
             drops = drops_found(twin, training_data.rad_s_per_unit)
             alarms = drop_lines(drops, unit.name) or ["alarms are not calibrated: fantwin calibrate"]
             page = report_page(content, assessment, alarms)
-    try:
-        output.write_text(page, encoding="utf-8")
-    except OSError as error:
-        raise UserError(f"{output}: cannot be written: {error.strerror}; name another file with -o") from error
+    write_whole(output, page.encode())
     warnings = [*training_data.outliers, *assessment.warnings]
     pooled = figures_in(content.evaluation.pooled, training_data.rad_s_per_unit)
     by_fan = [

@@ -11,12 +11,12 @@ from rich.markup import escape
 from rich.table import Table
 
 from fantwin.pipeline.cli.in_parallel import RecordingsInParallel
-from fantwin.pipeline.cli.options import make_folder
+from fantwin.pipeline.cli.options import make_folder, write_whole
 from fantwin.pipeline.cli.printing import table_of
 from fantwin.pipeline.cli.progress import training_progress
 from fantwin.pipeline.cli.twins.figures import figures_in, shown
 from fantwin.pipeline.cli.twins.training_data import TrainingData, data_cards
-from fantwin.pipeline.errors import UsageError, UserError
+from fantwin.pipeline.errors import UsageError
 
 if TYPE_CHECKING:
     from fantwin.twin.comparison import Candidate, Contender
@@ -84,7 +84,8 @@ def train_side_by_side(
         "models": [as_json(contender, training_data, folder) for contender in contenders],
         "warnings": training_data.with_fan_numbers(winner.twin.identification.warnings if winner.twin else []),
     }
-    _write(folder / "comparison.json", json.dumps(result, indent=2) + "\n")
+    content = json.dumps(result, indent=2) + "\n"
+    write_whole(folder / "comparison.json", content.encode(), "; name another folder with -o")
     lines = [f"* best: smallest free-run rmse over {SOURCE_MEANING[source]}."]
     if floor := next(m["figures"][source]["tacho_floor"] for m in result["models"] if m["model"] == result["best"]):
         lines.append(f"The tacho alone would leave a perfect model an rmse of {shown(floor)} {result['speed_unit']}.")
@@ -146,10 +147,3 @@ def table(result: dict[str, Any]) -> Table:
 
 def _file(folder: Path, candidate: Candidate) -> Path:
     return folder / f"{candidate.name}.onnx"
-
-
-def _write(path: Path, text: str) -> None:
-    try:
-        path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise UserError(f"{path}: cannot be written: {error.strerror}; name another folder with -o") from error
