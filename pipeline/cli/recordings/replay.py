@@ -37,8 +37,6 @@ _SHOWN_EVERY_S = 0.1
 LARGEST_RATE = 1e6
 LONGEST_S = 1e10
 """three centuries, which still fits in ns"""
-_VIEWING = "Viewing"
-_DECIDING = "Scoring again, without a bus"
 
 
 def replay(
@@ -52,24 +50,14 @@ def replay(
         ),
     ],
     rate: Annotated[
-        str | None,
-        typer.Option(
-            metavar="X|max",
-            help="Seconds of the recording per second; max: as fast as possible.",
-            rich_help_panel=_VIEWING,
-        ),
+        str | None, typer.Option(metavar="X|max", help="Seconds of the recording per second; max: as fast as possible.")
     ] = None,
     start: Annotated[float, typer.Option(help="Start, in s since the first message.")] = 0.0,
     end: Annotated[float, typer.Option(help="End, in s since the first message.")] = math.inf,
-    pause: Annotated[
-        bool, typer.Option("--pause", help="Start paused; space continues.", rich_help_panel=_VIEWING)
-    ] = False,
-    loop: Annotated[
-        bool, typer.Option("--loop", help="Repeat until Ctrl-C; times continue.", rich_help_panel=_VIEWING)
-    ] = False,
+    pause: Annotated[bool, typer.Option("--pause", help="Start paused; space continues.")] = False,
+    loop: Annotated[bool, typer.Option("--loop", help="Repeat until Ctrl-C; times continue.")] = False,
     topics: Annotated[
-        str | None,
-        typer.Option(metavar="A,B", help="Topics to publish. Default: all of the trays.", rich_help_panel=_VIEWING),
+        str | None, typer.Option(metavar="A,B", help="Topics to publish. Default: all of the trays.")
     ] = None,
     from_topic: Annotated[
         str | None,
@@ -77,7 +65,6 @@ def replay(
             "--from",
             metavar="TOPIC",
             help="Publish only the input of the stages that read TOPIC (raw, grid or prediction), and learned twins.",
-            rich_help_panel=_VIEWING,
         ),
     ] = None,
     config: Annotated[
@@ -92,21 +79,16 @@ def replay(
     overrides: SetOption = None,
     json_output: JsonOption = False,
     offline: Annotated[
-        bool, typer.Option("--offline", help="Run the stages in this process.", rich_help_panel=_DECIDING)
+        bool, typer.Option("--offline", help="Score recordings again, in this process and without a bus.")
     ] = False,
-    twin: Annotated[
-        Path | None, typer.Option(metavar="TWIN.onnx", help="Score with another twin.", rich_help_panel=_DECIDING)
-    ] = None,
+    twin: Annotated[Path | None, typer.Option(metavar="TWIN.onnx", help="Offline: score with another twin.")] = None,
     output: Annotated[
-        Path | None,
-        typer.Option("-o", "--output", metavar="OUT.mcap", help="Write a new recording.", rich_help_panel=_DECIDING),
+        Path | None, typer.Option("-o", "--output", metavar="OUT.mcap", help="Offline: write a new recording.")
     ] = None,
     verify: Annotated[
         bool,
         typer.Option(
-            "--verify",
-            help="Compare with the recorded result: decisions exactly, numbers within a tolerance.",
-            rich_help_panel=_DECIDING,
+            "--verify", help="Offline: compare with the recorded result, decisions exactly, numbers within a tolerance."
         ),
     ] = False,
     jobs: JobsOption = None,

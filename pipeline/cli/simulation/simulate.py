@@ -109,8 +109,12 @@ def simulate(
                 lambda t_s: reporter.show(doing, int(t_s), int(length_s)),
             )
     else:
-        save(truth, summary_of(PlaybackCounts(), complete=False))
-        on_start = partial(save_start, truth, summary_of)
+
+        def on_start(start_ns: int | None) -> None:
+            """The truth, with the start, before any sample is counted."""
+            save(truth, summary_of(PlaybackCounts(start_ns=start_ns), complete=False))
+
+        on_start(None)
         played = serve_line(device, link, wanted.protocol, wanted.speed_unit, on_start, wait=wait, err=json_output)
     summary = summary_of(played, complete=True)
     save(truth, summary)
@@ -268,11 +272,6 @@ def save(path: Path | None, summary: Summary) -> None:
         write_truth(path, summary)
     except OSError as error:
         raise UserError(f"{path}: cannot be written: {error.strerror}; name another file with --truth") from error
-
-
-def save_start(path: Path | None, summary_of: Callable[..., Summary], start_ns: int) -> None:
-    """Write the summary with the start of the playback, ns since the epoch, before any sample is counted."""
-    save(path, summary_of(PlaybackCounts(start_ns=start_ns), complete=False))
 
 
 def count_text(played: PlaybackCounts) -> str:
