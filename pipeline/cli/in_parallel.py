@@ -13,7 +13,6 @@ import warnings
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
-from dataclasses import asdict, dataclass
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -104,21 +103,6 @@ Recording = TypeVar("Recording", Path, tuple[Path, ...])
 """a file, or the parts of one recording"""
 
 
-@dataclass(frozen=True)
-class Skipped:
-    """A recording that was left out, and why."""
-
-    recording: str
-    reason: str
-
-
-@dataclass(frozen=True)
-class _Bad:
-    """What is returned in place of a result: an error that crosses processes as it is."""
-
-    error: UserError
-
-
 class RecordingsInParallel:
     """The processes of one command, and the recordings that it skipped. A context manager: its end is theirs."""
 
@@ -167,10 +151,10 @@ class RecordingsInParallel:
         begun = self._on_cluster(attempt, left) if self._client else self._here(attempt, left)
         with recordings_progress(doing, len(left)) as advance, closing(begun) as outcomes:
             for recording, outcome in zip(left, outcomes, strict=True):
-                if isinstance(outcome, _Bad):
+                if isinstance(outcome, UserError):
                     if not self._skip_bad:
-                        raise outcome.error
-                    self._bad[recording] = outcome.error
+                        raise outcome
+                    self._bad[recording] = outcome
                 else:
                     yield outcome
                 advance()
@@ -203,14 +187,10 @@ class RecordingsInParallel:
         finally:
             self._client.cancel(list(futures))
 
-    @property
-    def skipped(self) -> list[Skipped]:
-        """The recordings that were left out so far."""
-        return [Skipped(name_of(recording), str(error)) for recording, error in self._bad.items()]
-
     def as_json(self) -> dict[str, list[dict[str, str]]]:
         """The skipped recordings, for --json; empty where none are to be skipped."""
-        return {"skipped": [asdict(each) for each in self.skipped]} if self._skip_bad else {}
+        skipped = [{"recording": name_of(recording), "reason": str(error)} for recording, error in self._bad.items()]
+        return {"skipped": skipped} if self._skip_bad else {}
 
     def end_with(
         self, found: dict[str, Any], *lines: RenderableType, warnings: Iterable[str], json_output: bool
@@ -232,9 +212,9 @@ class RecordingsInParallel:
         Raises:
             typer.Exit: the code is not 0.
         """
-        for each in self.skipped:
-            typer.secho(f"skipped: {each.reason}", fg=typer.colors.YELLOW, err=True)
-        if exit_code or self.skipped:
+        for error in self._bad.values():
+            typer.secho(f"skipped: {error}", fg=typer.colors.YELLOW, err=True)
+        if exit_code or self._bad:
             raise typer.Exit(exit_code or EXIT_SKIPPED)
 
 
@@ -243,8 +223,11 @@ def name_of(recording: Path | tuple[Path, ...]) -> str:
     return str(recording[0] if isinstance(recording, tuple) else recording)
 
 
-def _attempt(recording: Recording, work: Callable[[Recording], Result], copies: Path | None) -> Result | _Bad:
-    """Runs in any process. With several threads, linear algebra rounds in another order: there is one everywhere."""
+def _attempt(recording: Recording, work: Callable[[Recording], Result], copies: Path | None) -> Result | UserError:
+    """A result, or in its place an error, which crosses processes as it is. Runs in any process.
+
+    With several threads, linear algebra rounds in another order: there is one everywhere.
+    """
     try:
         with local_copies(copies), threadpool_limits(1):
             return work(recording)
@@ -253,7 +236,7 @@ def _attempt(recording: Recording, work: Callable[[Recording], Result], copies: 
     except UserError as error:
         files = recording if isinstance(recording, tuple) else (recording,)
         is_named = any(str(file) in str(error) for file in files)
-        return _Bad(error if is_named else UserError(f"{name_of(recording)}: {error}"))
+        return error if is_named else UserError(f"{name_of(recording)}: {error}")
 
 
 @contextmanager

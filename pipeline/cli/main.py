@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import re
 import signal
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from importlib import import_module
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -19,92 +21,32 @@ PANELS = {
     "simulation": "Simulated tray",
 }
 """folder -> heading of its commands in `fantwin --help`"""
-COMMANDS: dict[str, tuple[str, str]] = {
-    "demo": (
-        "watch.demo",
-        "Run a simulated tray of eight fans through the whole pipeline; cover one inlet, disturb one rotor.",
-    ),
-    "commission": (
-        "watch.commission",
-        "Record healthy fans, train their twins, calibrate them, add them to the configuration, start `fantwin up`.",
-    ),
-    "up": ("watch.up", "Start all stages, restart those that die, stop all in order on Ctrl-C."),
-    "status": ("watch.status", "Show stages, rates, latency, losses and alarms of a running site."),
-    "alarms": (
-        "watch.alarms",
-        "List the current alarms; acknowledge, shelve or suppress the alarm of a fan, or say whether it was true "
-        "(docs/reference/alarms.md).",
-    ),
-    "wear": (
-        "watch.wear",
-        "Show how the speed of each fan has changed since commissioning, how fast, and when its limit will be reached\n"
-        "(docs/explanation/wear.md).",
-    ),
-    "command": (
-        "watch.command",
-        "Send a command to one fan, or move the commands of all over their range while `fantwin up` records.",
-    ),
-    "doctor": (
-        "watch.doctor",
-        "Check the installation and a configuration, find the fans of this computer, or send test messages.",
-    ),
-    "selftest": (
-        "watch.selftest",
-        "Kill, freeze and flood the stages of a simulated site, and check that fantwin keeps its promises.",
-    ),
-    "router": ("watch.router", 'Run a Zenoh router until Ctrl-C, for stages with bus.mode = "client".'),
-    "certs": (
-        "watch.certs",
-        "Make and show certificates of a site: who may do what on its bus (docs/how-to/security.md).",
-    ),
-    "users": (
-        "watch.users",
-        "List the users who may log in to the operators' page and over OPC UA; add or remove one.",
-    ),
-    "replay": (
-        "recordings.replay",
-        "Publish a recording on the bus in recorded time, for the viewer or the stages; or score recordings again "
-        "offline.",
-    ),
-    "info": (
-        "recordings.info",
-        "Show what a recording contains: time, trays, twins, messages and losses of each topic, problems of stages.",
-    ),
-    "import": (
-        "recordings.import_table",
-        "Turn a measured table or a log into a recording, the data format of training, evaluation and replay.",
-    ),
-    "export": (
-        "recordings.export",
-        "Export a recording as tables: one per topic and tray, with a row per sample and fan.",
-    ),
-    "view": (
-        "recordings.view",
-        "Turn a recording into a view file for Rerun, or plot its speeds, predictions, bands, alarms and states.",
-    ),
-    "train": ("twins.train", "Train a twin of healthy fans and write it, with its card, as an ONNX file."),
-    "calibrate": (
-        "twins.calibrate",
-        "Learn from healthy recordings how far a twin's fans may differ from it, and write that into its card.",
-    ),
-    "evaluate": (
-        "twins.evaluate",
-        "Compare the free run of a twin with the measured speeds of recordings, in the recordings' own units.",
-    ),
-    "report": (
-        "twins.report",
-        "Compare the free run of a twin with recordings on an HTML page, or identify the fans of recordings.",
-    ),
-    "twins": (
-        "twins.twins",
-        "List the versions of a learned twin, make the next one, put one in force, or mark a time span as faulty.",
-    ),
-    "simulate": (
-        "simulation.simulate",
-        "Simulate a tray of fans on a serial port that any program can open, or as the fans of a computer.",
-    ),
+COMMANDS = {
+    "demo": "watch.demo",
+    "commission": "watch.commission",
+    "up": "watch.up",
+    "status": "watch.status",
+    "alarms": "watch.alarms",
+    "wear": "watch.wear",
+    "command": "watch.command",
+    "doctor": "watch.doctor",
+    "selftest": "watch.selftest",
+    "router": "watch.router",
+    "certs": "watch.certs",
+    "users": "watch.users",
+    "replay": "recordings.replay",
+    "info": "recordings.info",
+    "import": "recordings.import_table",
+    "export": "recordings.export",
+    "view": "recordings.view",
+    "train": "twins.train",
+    "calibrate": "twins.calibrate",
+    "evaluate": "twins.evaluate",
+    "report": "twins.report",
+    "twins": "twins.twins",
+    "simulate": "simulation.simulate",
 }
-"""command -> its module in this folder, whose function of the same name is the command; the first line of its help"""
+"""command -> its module in this folder, whose function of the same name is the command"""
 VARIADIC: dict[str, tuple[str, ...]] = {
     "train": ("--validate", "--test"),
     "calibrate": ("--verify", "--feedback"),
@@ -142,20 +84,29 @@ def _group(
 
 def function_of(name: str) -> Callable[..., Any]:
     """The function that is a command."""
-    path = COMMANDS[name][0]
+    path = COMMANDS[name]
     return getattr(import_module(f"fantwin.pipeline.cli.{path}"), path.rpartition(".")[2])
 
 
 def _register(names: Iterable[str]) -> None:
     for name in names:
-        folder, _, _ = COMMANDS[name][0].partition(".")
+        folder, _, _ = COMMANDS[name].partition(".")
         app.command(name, rich_help_panel=PANELS[folder])(function_of(name))
 
 
 def _list_commands() -> None:
     """All commands for `--help` and for a mistyped name, without importing any."""
-    for name, (module, about) in COMMANDS.items():
-        app.command(name, help=about, rich_help_panel=PANELS[module.split(".")[0]])(lambda: None)
+    for name, module in COMMANDS.items():
+        app.command(name, help=about(name), rich_help_panel=PANELS[module.split(".")[0]])(lambda: None)
+
+
+def about(name: str) -> str:
+    """The first paragraph of a command's docstring, from its source: to import all commands takes seconds."""
+    folder, _, function = COMMANDS[name].rpartition(".")
+    source = (Path(__file__).parent / folder / f"{function}.py").read_text(encoding="utf-8")
+    found = re.search(rf'^def {function}\(.*?^    """(.+?)(?:\n\n|""")', source, re.MULTILINE | re.DOTALL)
+    assert found
+    return " ".join(found[1].split())
 
 
 def expand_variadic(words: Sequence[str]) -> list[str]:

@@ -45,7 +45,7 @@ def page() -> str:
     parts = [_INTRODUCTION, "\n".join([*_HEAD, *common, ""])]
     for folder, heading in PANELS.items():
         parts.append(f"## {heading}\n")
-        for name in (name for name, (module, _) in COMMANDS.items() if module.startswith(f"{folder}.")):
+        for name in (name for name, module in COMMANDS.items() if module.startswith(f"{folder}.")):
             parts += _command(name, commands[name], common)
     parts += [
         "### The keys of a scenario\n",

@@ -83,7 +83,7 @@ class Site:
         return ["replay", *words, *self.chain.words("")[1:]]
 
     def replay(self, *words: object) -> subprocess.CompletedProcess[str]:
-        return fantwin(*self.words(*words))
+        return as_typed(*self.words(*words))
 
     def next(self, kind: type[Message]) -> Any:
         return self.heard[kind].get(timeout=DEADLINE_S)
@@ -164,7 +164,7 @@ def test_at_full_speed_the_stages_take_every_message_and_decide_every_sample(tmp
         up = chain.start_up()
         with chain.watcher() as watcher:
             eventually(lambda: {v.health.stage for v in watcher.stages() if v.alive} == set(WORKING), "all are there")
-        done = fantwin("replay", recording, "--rate", "max", "--from", "raw", "--json", *chain.words("")[1:])
+        done = as_typed("replay", recording, "--rate", "max", "--from", "raw", "--json", *chain.words("")[1:])
         status, account = up.end(), up.output()
     finally:
         chain.close()
@@ -202,7 +202,7 @@ def test_stages_without_a_twin_of_their_own_change_to_the_learned_twins_at_the_r
         up = chain.start_up()
         with chain.watcher() as watcher:
             eventually(lambda: {v.health.stage for v in watcher.stages() if v.alive} == set(stages), "all are there")
-        done = fantwin("replay", source, "--rate", "max", "--from", "raw", "--json", *chain.words("")[1:])
+        done = as_typed("replay", source, "--rate", "max", "--from", "raw", "--json", *chain.words("")[1:])
         status, account = up.end(), up.output()
     finally:
         chain.close()

@@ -6,7 +6,6 @@ import signal
 import subprocess
 import sys
 import tomllib
-from importlib import import_module
 from inspect import getdoc
 from pathlib import Path
 
@@ -34,9 +33,8 @@ def help_of(*words: str) -> str:
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_every_command_says_what_the_list_says_has_an_example_and_prints_json_if_asked(command: str) -> None:
-    module, about = COMMANDS[command]
-    function = getattr(import_module(f"fantwin.pipeline.cli.{module}"), module.rpartition(".")[2])
-    assert about.split() == str(getdoc(function)).partition("\n\n")[0].split()
+    function = command_line.function_of(command)
+    assert command_line.about(command).split() == str(getdoc(function)).partition("\n\n")[0].split()
     text = help_of(command)
     assert f"Example: fantwin {command}" in " ".join(text.split())
     assert "--json" in text
@@ -56,7 +54,7 @@ def test_help_lists_every_command_and_the_exit_codes():
 
 def test_help_has_a_panel_for_each_folder_of_commands_in_order():
     folders = {path.name for path in Path(command_line.__file__).parent.iterdir() if (path / "__init__.py").exists()}
-    assert set(PANELS) == folders == {module.split(".")[0] for module, _ in COMMANDS.values()}
+    assert set(PANELS) == folders == {module.split(".")[0] for module in COMMANDS.values()}
     lines = help_of().splitlines()
     panels = [next(n for n, line in enumerate(lines) if f" {panel} ─" in line) for panel in PANELS.values()]
     assert panels == sorted(panels)
