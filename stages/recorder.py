@@ -19,8 +19,9 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 
 from fantwin.pipeline.config.registry import RECORDER, STAGES
-from fantwin.pipeline.recordings.clips.alarm_clips import AlarmClips, tracker_of
-from fantwin.pipeline.recordings.clips.worker import ClipWorker
+from fantwin.pipeline.recordings.clips.alarm_clips import AlarmClips, listed_clips
+from fantwin.pipeline.recordings.clips.cutting import ClipCutter
+from fantwin.pipeline.recordings.clips.tracker import ClipTracker
 from fantwin.pipeline.recordings.disk import DiskError
 from fantwin.pipeline.recordings.disk_room import DiskRoom
 from fantwin.pipeline.recordings.held_messages import HeldMessages
@@ -204,7 +205,7 @@ class Recorder(Core):
         file was deleted, parts, and files that were restored."""
         recorded = self._recorded + (self._part.written if self._part else Counter())
         written = {f"recorded_{topic}": count for topic, count in recorded.items()}
-        of_clips = self._clips.counters() if self._clips else {}
+        of_clips = self._clips.tracker.counts if self._clips else {}
         return {**written, **self._counts, **self._room.counts, **self._interference.counts, **of_clips}
 
     def notes(self) -> Sequence[str]:
@@ -264,7 +265,7 @@ class Recorder(Core):
     def _is_flush_due(self) -> bool:
         """Return whether a message would be unflushed for too long at the next tick; not at every tick behind a
         backlog."""
-        is_clip_running = self._clips is not None and self._clips.is_running
+        is_clip_running = self._clips is not None and self._clips.tracker.needed_since_ns is not None
         is_soon = self._is_urgent or is_clip_running or self._unflushed_bytes >= FLUSH_BYTES
         flush_ns = self._soon_ns if is_soon else self._flush_ns
         return (
@@ -412,9 +413,9 @@ def _clips_of(parts: RecordingParts, config: RecorderConfig) -> AlarmClips:
     most_bytes = 0
     with suppress(DiskError):  # it does not say its size: the health reports that
         most_bytes = round(parts.disk_bytes() * config.keep_share_of_disk * CLIPS_SHARE)
-    tracker = tracker_of(parts.path, CLIP_BEFORE_S, CLIP_AFTER_S, most_bytes, CLIP_SETTLED_S)
-    worker = ClipWorker(parts.path, config.min_free_bytes, parts.free_bytes)
-    clips = AlarmClips(tracker, worker)
+    listed = listed_clips(parts.path)
+    tracker = ClipTracker(listed, CLIP_BEFORE_S, CLIP_AFTER_S, most_bytes, CLIP_SETTLED_S)
+    clips = AlarmClips(tracker, parts.path, ClipCutter(parts.path, parts.free_bytes, config.min_free_bytes).cut)
     if parts.last_part:
         clips.continue_after(parts.last_part)
     return clips

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from fantwin.pipeline.recordings.clips.alarm_clips import AlarmClips
+from fantwin.pipeline.recordings.clips.clip import Clip
 from fantwin.pipeline.recordings.disk import Disk, DiskError
 from fantwin.pipeline.recordings.open_part import PartsFolder
 from fantwin.pipeline.recordings.recorder_config import CLIPS_SHARE, PARTS_WITHIN_LIMITS, RecorderConfig
@@ -36,8 +37,8 @@ class _Oldest(NamedTuple):
     """The part or clip that may be deleted next."""
 
     last_ns: int
-    part: StoredPart | None
-    """None: it is a clip"""
+    part: StoredPart | None = None
+    clip: Clip | None = None
     is_needed: bool = False
     """a clip that is still to be cut needs this part"""
 
@@ -156,10 +157,10 @@ class DiskRoom:
             return None
         part = next(iter(self._stored.parts), None)
         is_needed = part is not None and self._clips is not None and self._clips.needs(part.last_ns)
-        until_ns = self._clips.oldest_acknowledged_until_ns() if self._clips else None
-        if until_ns is not None and (part is None or is_needed or until_ns <= part.last_ns):
-            return _Oldest(until_ns, None)
-        return _Oldest(part.last_ns, part, is_needed) if part else None
+        clip = self._clips.tracker.oldest_acknowledged if self._clips else None
+        if clip and (part is None or is_needed or clip.until_ns <= part.last_ns):
+            return _Oldest(clip.until_ns, clip=clip)
+        return _Oldest(part.last_ns, part, is_needed=is_needed) if part else None
 
     def _is_last(self, oldest: _Oldest) -> bool:
         """Whether it is the only finished part."""
@@ -177,25 +178,27 @@ class DiskRoom:
     def _delete(self, oldest: _Oldest, why: str) -> bool:
         """Delete it; False if that is not possible."""
         try:
-            if oldest.part is None:
-                assert self._clips
-                deleted = self._clips.delete_oldest_acknowledged()
-                _LOG.warning("clip %s, the oldest whose alarms are acknowledged, was deleted: %s", deleted, why)
-                return True
-            self._parts.delete(oldest.part)
+            if oldest.clip and self._clips:
+                self._clips.delete(oldest.clip)
+                _LOG.warning(
+                    "clip %s, the oldest whose alarms are acknowledged, was deleted: %s", oldest.clip.name, why
+                )
+            elif oldest.part:
+                self._parts.delete(oldest.part)
+                self.counts["parts_deleted"] += 1
+                if self._clips and oldest.is_needed:
+                    self._clips.tracker.part_deleted()
+                _LOG.warning("%s, the oldest part, was deleted: %s", oldest.part.path.name, why)
         except RecordingError as error:
             self._report(error)
             return False
-        self.counts["parts_deleted"] += 1
-        if self._clips and oldest.is_needed:
-            self._clips.part_deleted()
-        _LOG.warning("%s, the oldest part, was deleted: %s", oldest.part.path.name, why)
         return True
 
     def _warn_of_what_is_kept(self, since_ns: float, *, is_all: bool) -> None:
         """Warn once of files beyond the limits that may not be deleted. is_all: no file may be deleted."""
         before, self._beyond = self._beyond, ""
-        if self._clips and (kept := self._clips.unacknowledged_before(since_ns)):
+        clips = self._clips.tracker.clips if self._clips else []
+        if kept := [clip for clip in clips if clip.until_ns < since_ns and not clip.is_acknowledged]:
             size = sum(clip.size_bytes for clip in kept)
             self._beyond = (
                 f"clips kept beyond {self._config.keep_days:g} days until their alarms are acknowledged: {len(kept)}, "

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from fantwin.pipeline.recordings.clips.alarm_clips import AlarmClips, tracker_of
-from fantwin.pipeline.recordings.clips.clip import Clip, clips_in, kept_clips, list_path
+from fantwin.pipeline.recordings.clips.alarm_clips import AlarmClips, listed_clips
+from fantwin.pipeline.recordings.clips.clip import Clip, kept_clips
+from fantwin.pipeline.recordings.clips.cutting import ClipCutter
 from fantwin.pipeline.recordings.clips.tracker import ClipTracker, CutResult
-from fantwin.pipeline.recordings.clips.worker import ClipWorker
 from fantwin.pipeline.recordings.indexed import PartIndex
 from fantwin.pipeline.recordings.parts import RecordingParts
 from fantwin.pipeline.recordings.reading import RecordingError, read_recording
@@ -34,42 +33,37 @@ def chain(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return recording_of(tmp_path_factory.mktemp("chain"), 1, 400)
 
 
-class Maker(ClipWorker):
-    """A stand-in for the disk of the clips."""
+class Cutter:
+    """Cuts clips of a stated size, and knows which."""
 
     def __init__(self) -> None:
         self.asked: list[str] = []
-        self.deleted: list[str] = []
-        self.saved: list[Clip] = []
-        self.waiting: list[CutResult] = []
-        self.refuses = self.undeletable = ""
+        self.size_bytes = 100
 
-    def save(self, clips: Sequence[Clip]) -> None:
-        if not self.refuses:
-            self.saved = list(clips)
-
-    def cut(self, clips: Sequence[Clip], open_part: PartIndex | None) -> None:
-        self.asked += [clip.name for clip in clips]
-
-    def results(self) -> list[CutResult]:
-        results, self.waiting = self.waiting, []
-        return results
-
-    def delete(self, clip: Clip) -> None:
-        if self.undeletable:
-            raise RecordingError(self.undeletable)
-        self.deleted.append(clip.name)
-
-    def problem(self) -> str:
-        return self.refuses
-
-    def end(self, timeout_s: float) -> None: ...
+    def cut(self, clip: Clip, _open_part: PartIndex | None) -> CutResult:
+        self.asked.append(clip.name)
+        return CutResult(clip.name, self.size_bytes)
 
 
 def clips_of(recording: Path, free: int = FREE, after_s: float = 1.0) -> AlarmClips:
     """As a recorder has them, with short clips."""
-    tracker = tracker_of(recording, before_s=0.5, after_s=after_s, most_bytes=0, settled_s=0.3)
-    return AlarmClips(tracker, ClipWorker(recording, min_free_bytes=1000, free_bytes=lambda: free))
+    tracker = ClipTracker(listed_clips(recording), before_s=0.5, after_s=after_s, most_bytes=0, settled_s=0.3)
+    return AlarmClips(tracker, recording, ClipCutter(recording, lambda: free, min_free_bytes=1000).cut)
+
+
+def with_cutter(disk: Disk, folder: Path, **config: Any) -> tuple[Recorder, AlarmClips, Cutter]:
+    """A recorder whose clips are cut by a stand-in."""
+    cutter = Cutter()
+    clips = AlarmClips(ClipTracker((), 60, 60, 0), folder / "recording.mcap", cutter.cut)
+    return Recorder(disk, RecorderConfig(**config), NOW_NS, clips=clips), clips, cutter
+
+
+def tick_until_cut(core: Recorder, clips: AlarmClips, now_ns: int) -> None:
+    """A tick at which clips are due, and one that takes them."""
+    core.tick(now_ns)
+    assert clips._thread
+    clips._thread.join(60)
+    core.tick(now_ns)
 
 
 def raised(fan: int, t_ns: int, **more: Any) -> Alarm:
@@ -101,13 +95,12 @@ def test_a_clip_that_was_due_at_the_end_of_a_recorder_is_cut_by_the_next_one(cha
     clips = clips_of(recording, after_s=60)
     core = record(chain, recording, clips=clips)
     if ends == "by a crash":
-        clips._maker.end(60)  # the list is on the disk
         crash(core)
         assert not kept_clips(tmp_path / "clips")
     else:
         core.close()
         assert kept_clips(tmp_path / "clips"), "as much as there is"
-    (due,) = clips_in(list_path(recording))
+    (due,) = listed_clips(recording)
     assert due.is_due
     core = Recorder(RecordingParts(recording, {}, {}, "s2"), RecorderConfig(), NOW_NS, clips=clips_of(recording))
     core.tick(due.until_ns + SECOND_NS)
@@ -134,80 +127,69 @@ def test_no_clip_is_cut_where_that_would_fill_the_disk_and_the_recorder_says_so(
     recording = tmp_path / "recording.mcap"
     clips = clips_of(recording, free=2000)
     core = record(chain, recording, clips=clips)
-    clips._maker.end(60)
     core.tick(2 * 10**18)
-    assert "cannot be cut yet" in core.problem() and "are free on the disk" in core.problem()
-    assert not kept_clips(tmp_path / "clips")
     core.close()
+    assert "cannot be cut yet" in core.problem() and "are free on the disk" in core.problem()
+    assert not kept_clips(tmp_path / "clips") and listed_clips(recording)[0].is_due
 
 
-def test_the_disk_guard_takes_what_is_oldest_but_no_unacknowledged_clip_and_last_what_a_clip_needs():
-    disk, maker = Disk(), Maker()
-    config = RecorderConfig(min_free_bytes=50_000_000)
-    core = Recorder(disk, config, NOW_NS, clips=AlarmClips(ClipTracker((), 60, 60, 0), maker))
+def test_the_disk_guard_takes_what_is_oldest_but_no_unacknowledged_clip_and_last_what_a_clip_needs(tmp_path):
+    disk = Disk()
+    core, clips, _ = with_cutter(disk, tmp_path, min_free_bytes=50_000_000)
     now_ns = NOW_NS
     for fan in range(2):
         core.step(envelope(raised(fan, now_ns), "alarm", now_ns))
-        now_ns += 70 * SECOND_NS
-        core.tick(now_ns)
-        maker.waiting = [CutResult(maker.asked[-1], 100)]
-        core.tick(now_ns)
+        tick_until_cut(core, clips, now_ns := now_ns + 70 * SECOND_NS)
     core.step(envelope(raised(0, now_ns, acknowledged=True, transition=Transition.ACKNOWLEDGED), "alarm", now_ns))
     core.step(envelope(raised(2, now_ns), "alarm", now_ns))
-    acknowledged, _, running = [clip.name for clip in core._clips._tracker.clips]  # type: ignore[union-attr]
+    acknowledged, unacknowledged, _ = [tmp_path / "clips" / clip.name for clip in clips.tracker.clips]
+    for path in (acknowledged, unacknowledged):
+        path.touch()
     disk.free, disk.old = 1, old_parts("r-0.mcap", "r-1.mcap", last_ns=NOW_NS - 1000 * SECOND_NS)
     core.tick(now_ns := now_ns + SECOND_NS)
-    assert disk.old_names == ["r-1.mcap"] and maker.deleted == []  # this part is older than any clip
+    assert disk.old_names == ["r-1.mcap"] and acknowledged.exists()  # this part is older than any clip
     disk.old = old_parts("r-1.mcap", "r-2.mcap", last_ns=now_ns)
-    maker.undeletable = f"clips/{acknowledged}: cannot be deleted: Operation not permitted; delete or move it"
     core.tick(now_ns := now_ns + SECOND_NS)
-    assert maker.undeletable in core.problem() and core.counters().get("clips_deleted", 0) == 0
-    maker.undeletable = ""
-    core.tick(now_ns := now_ns + SECOND_NS)
-    assert disk.old_names == ["r-1.mcap", "r-2.mcap"] and maker.deleted == [acknowledged]
+    assert disk.old_names == ["r-1.mcap", "r-2.mcap"] and not acknowledged.exists()
     assert core.problem() == ""
     core.tick(now_ns := now_ns + SECOND_NS)
     assert disk.old_names == ["r-2.mcap"]  # the running clip needs the other, but the disk is full
-    lacking = next(clip for clip in maker.saved if clip.name == running)
-    assert lacking.problem == "a part that it needs was deleted to make room"
+    lacking = clips.tracker.clips[-1]
+    assert lacking.is_due and lacking.problem == "a part that it needs was deleted to make room"
     core.tick(now_ns + SECOND_NS)
-    assert "NOTHING IS RECORDED" in core.problem() and len(maker.deleted) == 1
+    assert "NOTHING IS RECORDED" in core.problem() and unacknowledged.exists()
     assert core.counters()["parts_deleted"] == 2 and core.counters()["clips_deleted"] == 1
 
 
-def test_a_clip_outlives_the_limit_of_days_until_it_is_acknowledged_and_that_is_said_once(caplog):
-    disk, maker = Disk(), Maker()
-    core = Recorder(disk, RecorderConfig(), NOW_NS, clips=AlarmClips(ClipTracker((), 60, 60, 0), maker))
+def test_a_clip_outlives_the_limit_of_days_until_it_is_acknowledged_and_that_is_said_once(tmp_path, caplog):
+    core, clips, cutter = with_cutter(Disk(), tmp_path)
+    cutter.size_bytes = 5_000_000
     core.step(envelope(raised(0, NOW_NS), "alarm", NOW_NS))
-    core.tick(NOW_NS + 70 * SECOND_NS)
-    maker.waiting = [CutResult(maker.asked[0], 5_000_000)]
-    core.tick(NOW_NS + 80 * SECOND_NS)
+    tick_until_cut(core, clips, NOW_NS + 70 * SECOND_NS)
     now_ns = NOW_NS
     for day in range(15, 20):
         now_ns = NOW_NS + day * 86_400 * SECOND_NS
         core.tick(now_ns)
     said = "clips kept beyond 14 days until their alarms are acknowledged: 1, 5 MB"
-    assert maker.deleted == [] and core.notes()[1] == said and caplog.text.count(said) == 1
+    assert clips.tracker.clips and core.notes()[1] == said and caplog.text.count(said) == 1
     core.step(envelope(raised(0, NOW_NS, acknowledged=True, transition=Transition.ACKNOWLEDGED), "alarm", now_ns))
     core.tick(now_ns + 10 * SECOND_NS)
-    assert maker.deleted == maker.asked and len(core.notes()) == 1
+    assert not clips.tracker.clips and len(core.notes()) == 1
 
 
 def test_of_clips_that_cannot_be_deleted_none_is_forgotten_and_the_first_is_named(tmp_path):
     names = ["1.mcap", "2.mcap"]
-    clips = [Clip(name, "tray1", 0, at, 0, (), is_due=False, size_bytes=100) for at, name in enumerate(names)]
-    tracker = ClipTracker(clips, 1, 1, most_bytes=100)
-    of = AlarmClips(tracker, ClipWorker(tmp_path / "recording.mcap", 0, lambda: FREE))
+    listed = [Clip(name, "tray1", 0, at, 0, (), is_due=False, size_bytes=100) for at, name in enumerate(names)]
+    clips = AlarmClips(ClipTracker(listed, 1, 1, most_bytes=100), tmp_path / "recording.mcap", Cutter().cut)
     in_the_way = tmp_path / "clips" / names[0]
     in_the_way.mkdir(parents=True)
-    of.tick(NOW_NS, lambda: None)
-    assert tracker.clips == clips and of.problem().startswith(f"{in_the_way}: cannot be deleted: ")
+    clips.tick(NOW_NS, lambda: None)
+    assert clips.tracker.clips == listed and clips.problem().startswith(f"{in_the_way}: cannot be deleted: ")
     with pytest.raises(RecordingError, match=r"1\.mcap: cannot be deleted"):
-        of.delete_oldest_acknowledged()
+        clips.delete(listed[0])
     in_the_way.rmdir()
-    of.tick(NOW_NS, lambda: None)
-    assert tracker.clips == [] and of.problem() == "" and of.counters()["clips_deleted"] == 2
-    of.close(lambda: None)
+    clips.tick(NOW_NS, lambda: None)
+    assert clips.tracker.clips == [] and clips.problem() == "" and clips.tracker.counts["clips_deleted"] == 2
 
 
 def test_files_that_a_killed_recorder_left_of_a_clip_are_removed_and_what_another_one_is_writing_stays(tmp_path):
@@ -220,63 +202,57 @@ def test_files_that_a_killed_recorder_left_of_a_clip_are_removed_and_what_anothe
         assert sorted(path.name for path in folder.iterdir()) == [".unfinished-tray2-0.mcap.active", "tray1-0.mcap"]
 
 
-def test_while_a_clip_is_cut_the_disk_guard_has_room_at_once_and_the_list_is_written_at_the_end(tmp_path):
+def test_while_a_clip_is_cut_the_recorder_makes_room_and_ends_and_the_list_says_what_is_due(tmp_path, monkeypatch):
     is_cutting, may_go_on = threading.Event(), threading.Event()
 
-    def free_bytes() -> int:
+    def cut(clip: Clip, _open_part: PartIndex | None) -> CutResult:
         is_cutting.set()
         may_go_on.wait(60)
-        return 0
+        return CutResult(clip.name, 100)
 
+    monkeypatch.setattr("fantwin.pipeline.recordings.clips.alarm_clips.CLOSE_S", 0.0)
     recording = tmp_path / "recording.mcap"
-    worker = ClipWorker(recording, 0, free_bytes)
-    old, slow = (Clip(name, "tray1", 0, 1, 0, (), is_due=False) for name in ("old.mcap", "slow.mcap"))
+    old = Clip("old.mcap", "tray1", 0, 1, 0, (), is_due=False)
+    slow = Clip("slow.mcap", "tray1", 0, 1, 0, ())
+    clips = AlarmClips(ClipTracker([old, slow], 60, 60, 0), recording, cut)
     (tmp_path / "clips").mkdir()
     (tmp_path / "clips" / old.name).touch()
-    worker.cut([slow], None)
+    clips.tick(NOW_NS, lambda: None)
     assert is_cutting.wait(60)
-    worker.delete(old)
+    clips.delete(old)
     is_there = (tmp_path / "clips" / old.name).exists()
-    worker.end(0.0)
-    worker.save([slow])
-    listed = list_path(recording).exists() and clips_in(list_path(recording))
+    clips.close(lambda: None)
     may_go_on.set()
-    assert not is_there and listed == [slow]
+    assert not is_there and listed_clips(recording) == [slow]
 
 
-def test_the_list_that_a_full_disk_has_refused_is_written_once_there_is_room():
-    maker = Maker()
-    core = Recorder(Disk(), RecorderConfig(), NOW_NS, clips=AlarmClips(ClipTracker((), 60, 60, 0), maker))
-    maker.refuses = "clips: cannot be written: No space left on device"
+def test_the_list_that_the_disk_has_refused_is_written_once_it_can_be(tmp_path):
+    core, clips, _ = with_cutter(Disk(), tmp_path)
+    (tmp_path / "clips").touch()
     for _ in range(2):  # a restarted recorder receives it again
         core.step(envelope(raised(0, NOW_NS), "alarm", NOW_NS))
     core.tick(NOW_NS + SECOND_NS)
-    assert maker.saved == []
-    maker.saved, real_save = [], maker.save
-
-    def save(clips: Sequence[Clip]) -> None:
-        maker.refuses = ""
-        real_save(clips)
-
-    maker.save = save  # type: ignore[method-assign]
+    assert "clips: cannot be written: " in core.problem()
+    (tmp_path / "clips").unlink()
     core.tick(NOW_NS + 2 * SECOND_NS)
-    assert maker.saved == []
+    assert listed_clips(tmp_path / "recording.mcap") == []
     core.tick(NOW_NS + 12 * SECOND_NS)
-    assert len(maker.saved) == 1 and core.problem() == ""
+    assert listed_clips(tmp_path / "recording.mcap") == clips.tracker.clips != []
+    assert core.problem() == ""
 
 
-def test_a_clip_is_not_cut_before_what_was_received_in_a_pause_is_on_the_disk():
-    disk, maker = Disk(), Maker()
-    core = Recorder(disk, RecorderConfig(), NOW_NS, clips=AlarmClips(ClipTracker((), 60, 60, 0), maker))
+def test_a_clip_is_not_cut_before_what_was_received_in_a_pause_is_on_the_disk(tmp_path):
+    disk = Disk()
+    core, clips, cutter = with_cutter(disk, tmp_path)
     core.step(envelope(raised(0, NOW_NS), "alarm", NOW_NS))
     core.tick(NOW_NS + 2 * SECOND_NS)
     disk.free = 1
     core.tick(NOW_NS + 4 * SECOND_NS)
     core.step(envelope(raised(0, NOW_NS, transition=Transition.CLEARED), "alarm", NOW_NS + 5 * SECOND_NS))
     core.tick(NOW_NS + 70 * SECOND_NS)
-    assert "NOTHING IS RECORDED" in core.problem() and maker.asked == []
+    assert "NOTHING IS RECORDED" in core.problem()
     disk.free = FREE
     core.tick(NOW_NS + 72 * SECOND_NS)
-    assert core.problem() == "" and core.unsaved() and maker.asked == []
-    core.tick(NOW_NS + 75 * SECOND_NS)
-    assert not core.unsaved() and len(maker.asked) == 1
+    assert core.problem() == "" and core.unsaved() and cutter.asked == []
+    tick_until_cut(core, clips, NOW_NS + 75 * SECOND_NS)
+    assert not core.unsaved() and len(cutter.asked) == 1

@@ -7,7 +7,7 @@ recording of a tray is not kept once for each of its fans. All times are times o
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 from fantwin.pipeline.recordings.clips.clip import Clip, ClipAlarm, clip_name
@@ -51,20 +51,17 @@ class ClipTracker:
         most_bytes: of all clips together; 0: no limit. settled_s: how long after its end all of a clip is on the disk.
         """
         self._clips = {clip.name: clip for clip in clips}
-        self._of_fan: dict[tuple[str, int], dict[int, str]] = {}
-        """by tray and fan: the clip of each of its alarms, by onset. A power cut raises a thousand, and all of them are
-        acknowledged at once"""
-        for clip in self._clips.values():
-            for each in clip.alarms:
-                self._of_fan.setdefault((clip.tray, each.fan), {})[each.onset_t_ns] = clip.name
         self._before_ns, self._after_ns = round(before_s * NS_PER_S), round(after_s * NS_PER_S)
         self._settled_ns = round(settled_s * NS_PER_S)
         self._most_bytes = most_bytes
         self._being_cut: set[str] = set()
-        self._ends_ns: dict[str, int] = {}
-        """of clips that ended when the host's clock was set back: by the new time"""
+        self._ended: set[str] = set()
+        """clips that ended when the host's clock was set back"""
         self._retry_ns = self._now_ns = 0
-        self._waits = self._not_kept = self._full = ""
+        self._failed = ""
+        """why a clip could not be cut; until one is"""
+        self._not_kept = ""
+        """the last clip for which there was no room"""
         self.counts: Counter[str] = Counter()
         self.version = 0
         """higher after each change of `clips`"""
@@ -87,11 +84,12 @@ class ClipTracker:
 
     def add(self, alarm: Alarm, received_t_ns: int) -> None:
         """Follow the next message about an alarm."""
+        of_tray = [clip for clip in self._clips.values() if clip.tray == alarm.header.tray]
         if alarm.acknowledged:
-            for name in set(self._of_fan.get((alarm.header.tray, alarm.fan), {}).values()):
-                self._put(self._clips[name].with_acknowledged(alarm))
+            for clip in of_tray:
+                self._put(clip.with_acknowledged(alarm))
         elif alarm.transition == Transition.RAISED and not is_silenced(alarm):
-            self._raise(alarm, received_t_ns)
+            self._raise(alarm, received_t_ns, of_tray)
 
     def due(self, now_ns: int, unsaved_since_ns: int | None = None) -> list[Clip]:
         """The clips to be cut now, which count as being cut until `cut` says what came of it. What a clip over the
@@ -105,15 +103,14 @@ class ClipTracker:
             for clip in self._clips.values()
             if clip.is_due
             and clip.name not in self._being_cut
-            and self._ends_ns.get(clip.name, clip.until_ns) + self._settled_ns <= now_ns
-            and (unsaved_since_ns is None or clip.until_ns < unsaved_since_ns or clip.name in self._ends_ns)
+            and (clip.name in self._ended or self._is_settled(clip, unsaved_since_ns))
         ]
         if now_ns < self._retry_ns or not found:
             return []
         if self._is_full():
             for clip in found:
                 self._drop(clip)
-            self._full = f"the clip of {found[-1].name} is not kept"
+            self._not_kept, self._failed = found[-1].name, ""
             return []
         self._being_cut |= {clip.name for clip in found}
         return found
@@ -133,13 +130,13 @@ class ClipTracker:
         if result.size_bytes:
             self._put(replace(clip, is_due=not is_over, size_bytes=result.size_bytes, problem=_joined(clip, result)))
             self.counts["clips"] += int(is_over)
-            self._waits = self._not_kept = ""
+            self._failed = ""
         elif result.may_pass:
             self._retry_ns = self._now_ns + RETRY_NS
-            self._waits = f"clip {result.name} cannot be cut yet: {result.problem}"
+            self._failed = f"clip {result.name} cannot be cut yet: {result.problem}"
         elif is_over:
             self._drop(clip)
-            self._not_kept = f"clip {clip.name} is not kept: {result.problem}"
+            self._failed = f"clip {clip.name} is not kept: {result.problem}"
 
     def to_delete(self) -> Clip | None:
         """The oldest acknowledged clip, if clips exceed the limit of bytes."""
@@ -157,53 +154,56 @@ class ClipTracker:
 
     def problem(self) -> str:
         """Why clips cannot be cut or kept; empty if all is well."""
-        if self._full and self._is_full():
+        if self._not_kept and self._is_full():
             return (
-                f"{self._full}: clips with unacknowledged alarms fill half of "
+                f"the clip of {self._not_kept} is not kept: clips with unacknowledged alarms fill half of "
                 "recorder.keep_share_of_disk: acknowledge alarms, or raise this limit"
             )
-        is_waiting = any(clip.is_due for clip in self._clips.values())
-        return self._waits if self._waits and is_waiting else self._not_kept
+        return self._failed
 
-    def _raise(self, alarm: Alarm, received_t_ns: int) -> None:
-        tray = alarm.header.tray
-        new = ClipAlarm(alarm.fan, alarm.onset_t_ns, alarm.t_ns)
-        of_fan = self._of_fan.setdefault((tray, alarm.fan), {})
-        if alarm.onset_t_ns in of_fan:
+    def _raise(self, alarm: Alarm, received_t_ns: int, of_tray: Sequence[Clip]) -> None:
+        if any(
+            (each.fan, each.onset_t_ns) == (alarm.fan, alarm.onset_t_ns) for clip in of_tray for each in clip.alarms
+        ):
             return
-        of_tray = (clip for clip in self._clips.values() if clip.tray == tray)
+        new = ClipAlarm(alarm.fan, alarm.onset_t_ns, alarm.t_ns)
         delay_ns = min(max(0, alarm.t_ns - alarm.onset_t_ns), LONGEST_DELAY_NS)
         onset_ns, until_ns = received_t_ns - delay_ns, received_t_ns + self._after_ns
         since_ns, judged_since_ns = onset_ns - self._before_ns, onset_ns - max(self._before_ns, JUDGED_NS)
-        running = next((clip for clip in of_tray if self._is_joined(clip, received_t_ns, until_ns)), None)
-        if running:
-            longer = replace(running, alarms=(*running.alarms, new), until_ns=max(running.until_ns, until_ns))
-            judged_since_ns = min(running.judged_since_ns, judged_since_ns)
-            self._put(replace(longer, since_ns=min(running.since_ns, since_ns), judged_since_ns=judged_since_ns))
-            of_fan[alarm.onset_t_ns] = running.name
-            return
-        clip = Clip(clip_name(alarm, self._clips), tray, since_ns, until_ns, judged_since_ns, (new,))
-        self._put(clip)
-        of_fan[alarm.onset_t_ns] = clip.name
+        clip = next((clip for clip in of_tray if self._is_joined(clip, received_t_ns, until_ns)), None)
+        if clip is None:
+            name = clip_name(alarm, self._clips)
+            clip = Clip(name, alarm.header.tray, since_ns, until_ns, judged_since_ns, ())
+        self._put(
+            replace(
+                clip,
+                alarms=(*clip.alarms, new),
+                since_ns=min(clip.since_ns, since_ns),
+                until_ns=max(clip.until_ns, until_ns),
+                judged_since_ns=min(clip.judged_since_ns, judged_since_ns),
+            )
+        )
 
     def _is_joined(self, clip: Clip, received_t_ns: int, until_ns: int) -> bool:
         """Whether an alarm that is received now belongs to a clip, which then goes on until `until_ns`."""
-        is_running = clip.is_due and clip.name not in self._being_cut and clip.name not in self._ends_ns
+        is_running = clip.is_due and clip.name not in self._being_cut | self._ended
         is_short = until_ns - clip.since_ns <= LONGEST_NS + self._before_ns + self._after_ns
         return is_running and is_short and clip.since_ns <= received_t_ns <= clip.until_ns
+
+    def _is_settled(self, clip: Clip, unsaved_since_ns: int | None) -> bool:
+        """Whether all of a clip has come and is on the disk."""
+        is_saved = unsaved_since_ns is None or clip.until_ns < unsaved_since_ns
+        return is_saved and clip.until_ns + self._settled_ns <= self._now_ns
 
     def _end_running(self, now_ns: int) -> None:
         """The host's clock was set back: what is running ends there, and does not wait for that time again."""
         for clip in [clip for clip in self._clips.values() if clip.is_due and clip.until_ns > now_ns]:
             self._put(replace(clip, until_ns=max(clip.since_ns, min(clip.until_ns, self._now_ns))))
-            self._ends_ns[clip.name] = now_ns
+            self._ended.add(clip.name)
         self._retry_ns = min(self._retry_ns, now_ns)
 
     def _is_full(self) -> bool:
-        return bool(self._most_bytes) and self._total() >= self._most_bytes
-
-    def _total(self) -> int:
-        return sum(clip.size_bytes for clip in self._clips.values())
+        return 0 < self._most_bytes <= sum(clip.size_bytes for clip in self._clips.values())
 
     def _drop(self, clip: Clip) -> None:
         self.counts["clips_not_kept"] += 1
@@ -214,8 +214,6 @@ class ClipTracker:
 
     def _remove(self, clip: Clip) -> None:
         del self._clips[clip.name]
-        for each in clip.alarms:
-            self._of_fan[clip.tray, each.fan].pop(each.onset_t_ns, None)
         self.version += 1
 
     def _put(self, clip: Clip) -> None:

@@ -142,10 +142,8 @@ def test_a_clock_that_is_set_back_does_not_make_a_clip_wait():
     of = tracker()
     follow(of, alarm())
     assert of.due(T0 + 30 * S) == []
-    assert of.due(T0 - 3600 * S) == []
-    (clip,) = of.clips
-    assert clip.until_ns == T0 + 30 * S
-    assert cut(of, -3597) == [clip.name]
+    (due,) = of.due(T0 - 3600 * S)
+    assert due.until_ns == T0 + 30 * S
 
 
 def test_clips_survive_a_restart_in_their_list_and_what_was_cut_short_is_cut_again(tmp_path):

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from fantwin.pipeline.recordings.clips.clip import Clip, clip_lines
-from fantwin.pipeline.recordings.clips.cutting import cut_clips
+from fantwin.pipeline.recordings.clips.cutting import ClipCutter
 from fantwin.pipeline.recordings.contents import contents_of
-from fantwin.pipeline.recordings.disk import DiskError
 from fantwin.pipeline.recordings.reading import read_metadata, read_recording
 from fantwin.pipeline.recordings.records import active_path
 from fantwin.pipeline.recordings.writing import RecordingWriter
@@ -32,11 +32,16 @@ def first_raised(path: Path) -> Alarm:
     return next(alarm for alarm in recorded(path, "alarm") if alarm.transition == Transition.RAISED)
 
 
+def cutter(recording: Path, **more: Any) -> ClipCutter:
+    """On a disk with room."""
+    return ClipCutter(recording, **{"free_bytes": lambda: 1 << 40, **more})
+
+
 def cut(source: Path, folder: Path, left_out: tuple[str, ...] = ()) -> Path:
     """The clip of the first alarm of a recording, from its parts, the last of which is still being written."""
     clip = clip_of(first_raised(source), before_s=0.5, after_s=2.0)
     core = record(source, folder / "recording.mcap", left_out, part_s=1.0)
-    (result,) = cut_clips([clip], folder / "recording.mcap", folder / "clips", core._index(), margin_s=MARGIN_S)
+    result = cutter(folder / "recording.mcap", margin_s=MARGIN_S).cut(clip, core._index())
     core.close()
     assert result.size_bytes == (folder / "clips" / clip.name).stat().st_size
     assert not result.problem
@@ -117,8 +122,8 @@ def later(tmp_path_factory: pytest.TempPathFactory) -> Path:
     assert raised.onset_t_ns < shelved.t_ns < raised.t_ns
     clip = clip_of(raised, before_s=0.05, after_s=4.5)
     record(source, folder / "parts" / "recording.mcap", part_s=1.0).close()
-    cut_clips([clip], folder / "parts" / "recording.mcap", folder / "clips", margin_s=0.5)
-    return folder / "clips" / clip.name
+    cutter(folder / "parts" / "recording.mcap", margin_s=0.5).cut(clip)
+    return folder / "parts" / "clips" / clip.name
 
 
 def test_a_clip_whose_snapshot_lacks_evidence_has_its_alarm_at_about_the_same_time(later):
@@ -184,10 +189,14 @@ def test_what_cannot_be_written_leaves_no_file_and_can_be_tried_again(undisturbe
     record(undisturbed, tmp_path / "recording.mcap", part_s=1.0).close()
     folder = tmp_path / "clips"
     with disk_of(40_000):
-        (result,) = cut_clips([clip], tmp_path / "recording.mcap", folder)
+        result = cutter(tmp_path / "recording.mcap").cut(clip)
     assert result.may_pass and not result.size_bytes and "File too large" in result.problem
     assert list(folder.iterdir()) == []
-    (result,) = cut_clips([clip], tmp_path / "recording.mcap", folder)
+    room = iter([5_000_000, 1_000_000, 1_000, 1_000])
+    result = cutter(tmp_path / "recording.mcap", free_bytes=lambda: next(room), min_free_bytes=10_000).cut(clip)
+    assert result.may_pass and not result.size_bytes and "0.0 MB are free" in result.problem
+    assert list(folder.iterdir()) == [], "room ran out while it was written"
+    result = cutter(tmp_path / "recording.mcap").cut(clip)
     assert result.size_bytes and [path.name for path in folder.iterdir()] == [clip.name]
 
 
@@ -196,31 +205,12 @@ def test_a_clip_of_parts_that_are_gone_is_not_written_and_one_of_some_has_the_re
     record(undisturbed, tmp_path / "recording.mcap", part_s=1.0).close()
     (tmp_path / "recording.mcap").unlink()
     clip = clip_of(alarm, before_s=0.5, after_s=2.0)
-    (result,) = cut_clips([clip], tmp_path / "recording.mcap", tmp_path / "clips")
+    result = cutter(tmp_path / "recording.mcap").cut(clip)
     assert result.size_bytes
     first = recorded(tmp_path / "clips" / clip.name, "raw")[0].host_receive_t_ns[0]
     assert first == recorded(tmp_path / "recording-2.mcap", "raw")[0].host_receive_t_ns[0]
     past = Clip("past.mcap", "tray1", 5 * S, 9 * S, 5 * S, clip.alarms)
-    (result,) = cut_clips([past], tmp_path / "recording.mcap", tmp_path / "clips")
+    result = cutter(tmp_path / "recording.mcap").cut(past)
     assert (result.size_bytes, result.may_pass) == (0, False)
     assert "nothing of that time is recorded" in result.problem
     assert not active_path(tmp_path / "clips" / past.name).exists()
-
-
-def test_where_room_runs_out_while_clips_are_written_the_last_one_is_given_up(undisturbed, tmp_path):
-    clip = clip_of(first_raised(undisturbed), before_s=0.5, after_s=2.0)
-    record(undisturbed, tmp_path / "recording.mcap", part_s=1.0).close()
-    folder = tmp_path / "clips"
-    files: list[int] = []
-
-    def rest() -> None:
-        files.append(len(list(folder.iterdir())))
-        if len(files) == 2:
-            raise DiskError("0.1 MB are free")
-
-    clips = [clip, replace(clip, name="last.mcap")]
-    first, last = cut_clips(clips, tmp_path / "recording.mcap", folder, rest=rest)
-    assert first.size_bytes and not first.problem
-    assert (last.size_bytes, last.may_pass, last.problem) == (0, True, "0.1 MB are free")
-    assert files[:3] == [2, 2, 1], "there is room again before the first one goes on"
-    assert [path.name for path in folder.iterdir()] == [clip.name]
