@@ -41,8 +41,6 @@ class Comparison:
     """replayed, and later than the last recorded score of their session"""
     not_comparable: int = 0
     """not equal or not replayed, where the recording lacks what they were computed from"""
-    in_part: int = 0
-    """those of a clip that are equal but for what rests on evidence that its snapshot lacks"""
     alarms_not_comparable: int = 0
     has_scores: bool = True
     """scores were recorded; otherwise snapshots are compared"""
@@ -71,7 +69,7 @@ class Comparison:
     def has_content(self) -> bool:
         """Whether anything could be compared."""
         if self.has_scores:
-            return bool(self.equal or self.in_part or self.different or self.not_made)
+            return bool(self.equal or self.different or self.not_made)
         return bool(self.alarms_equal or self.snapshots_equal or not self.is_equal)
 
     def note(self, apart: Apart) -> None:

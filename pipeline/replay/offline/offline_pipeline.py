@@ -22,8 +22,6 @@ from fantwin.pipeline.replay.offline.sample_stream import SampleStream
 from fantwin.pipeline.replay.stage_chain import StageChain
 from fantwin.pipeline.runtime.stage import Context, Core, Stage
 from fantwin.schemas.blocks import cut
-from fantwin.schemas.envelope import Envelope
-from fantwin.schemas.fast_decode import decode_header
 from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Message, NewTwin, Prediction, Request, ScorerSnapshot
 from fantwin.schemas.messages import newest_t_ns as message_t_ns
@@ -48,11 +46,9 @@ class OfflinePipeline:
         raw: RawBlocks,
         plan: TrayPlan,
         observe: Callable[[Message], None],
-        recorded_inputs: Callable[[], Iterable[Envelope]] = tuple,
     ) -> None:
         """contexts: of this tray, one for each stage. observe: is given what each stage makes and a later one consumes,
-        the requests, and what the last stage makes. recorded_inputs: the recorded input of the last stage, from the
-        beginning at each call; only for a plan that uses it."""
+        the requests, and what the last stage makes."""
         self._contexts = {stage.name: context for stage, context in zip(stages.stages, contexts, strict=True)}
         self._raw = raw
         self._plan = plan
@@ -63,10 +59,7 @@ class OfflinePipeline:
         """sessions of the first stage that consumed raw messages which the recording lacks"""
         self._last = stages.stages[-1]
         streams: dict[str, SampleStream[Any]] = {}
-        if plan.uses_recorded_inputs:
-            for producer in dict.fromkeys(span.producer for session in plan.last for span in session.spans):
-                streams[producer] = SampleStream(_samples_of(recorded_inputs(), producer))
-        for stage, output in zip(() if plan.uses_recorded_inputs else stages.stages[:-1], stages.outputs, strict=False):
+        for stage, output in zip(stages.stages[:-1], stages.outputs, strict=False):
             streams = {
                 session.producer: SampleStream(self._run_stage(stage, output, session, streams))
                 for session in plan.sessions[stage.name]
@@ -222,13 +215,3 @@ class OfflinePipeline:
         closing = list(core.close())
         self.counts.update(core.counters() if counters is None else counters)
         return closing
-
-
-def _samples_of(envelopes: Iterable[Envelope], producer: str) -> Iterator[Any]:
-    """The recorded samples of one producer, each message once."""
-    next_sequence = 0
-    for envelope in envelopes:
-        header = decode_header(envelope)
-        if header.producer == producer and header.sequence >= next_sequence:
-            next_sequence = header.sequence + 1
-            yield envelope.message

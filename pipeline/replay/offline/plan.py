@@ -72,10 +72,6 @@ class Session:
     """of its outputs or reports"""
     position: InputPosition | None = None
     """of its newest recorded output"""
-    first_position: InputPosition | None = None
-    """of its first recorded output"""
-    lacks_evidence: bool = False
-    """it continues from a snapshot in the middle of a recorded session, which had evidence that no snapshot keeps"""
     snapshots_t_ns: list[int] = field(default_factory=list)
     """when it took the recorded snapshots, in order: a replay takes its own there, because evidence is rounded then"""
 
@@ -93,8 +89,6 @@ class TrayPlan:
     """by stage in the order of the chain, each list in the order the sessions began"""
     uses_recorded_snapshots: bool = True
     """False, with another twin or configuration: a session is restored from what the replayed one before it left"""
-    uses_recorded_inputs: bool = False
-    """the last stage is given what was recorded of its input, and the stages before it do not run"""
 
     @property
     def first(self) -> list[Session]:

@@ -6,14 +6,13 @@ their place.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable
-from typing import NamedTuple
+from collections.abc import Collection, Iterable
+from typing import Any
 
 from fantwin.pipeline.replay.offline.plan import BEGINNING, Session, Span, TrayPlan
 from fantwin.pipeline.replay.stage_chain import StageChain
 from fantwin.schemas.codec import CodecError
 from fantwin.schemas.envelope import Envelope
-from fantwin.schemas.fast_decode import decode_header
 from fantwin.schemas.header import InputPosition
 from fantwin.schemas.messages import (
     Alarm,
@@ -31,27 +30,11 @@ from fantwin.schemas.streams import continues
 _NEVER_REACHED = "raw messages never reached {}, and the recording does not say which"
 
 
-class Output(NamedTuple):
-    """What is known of a recorded output, or of one that a stage has reported."""
-
-    producer: str
-    number: int
-    """counts what is known of its producer: sequence number of the output, or of the report"""
-    position: InputPosition
-    first_t_ns: Callable[[], int]
-    newest_t_ns: int
-
-
-class NoInputPositionError(Exception):
-    """An output does not say which input it was made from."""
-
-
 class PlanReader:
     """Reads a tray's outputs and side topics, in the order they were recorded."""
 
-    def __init__(self, chain: StageChain, left_out: Collection[str] = (), *, from_snapshot: bool = False) -> None:
-        """left_out: topics that the recorder did not record. from_snapshot: the recording is a clip that begins in the
-        middle of a session, with the snapshot from which this goes on."""
+    def __init__(self, chain: StageChain, left_out: Collection[str] = ()) -> None:
+        """left_out: topics that the recorder did not record."""
         self._left_out = left_out
         self._result = chain.outputs[-1]
         self._stages = {topic: stage.name for stage, topic in zip(chain.stages, chain.outputs, strict=True)}
@@ -66,7 +49,6 @@ class PlanReader:
         self._twins: dict[tuple[str, int], ModelCard] = {}
         self._answers: dict[tuple[str, str], tuple[int, int]] = {}
         self._has_positions = True
-        self._from_snapshot = from_snapshot
         self.first_snapshot: ScorerSnapshot | None = None
         """the first one in the recording"""
         self.alarms: dict[tuple[str, int], Alarm] = {}
@@ -77,14 +59,12 @@ class PlanReader:
         """Read the next message."""
         try:
             if envelope.topic in self._stages:
-                if self._has_positions:
-                    self._add_output(envelope)
+                self._extend(self._stages[envelope.topic], envelope.header, envelope.newest_t_ns, envelope)
             elif isinstance(message := envelope.message, Consumed):
-                self._add_report(message)
+                if message.topic in self._left_out:
+                    self._extend(self._stages[message.topic], message.header, message.t_ns, envelope)
             else:
                 self._add_side(message)
-        except NoInputPositionError:
-            self._has_positions = False
         except CodecError:
             self.undecodable += 1
 
@@ -104,7 +84,7 @@ class PlanReader:
         _open_ends(plan)
         _find_repeats(plan)
         self._add_sides(plan)
-        _limit_unknown_beginnings(plan, 1 if self._from_snapshot else 0)
+        _limit_unknown_beginnings(plan)
         return plan
 
     @property
@@ -129,52 +109,37 @@ class PlanReader:
             lacking = f"it has no {'reports' if empty[0] in self._left_out else 'messages'} of topic {empty[0]}"
         return f"{lacking}: nothing to compare with"
 
-    def _add_output(self, envelope: Envelope) -> None:
-        header = decode_header(envelope)
-        if not header.HasField("input_position"):
-            raise NoInputPositionError
-        known = header.input_position
-        position = InputPosition(
-            known.topic,
-            known.producer,
-            known.sequence,
-            known.consumed_count,
-            known.contiguous_from,
-            known.from_timer,
-        )
+    def _extend(self, stage: str, header: Any, newest_t_ns: int, envelope: Envelope) -> None:
+        """Add to the session of a stage what it consumed up to an output.
 
-        def first_t_ns() -> int:
-            message = envelope.message
-            assert isinstance(message, Grid | Prediction | Score)
-            return int(message.t_ns[0])
-
-        output = Output(header.producer, header.sequence, position, first_t_ns, envelope.newest_t_ns)
-        self._extend(self._stages[envelope.topic], output)
-
-    def _add_report(self, report: Consumed) -> None:
-        header, position = report.header, report.header.input_position
-        if report.topic in self._left_out and position is not None:
-            output = Output(header.producer, header.sequence, position, lambda: report.first_t_ns, report.t_ns)
-            self._extend(self._stages[report.topic], output)
-
-    def _extend(self, stage: str, output: Output) -> None:
-        """Add to the session of a stage what it consumed up to this output."""
+        header: of the output, or of a report of it, which are numbered each by themselves. newest_t_ns: time of the
+        newest sample of the output.
+        """
+        position: InputPosition | None = header.input_position
+        if position is None or not position.consumed_count:
+            self._has_positions = False
+            return
         sessions = self._sessions[stage]
-        session = sessions.get(output.producer)
+        session = sessions.get(header.producer)
         if session is None:
             # the first stage consumes messages without making output; the others answer the first message at once
-            began_before = stage != self._first and output.position.consumed_count > 1
-            lacks_outputs = stage != self._first and output.number > 0
-            session = sessions[output.producer] = Session(output.producer, began_before, lacks_outputs)
-            session.first_position = output.position
-        elif output.number < session.next_number:
+            began_before = stage != self._first and position.consumed_count > 1
+            lacks_outputs = stage != self._first and header.sequence > 0
+            session = sessions[header.producer] = Session(header.producer, began_before, lacks_outputs)
+        elif header.sequence < session.next_number:
             return  # this part of the recording overlaps the one before
         if stage == self._first:
-            _extend_by_messages(session, output)
+            _extend_by_messages(session, position, newest_t_ns)
+        elif session.position and continues(session.position, position):
+            session.spans[-1].last = newest_t_ns
         else:
-            _extend_by_samples(session, output)
-        session.position = output.position
-        session.next_number, session.last_t_ns = output.number + 1, output.newest_t_ns
+            if (
+                session.position and header.sequence > session.next_number
+            ):  # it may have consumed samples of any producer
+                session.set_limit(session.last_t_ns, f"what {session.producer} consumed next was not recorded")
+            session.spans.append(Span(position.producer, _first_t_ns(envelope.message), newest_t_ns))
+        session.position = position
+        session.next_number, session.last_t_ns = header.sequence + 1, newest_t_ns
 
     def _extend_last(self, sessions: Iterable[Session]) -> None:
         """A killed session has not reported its last outputs: its alarms and snapshots show that it went on."""
@@ -220,8 +185,16 @@ class PlanReader:
                 sessions[producer].requests.append((t_ns, self._requests[name]))
 
 
-def _extend_by_messages(session: Session, output: Output) -> None:
-    before, position = session.position, output.position
+def _first_t_ns(message: Message) -> int:
+    """Time of the first sample of an output, or of the output of a report."""
+    if isinstance(message, Consumed):
+        return message.first_t_ns
+    assert isinstance(message, Grid | Prediction | Score)
+    return int(message.t_ns[0])
+
+
+def _extend_by_messages(session: Session, position: InputPosition, newest_t_ns: int) -> None:
+    before = session.position
     if before is None:
         first = max(0, position.sequence - position.consumed_count + 1)
         session.spans.append(Span(position.producer, first, position.sequence))
@@ -240,17 +213,7 @@ def _extend_by_messages(session: Session, output: Output) -> None:
         session.spans.append(Span(position.producer, position.contiguous_from, position.sequence))
     session.spans[-1].last_known = position.sequence
     if position.from_timer:
-        session.timer_outputs[position.producer, position.sequence] = output.newest_t_ns
-
-
-def _extend_by_samples(session: Session, output: Output) -> None:
-    before = session.position
-    if before and continues(before, output.position):
-        session.spans[-1].last = output.newest_t_ns
-    else:
-        if before and output.number > session.next_number:  # it may have consumed samples of any producer in between
-            session.set_limit(session.last_t_ns, f"what {session.producer} consumed next was not recorded")
-        session.spans.append(Span(output.position.producer, output.first_t_ns(), output.newest_t_ns))
+        session.timer_outputs[position.producer, position.sequence] = newest_t_ns
 
 
 def _drop_unknown_producers(sessions: list[Session], known: set[str]) -> None:
@@ -266,11 +229,10 @@ def _drop_unknown_producers(sessions: list[Session], known: set[str]) -> None:
             session.spans = [span for span in session.spans if span.producer in known]
 
 
-def _limit_unknown_beginnings(plan: TrayPlan, first: int) -> None:
+def _limit_unknown_beginnings(plan: TrayPlan) -> None:
     for sessions in plan.sessions.values():
         for number, session in enumerate(sessions):
-            is_unknown = session.lacks_outputs or (session.began_before and session.snapshot is None)
-            if number >= first and is_unknown:
+            if session.lacks_outputs or (session.began_before and session.snapshot is None):
                 reason = (
                     f"the first messages of {session.producer} were not recorded"
                     if number

@@ -10,7 +10,7 @@ import numpy as np
 from fantwin.pipeline.replay.offline.plan import Session, Span
 from fantwin.schemas.blocks import cut
 from fantwin.schemas.envelope import Envelope
-from fantwin.schemas.fast_decode import decode_header, decode_together
+from fantwin.schemas.fast_decode import decode_together
 from fantwin.schemas.messages import Message, Raw
 from fantwin.schemas.units import NS_PER_S
 
@@ -116,7 +116,7 @@ class RawBlocks:
         number, has_begun = 0, not spans[0].producer
         due: dict[str, int] = {spans[0].producer: spans[0].first} if spans[0].producer else {}
         for envelope in self._read():
-            header = decode_header(envelope)
+            header = envelope.header
             producer, sequence = header.producer, header.sequence
             if sequence < next_sequence.get(producer, 0):
                 continue  # this part of the recording overlaps the one before

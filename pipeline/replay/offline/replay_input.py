@@ -18,7 +18,7 @@ from fantwin.pipeline.recordings.order import in_order
 from fantwin.pipeline.recordings.reading import RecordingError, RecordingMetadata, read_metadata, read_recording
 from fantwin.pipeline.recordings.run_recordings import run_metadata
 from fantwin.pipeline.replay.default_config import default_config, first_raw
-from fantwin.pipeline.replay.offline.clip_plan import NO_PREDICTIONS, plan_from_snapshot, plan_with_recorded_inputs
+from fantwin.pipeline.replay.offline.clip_plan import NOT_VERIFIED, plan_from_snapshot
 from fantwin.pipeline.replay.offline.offline_pipeline import OfflinePipeline
 from fantwin.pipeline.replay.offline.plan import TrayPlan, undisturbed_plan
 from fantwin.pipeline.replay.offline.plan_reader import PlanReader
@@ -29,7 +29,7 @@ from fantwin.pipeline.runtime.consumed import CONSUMED
 from fantwin.pipeline.runtime.stage import Context
 from fantwin.pipeline.timebase.stage_clock import is_of_replay
 from fantwin.schemas.envelope import Envelope
-from fantwin.schemas.messages import Alarm, Message, ModelCard, ScorerSnapshot
+from fantwin.schemas.messages import Alarm, Message, ModelCard
 
 
 @dataclass
@@ -83,38 +83,28 @@ class ReplayInput:
     def read_plan(self, tray: str, *, verify: bool = False) -> tuple[TrayPlan | None, list[Alarm], str]:
         """What each session of a tray's stages consumed; the recorded alarms, each once; why there is no plan.
 
-        The plan is None if the recording does not contain it, or if another grid or only a part is replayed. verify:
-        the replay is compared with the recording, which of a clip needs another plan.
+        The plan is None if the recording does not contain it, if another grid or only a part is replayed, or to verify
+        a clip.
         """
         left_out = self.metadata.left_out
         recorded = [topic for topic in self.stages.outputs if topic not in left_out]
-        from_snapshot = CLIP_SNAPSHOT_KEY in self.metadata.metadata
-        reader = PlanReader(self.stages, left_out, from_snapshot=from_snapshot)
+        reader = PlanReader(self.stages, left_out)
         for envelope in self.envelopes(tray, (*recorded, *self.stages.side_topics, CONSUMED)):
             reader.add(envelope)
         if reader.undecodable:
             line = f"{self.paths[0]}: messages left out that cannot be decoded: {reader.undecodable}"
             self.damage[self.paths[0]] = line
-        if from_snapshot and reader.first_snapshot:
-            plan, reason = self._clip_plan(tray, reader, reader.first_snapshot, verify=verify)
-            return plan, list(reader.alarms.values()), reason
+        alarms, snapshot = list(reader.alarms.values()), reader.first_snapshot
+        if CLIP_SNAPSHOT_KEY in self.metadata.metadata and snapshot:
+            twins = reader.twins if self.twins[tray] is None else []
+            plan = None if verify else plan_from_snapshot(self.stages, snapshot, twins, reader.answered_requests)
+            return plan, alarms, NOT_VERIFIED
         plan = reader.plan() if self.is_same_grid and not self.is_part else None
         if plan:
             plan.uses_recorded_snapshots = self.is_as_recorded
             if self.twins[tray] is not None:
                 plan.without_learned_twins()
-        return plan, list(reader.alarms.values()), reader.no_plan_reason
-
-    def _clip_plan(
-        self, tray: str, reader: PlanReader, snapshot: ScorerSnapshot, *, verify: bool
-    ) -> tuple[TrayPlan | None, str]:
-        if not verify:
-            twins = reader.twins if self.twins[tray] is None else []
-            return plan_from_snapshot(self.stages, snapshot, twins, reader.answered_requests), ""
-        if self.stages.outputs[-2] in self.metadata.left_out:
-            return None, NO_PREDICTIONS
-        plan = reader.plan()
-        return (plan_with_recorded_inputs(plan, snapshot) if plan else None), reader.no_plan_reason
+        return plan, alarms, reader.no_plan_reason
 
     def learned_twins(self, tray: str) -> list[ModelCard]:
         """Those that replace one another in the recording, each with its first sample; none if another twin is used."""
@@ -132,8 +122,7 @@ class ReplayInput:
         raw = RawBlocks(lambda: self.envelopes(tray, ("raw",)), observe, (self.start_s, self.end_s))
         contexts = self.contexts(self.config.tray(tray))
         plan = plan or undisturbed_plan(self.stages, self.learned_twins(tray))
-        inputs = self.stages.outputs[-2]
-        return OfflinePipeline(self.stages, contexts, raw, plan, observe, lambda: self.envelopes(tray, (inputs,)))
+        return OfflinePipeline(self.stages, contexts, raw, plan, observe)
 
     def contexts(self, tray: TrayConfig) -> list[Context]:
         """What each stage of a tray is built from, in the order of the chain."""

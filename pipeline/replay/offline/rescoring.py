@@ -132,7 +132,7 @@ def _rescore_tray(
     def observe(message: Message) -> None:
         if output:
             output.add(message)
-        if verifier and isinstance(message, Grid | Prediction) and not plan_used.uses_recorded_inputs:
+        if verifier and isinstance(message, Grid | Prediction):
             verifier.add_input(message)
 
     pipeline = replay_input.pipeline(tray, rescored.plan, observe)
@@ -142,7 +142,6 @@ def _rescore_tray(
             lambda topic: replay_input.envelopes(tray, (topic,)),
             pipeline.limit_of,
             replay_input.metadata.left_out,
-            [session.producer for session in plan.last if session.lacks_evidence],
         )
         if verify and plan
         else None

@@ -1,8 +1,7 @@
 """Comparison of replayed scores and alarms with the recorded ones; of snapshots if scores are not recorded.
 
 Decisions must be equal: states, statistics, validity and its reasons, times, and alarms with the order of their causes.
-Numbers may differ within a tolerance (pipeline.replay.offline.tolerance); those of alarm clips by more, and in time
-(pipeline.replay.offline.clip_tolerance).
+Numbers may differ within a tolerance (pipeline.replay.offline.tolerance).
 """
 
 from __future__ import annotations
@@ -15,7 +14,6 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 
 from fantwin.pipeline.recordings.dates import format_utc
-from fantwin.pipeline.replay.offline.clip_tolerance import LACKS_EVIDENCE, OF_EVIDENCE, may_be_alone, nearest
 from fantwin.pipeline.replay.offline.compare_snapshots import SnapshotVerifier
 from fantwin.pipeline.replay.offline.comparison import Comparison
 from fantwin.pipeline.replay.offline.plan import Limit, Session
@@ -23,7 +21,7 @@ from fantwin.pipeline.replay.offline.tolerance import Apart, differences, shares
 from fantwin.schemas.blocks import cut
 from fantwin.schemas.enums import Transition
 from fantwin.schemas.envelope import Envelope
-from fantwin.schemas.fast_decode import decode_header, decode_together
+from fantwin.schemas.fast_decode import decode_together
 from fantwin.schemas.fields import columns
 from fantwin.schemas.messages import Alarm, Array, Grid, Message, Prediction, Score, ScorerSnapshot
 
@@ -51,14 +49,11 @@ class TrayVerifier:
         read: Callable[[str], Iterable[Envelope]],
         limit_of: Callable[[str], Limit | None],
         left_out: Collection[str] = (),
-        lacking_evidence: Collection[str] = (),
     ) -> None:
         """read: the recorded messages of a topic of the tray, from the beginning at each call. limit_of: the limit of a
-        session of the scorer, as known when its last scores were made. left_out: topics that are not recorded.
-        lacking_evidence: sessions of the scorer with `lacks_evidence`."""
+        session of the scorer, as known when its last scores were made. left_out: topics that are not recorded."""
         self._read = read
         self._limit_of = limit_of
-        self._lacking_evidence = lacking_evidence
         self._producer: str | None = None
         self._recorded: RecordedSession[Score] | None = None
         self._visited: set[str] = set()
@@ -85,8 +80,7 @@ class TrayVerifier:
         if self._recorded is None or producer != self._producer:
             self._end_session()
             self._recorded = self._begin_session(producer)
-        lacks_evidence = producer in self._lacking_evidence
-        compare_scores(score, self._recorded, self._found, self._limit_of(producer), lacks_evidence=lacks_evidence)
+        compare_scores(score, self._recorded, self._found, self._limit_of(producer))
 
     def finish(self, sessions: Sequence[Session], alarms: Sequence[Alarm], recorded: Sequence[Alarm]) -> Comparison:
         """Compare what is left, and the alarms; the result."""
@@ -99,8 +93,8 @@ class TrayVerifier:
                 [alarm for alarm in listed if alarm.header.producer == session.producer]
                 for listed in (alarms, recorded)
             )
-            limit, lacks_evidence = self._limit_of(session.producer), session.lacks_evidence
-            compare_alarms(replayed, known, session.last_t_ns, self._found, limit, lacks_evidence=lacks_evidence)
+            limit = self._limit_of(session.producer)
+            compare_alarms(replayed, known, session.last_t_ns, self._found, limit)
             if limit is not None and limit.t_ns < session.last_t_ns and not self._found.has_scores:
                 self._found.add_limit(limit)
         if holes := self._found.holes:
@@ -174,14 +168,9 @@ def compare_inputs(
 
 
 def compare_scores(
-    made: Score,
-    recorded: RecordedSession[Score],
-    found: Comparison,
-    limit: Limit | None = None,
-    *,
-    lacks_evidence: bool = False,
+    made: Score, recorded: RecordedSession[Score], found: Comparison, limit: Limit | None = None
 ) -> None:
-    """Compare a block of scores with the recorded ones up to its last sample. lacks_evidence: see Session."""
+    """Compare a block of scores with the recorded ones up to its last sample."""
     is_taken = np.zeros(len(made.t_ns), np.bool_)
     had_begun = recorded.has_begun
     for block in recorded.until(int(made.t_ns[-1])):
@@ -191,25 +180,16 @@ def compare_scores(
         rows = at[is_made]
         is_taken[rows] = True
         within = _within(block.t_ns[is_made], limit)
-        in_part = np.zeros(len(rows), np.bool_)
         if block.fans != made.fans:
             different = np.ones(len(rows), np.bool_)
             found.name(f"{found.tray}: {made.fans} fans replayed, {block.fans} recorded")
         else:
             one, other = _columns(made, rows), _columns(block, is_made)
-            if lacks_evidence:
-                of_evidence = [(name, one.pop(name), other.pop(name)) for name in OF_EVIDENCE]
-                in_part = np.any([_differ(*each, found).any(axis=1) for each in of_evidence], axis=0)
             different = _compare_samples(block.t_ns[is_made], one, other, within, found)
-            in_part &= ~different
         if limit is not None:
             found.add_not_comparable(int((different & ~within).sum()), limit)
-        if in_part.any():
-            found.in_part += int(in_part.sum())
-            found.not_comparable += int(in_part.sum())
-            found.add_reason(f"{found.tray}: {LACKS_EVIDENCE}")
         found.different += int((different & within).sum())
-        found.equal += int((~different & ~in_part).sum())
+        found.equal += int((~different).sum())
     found.not_recorded += int((~is_taken).sum())
     taken = np.flatnonzero(is_taken)
     between = slice(
@@ -288,17 +268,13 @@ def compare_alarms(
     last_scored_t_ns: int,
     found: Comparison,
     limit: Limit | None = None,
-    *,
-    lacks_evidence: bool = False,
 ) -> None:
     """Compare the alarms of one session with the recorded ones, matched by fan, time, transition and request.
 
     An alarm is published right after its score, so those of the last recorded score may be missing in the recording.
-    lacks_evidence: see Session.
     """
     at_a_limit = f" ({AT_A_LIMIT})" if found.equal and not found.numbers_different else ""
     left = {_key(alarm): alarm for alarm in recorded}
-    unlike: list[Alarm] = []
     for alarm in made:
         other = left.pop(_key(alarm), None)
         where = first_difference(alarm, other, found.note) if other is not None else ""
@@ -306,9 +282,6 @@ def compare_alarms(
             found.alarms_equal += 1
         elif limit is not None and alarm.t_ns > limit.t_ns:
             found.alarms_not_comparable += 1
-        elif lacks_evidence:
-            unlike.append(alarm)
-            left |= {_key(other): other} if other is not None else {}
         elif other is not None:
             found.alarms_different += 1
             found.name(f"{found.tray}: alarm {_describe(alarm)} replayed, {other.message!r} recorded: {where} differs")
@@ -317,8 +290,6 @@ def compare_alarms(
         else:
             found.alarms_different += 1
             found.name(f"{found.tray}: alarm {_describe(alarm)} replayed, none recorded{at_a_limit}")
-    if lacks_evidence:
-        _compare_in_time(unlike, left, last_scored_t_ns, found)
     for alarm in left.values():
         if limit is not None and alarm.t_ns > limit.t_ns:
             found.alarms_not_comparable += 1
@@ -331,32 +302,11 @@ def _key(alarm: Alarm) -> tuple[int, int, Transition, str]:
     return alarm.fan, alarm.t_ns, alarm.transition, alarm.request
 
 
-def _compare_in_time(
-    made: Iterable[Alarm], left: dict[tuple[int, int, Transition, str], Alarm], last_t_ns: int, found: Comparison
-) -> None:
-    """Compare the alarms of a clip that are not equal to a recorded one, and take what need not be equal from those
-    that are left."""
-    for alarm in made:
-        other = nearest(alarm, left.values())
-        if other is not None:
-            del left[_key(other)]
-        if other is not None or may_be_alone(alarm, last_t_ns):
-            found.alarms_not_comparable += 1
-            found.add_reason(f"{found.tray}: {LACKS_EVIDENCE}")
-        else:
-            found.alarms_different += 1
-            found.name(f"{found.tray}: alarm {_describe(alarm)} replayed, none recorded at about that time")
-    for key in [key for key, alarm in left.items() if may_be_alone(alarm, last_t_ns)]:
-        del left[key]
-        found.alarms_not_comparable += 1
-        found.add_reason(f"{found.tray}: {LACKS_EVIDENCE}")
-
-
 def _blocks(envelopes: Iterable[Envelope], producer: str, kind: type[Samples]) -> Iterator[Samples]:
     waiting: list[bytes] = []
     next_sequence = 0
     for envelope in envelopes:
-        header = decode_header(envelope)
+        header = envelope.header
         if header.producer == producer and header.sequence >= next_sequence:
             next_sequence = header.sequence + 1
             waiting.append(envelope.payload)
