@@ -8,7 +8,6 @@ with `fan.proto`.
 from __future__ import annotations
 
 from collections.abc import Collection
-from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, is_dataclass
 from functools import cache
 from types import NoneType
@@ -21,10 +20,9 @@ from google.protobuf.message import Message as ProtoMessage
 from fantwin.schemas import fan_pb2
 from fantwin.schemas.fields import Array, Column, OpenEnum, columns, other_fields, time_column
 from fantwin.schemas.messages import LARGEST_PERIOD_NS, Message
-from fantwin.schemas.wire_fields import LENGTH_DELIMITED, WireError, WireField, wire_fields
 
-_HEADER_KEY = 1 << 3 | LENGTH_DELIMITED  # of the field `header`, in every message
-_BOOLS = b"\0\1"
+_LENGTH_DELIMITED = 2
+_HEADER_KEY = 1 << 3 | _LENGTH_DELIMITED  # of the field `header`, in every message
 _SHORT = 48  # values; up to this length a list is a faster way into an array than the protobuf field itself
 
 AnyMessage = TypeVar("AnyMessage", bound=Message)
@@ -134,10 +132,6 @@ class _Layout:
     columns: tuple[_PackedColumn, ...]
     parts: dict[str, bytes]
     """the keys of the fields with nested messages that hold columns, by name"""
-    by_number: dict[int, _PackedColumn]
-    """the columns that the message itself holds, by the numbers of their fields"""
-    required: frozenset[str]
-    """names of the columns that are not optional"""
     time: str | None
     """name of the column of sample times; None for a message about one moment"""
 
@@ -156,7 +150,7 @@ def _layout(message_type: type[Message]) -> _Layout:
             name,
             column,
             column.dtype.newbyteorder("<"),
-            _varint(numbers[name] << 3 | LENGTH_DELIMITED),
+            _varint(numbers[name] << 3 | _LENGTH_DELIMITED),
             _nothing(column.dtype) if column.optional else None,
         )
         for name, column in declared.items()
@@ -167,9 +161,7 @@ def _layout(message_type: type[Message]) -> _Layout:
         proto=proto,
         record=_record(message_type),
         columns=packed,
-        parts={name: _varint(field.number << 3 | LENGTH_DELIMITED) for name, field in of_parts.items()},
-        by_number={numbers[column.name]: column for column in packed if not column.declared.part},
-        required=frozenset(column.name for column in packed if column.nothing is None),
+        parts={name: _varint(field.number << 3 | _LENGTH_DELIMITED) for name, field in of_parts.items()},
         time=time if time in declared else None,
     )
 
@@ -223,10 +215,12 @@ def encode(message: Message) -> bytes:
     return b"".join(parts)
 
 
-def decode(message_type: type[AnyMessage], data: bytes) -> AnyMessage:
+def decode(message_type: type[AnyMessage], data: bytes, names: Collection[str] | None = None) -> AnyMessage:
     """Parse bytes into a message; columns come back read-only in their declared shape.
 
     An optional column that the message does not have is empty. Enum values of a newer version are kept.
+
+    names: the columns that are needed, and the times; all others are left empty, which saves most of the time.
 
     Raises:
         CodecError: the bytes are not such a message.
@@ -240,7 +234,10 @@ def decode(message_type: type[AnyMessage], data: bytes) -> AnyMessage:
     fans = values.get("fans", -1)  # -1: a message without
     samples = len(getattr(proto, layout.time)) if layout.time else -1
     for column in layout.columns:
-        field = _field(proto, column)
+        if names is not None and column.name not in names and column.name != layout.time:
+            continue
+        part = column.declared.part
+        field = getattr(getattr(proto, part) if part else proto, column.name)
         if column.nothing is not None and not field:
             values[column.name] = column.nothing
             continue
@@ -257,11 +254,6 @@ def decode(message_type: type[AnyMessage], data: bytes) -> AnyMessage:
     return message
 
 
-def _field(proto: Any, column: _PackedColumn) -> Any:
-    part = column.declared.part
-    return getattr(getattr(proto, part) if part else proto, column.name)
-
-
 def decode_header(message_type: type[Message], data: bytes) -> Any:
     """The header of a message (`fan_pb2.Header`), without decoding the rest. Raises CodecError."""
     try:
@@ -275,85 +267,6 @@ def decode_header(message_type: type[Message], data: bytes) -> Any:
     except DecodeError as error:
         raise CodecError(f"{len(data)} bytes are not a {type_name(message_type)}: {error}") from error
     return message.header
-
-
-def decode_columns(message_type: type[AnyMessage], data: bytes, names: Collection[str]) -> AnyMessage:
-    """Parse some columns of a message, its times, and all that is no column; its other columns are left empty.
-
-    Columns are read-only views of `data`, and keep all of it in memory. So this takes about as long for a long message
-    as for a short one.
-
-    Raises:
-        CodecError: the bytes are not such a message.
-    """
-    layout = _layout(message_type)
-    own = {column.name for column in layout.by_number.values()}
-    try:
-        proto, arrays = _views(layout, data, {*names, layout.time} & own)
-    except (_PackedOtherwiseError, WireError):
-        return decode(message_type, data)
-    values = layout.record.read(proto)
-    fans, samples = values.get("fans", -1), len(arrays[layout.time]) if layout.time else -1
-    for column in layout.columns:
-        array = arrays.get(column.name)
-        if column.declared.part and column.name in names:
-            array = _array(layout, column, _field(proto, column))
-        if array is None or (column.declared.part and not array.size):
-            continue
-        if column.declared.shape == "samples x fans" and array.size == samples * fans:
-            array = array.reshape(samples, fans)
-        _check_shape(layout, column, array, samples, array.size if fans < 0 else fans)
-        values[column.name] = array
-    message = message_type(**values)
-    _check_period(layout, message)
-    return message
-
-
-class _PackedOtherwiseError(Exception):
-    """A message with columns that another encoder packed in a different way; only `decode` can read it."""
-
-
-def _views(layout: _Layout, data: bytes, names: AbstractSet[str | None]) -> tuple[Any, dict[str, Array]]:
-    """The fields that are no columns, parsed, and the named columns by name, flat, as they lie in `data`.
-
-    Raises:
-        _PackedOtherwiseError: a column that is not optional is missing; one is in several pieces, or not packed as
-            `encode` does it.
-        CodecError: the rest cannot be parsed, or a value is out of its limits.
-        WireError: these are no fields.
-    """
-    others: list[bytes] = []
-    arrays: dict[str, Array] = {}
-    for field in wire_fields(data):
-        column = layout.by_number.get(field.number)
-        if column is None:
-            others.append(data[field.key : field.end])
-        elif field.wire_type != LENGTH_DELIMITED or column.name in arrays:
-            raise _PackedOtherwiseError
-        elif column.name in names:
-            arrays[column.name] = _view(layout, column, data, field)
-    if len(arrays) < len(names) and not layout.required.isdisjoint(names - arrays.keys()):
-        raise _PackedOtherwiseError
-    try:
-        return layout.proto.FromString(b"".join(others)), arrays
-    except DecodeError as error:
-        raise CodecError(f"{len(data)} bytes are not a {layout.name}: {error}") from error
-
-
-def _view(layout: _Layout, column: _PackedColumn, data: bytes, field: WireField) -> Array:
-    """The values of a packed field where they lie, (n,)."""
-    length, size = field.end - field.start, column.dtype.itemsize
-    if not length or length % size:
-        raise _PackedOtherwiseError
-    array = np.frombuffer(data, column.dtype, length // size, field.start)
-    if size > 1:
-        _check_limits(layout, column, array)
-    elif column.declared.enum:
-        if not data[field.start : field.end].isascii():
-            raise _out_of_limits(layout, column)
-    elif data[field.start : field.end].translate(None, _BOOLS):
-        raise _PackedOtherwiseError
-    return array
 
 
 def _array(layout: _Layout, column: _PackedColumn, field: Any) -> Array:

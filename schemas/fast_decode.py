@@ -1,4 +1,4 @@
-"""Shortcuts for readers of hundreds of thousands of messages: only the header, or many messages as one block."""
+"""A shortcut for readers of hundreds of thousands of messages: many as one block."""
 
 from __future__ import annotations
 
@@ -6,21 +6,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, TypeVar
 
-from fantwin.schemas import codec
 from fantwin.schemas.codec import CodecError, decode
-from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.messages import Message
-from fantwin.schemas.topics import BY_NAME
 
 _Kind = TypeVar("_Kind", bound=Message)
-
-
-def decode_header(envelope: Envelope) -> Any:
-    """The header of a message (`fan_pb2.Header`), without decoding the rest. Raises CodecError."""
-    try:
-        return codec.decode_header(BY_NAME[envelope.topic].message, envelope.payload)
-    except CodecError as error:
-        raise CodecError(f"{envelope.key}: {error}") from error
 
 
 def decode_together(kind: type[_Kind], payloads: Sequence[bytes]) -> list[_Kind]:
@@ -36,10 +25,10 @@ def decode_together(kind: type[_Kind], payloads: Sequence[bytes]) -> list[_Kind]
     if not payloads:
         return []
     try:
-        together = _once(_decode(kind, b"".join(payloads)), len(payloads))
+        together = _once(decode(kind, b"".join(payloads)), len(payloads))
     except CodecError:
         together = None
-    return [_decode(kind, payload) for payload in payloads] if together is None else [together]
+    return [decode(kind, payload) for payload in payloads] if together is None else [together]
 
 
 def _once(message: _Kind, payloads: int) -> _Kind | None:
@@ -51,9 +40,3 @@ def _once(message: _Kind, payloads: int) -> _Kind | None:
             if found[name] * payloads != values:
                 return None
     return replace(message, **found) if found else message
-
-
-def _decode(kind: type[_Kind], payload: bytes) -> _Kind:
-    message = decode(kind, payload)
-    assert isinstance(message, kind)
-    return message

@@ -226,10 +226,10 @@ class _Scanner:
 
     def _add_unchunked(self, record: Record) -> None:
         """A message outside of chunks, as other writers may write them."""
-        channel, sequence, received_t_ns, _ = MESSAGE.unpack_from(record.content)
+        channel, _, received_t_ns, _ = MESSAGE.unpack_from(record.content)
         if not self._found.counts.knows(channel):
             raise ValueError("a message without a channel")
-        self._found.counts.add(channel, sequence, received_t_ns, record.content, MESSAGE.size, len(record.content))
+        self._found.counts.add(channel, received_t_ns, record.content[MESSAGE.size :])
         self._found.written[channel] += 1
         self._add_times(received_t_ns, received_t_ns)
 
@@ -239,11 +239,11 @@ class _Scanner:
         written: Counter[int] = Counter()
         for _, opcode, start, end in records_in(data):
             if opcode == Opcode.MESSAGE:
-                channel, sequence, received_t_ns, _ = MESSAGE.unpack_from(data, start)
+                channel, _, received_t_ns, _ = MESSAGE.unpack_from(data, start)
                 if channel not in written and not found.counts.knows(channel):
                     self._describe_from_summary(channel)
                 written[channel] += 1
-                found.counts.add(channel, sequence, received_t_ns, data, start + MESSAGE.size, end)
+                found.counts.add(channel, received_t_ns, data[start + MESSAGE.size : end])
             elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
                 self._describe(parse(Schema if opcode == Opcode.SCHEMA else Channel, data[start:end]))
         found.nameless += sum(written[channel] for channel in written.keys() & self._nameless)

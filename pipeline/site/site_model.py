@@ -24,7 +24,7 @@ from fantwin.pipeline.site.fan_history import COLUMNS, Curves, FanHistory, chann
 from fantwin.pipeline.site.fleet import SHOWN_CLASSES, Fan, FanGroup, FanNow, Fleet, last_sample
 from fantwin.pipeline.site.judged_time import LEARNED, JudgedTime
 from fantwin.pipeline.site.site_state import HeardHealth, StageState, stage_states
-from fantwin.schemas.codec import CodecError, decode_columns
+from fantwin.schemas.codec import CodecError, decode
 from fantwin.schemas.enums import Feedback, InvalidReason, StageStatus, Transition
 from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.health import Health
@@ -121,7 +121,7 @@ class SiteModel:
     def add_score(self, envelope: Envelope, columns: Sequence[str] = COLUMNS) -> Score | None:
         """A score of a known tray has arrived; returns it with these columns, or None if it cannot be shown."""
         try:
-            score = decode_columns(Score, envelope.payload, columns)
+            score = decode(Score, envelope.payload, columns)
         except CodecError:
             self.refused_scores += 1
             return None

@@ -19,7 +19,7 @@ from mcap_protobuf.schema import build_file_descriptor_set
 from fantwin.schemas import fan_pb2, messages
 from fantwin.schemas.channels import BY_NAME
 from fantwin.schemas.codec import CodecError, decode, encode, proto_type, type_name
-from fantwin.schemas.fields import OpenEnum, columns, other_fields
+from fantwin.schemas.fields import OpenEnum, columns, other_fields, time_column
 from fantwin.schemas.header import Header, InputPosition
 from fantwin.schemas.health import Counter, Input, Output
 from fantwin.schemas.messages import Alarm, Command, Diagnosis, Grid, Message, Prediction, Raw, Score
@@ -305,3 +305,21 @@ def test_a_prediction_with_samples_but_no_sigma_is_refused_by_encode_and_decode(
     proto.ClearField("sigma_rad_s")
     with pytest.raises(CodecError, match="sigma_rad_s"):
         decode(Prediction, proto.SerializeToString())
+
+
+@given(st.one_of(any_message(Score), any_message(Prediction), any_message(Raw)), st.data())
+def test_columns_that_are_named_are_as_decoded_in_full_and_others_are_empty(message: Message, data: st.DataObject):
+    kind, payload = type(message), encode(message)
+    names = data.draw(st.sets(st.sampled_from(sorted(columns(kind)))))
+    read, full = decode(kind, payload, names), decode(kind, payload)
+    for name in columns(kind):
+        is_there = name in names or name == time_column(kind)
+        assert same(getattr(read, name), getattr(full, name)) if is_there else not getattr(read, name).size
+    assert all(same(getattr(read, name), getattr(full, name)) for name in other_fields(kind))
+
+
+@pytest.mark.parametrize("fans", [0, 2])
+def test_a_named_column_that_does_not_fit_the_samples_is_refused(fans: int):
+    wrong = fan_pb2.Score(fans=fans, period_ns=10, t_ns=[5], score=[0.25, 0.5, 0.75])
+    with pytest.raises(CodecError, match="score has"):
+        decode(Score, wrong.SerializeToString(), ("score",))

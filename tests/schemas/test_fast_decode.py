@@ -10,7 +10,7 @@ import pytest
 from fantwin.schemas.codec import CodecError, encode
 from fantwin.schemas.enums import TachoKind
 from fantwin.schemas.envelope import Envelope
-from fantwin.schemas.fast_decode import decode_header, decode_together
+from fantwin.schemas.fast_decode import decode_together
 from fantwin.schemas.header import Header, InputPosition
 from fantwin.schemas.messages import Raw, StatedTacho
 from tests.support.message_strategies import same
@@ -28,18 +28,21 @@ def raw(sequence: int, fans: int = 2, position: InputPosition | None = None) -> 
     )
 
 
-@pytest.mark.parametrize("length", [1, 100, 130, 20_000])
+@pytest.mark.parametrize("length", [1, 100, 130])
 def test_a_header_of_any_length_is_read_without_the_rest(length):
     message = raw(3, position=InputPosition("raw", "p" * length, 9, 10, 0))
-    header = decode_header(Envelope(KEY, "raw", encode(message), 0))
+    envelope = Envelope(KEY, "raw", encode(message) + b"\xff", 0)
+    header = envelope.header
     assert (header.producer, header.sequence, header.tray) == ("acquisition-1", 3, "tray1")
     assert (header.input_position.producer, header.input_position.sequence) == ("p" * length, 9)
+    with pytest.raises(CodecError):
+        _ = envelope.message
 
 
 @pytest.mark.parametrize("payload", [b"\x0a\x05\xff", b"\xff\xff\xff", b"\x0a\x02\xff\xff"])
 def test_bytes_that_are_not_a_message_raise_a_codec_error(payload):
     with pytest.raises(CodecError):
-        decode_header(Envelope(KEY, "raw", payload, 0))
+        _ = Envelope(KEY, "raw", payload, 0).header
 
 
 def test_many_messages_are_decoded_as_one_block():

@@ -23,7 +23,7 @@ from fantwin.pipeline.replay.offline.alarm_episodes import Episode, episodes
 from fantwin.pipeline.replay.offline.marked_alarms import alarms_in
 from fantwin.pipeline.site.alarm_history import FILE, AlarmHistory
 from fantwin.pipeline.site.alarm_rates import AlarmRates
-from fantwin.schemas.codec import CodecError, decode_columns
+from fantwin.schemas.codec import CodecError, decode
 from fantwin.schemas.enums import Feedback
 from fantwin.schemas.messages import Alarm, ModelCard, Score
 from fantwin.schemas.units import NS_PER_S
@@ -132,7 +132,7 @@ def _in_order(paths: Iterable[Path]) -> list[Path]:
 def _add_score(payload: bytes, trays: dict[str, _Tray], newest: dict[tuple[str, str], int]) -> None:
     """newest: by producer and tray, the sequence of the newest score: another recorder may have it, too."""
     try:
-        score = decode_columns(Score, payload, ("valid",))
+        score = decode(Score, payload, ("valid",))
     except CodecError:
         return
     tray = trays.setdefault(score.header.tray, _Tray())
