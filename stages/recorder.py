@@ -28,7 +28,6 @@ from fantwin.pipeline.recordings.held_messages import HeldMessages
 from fantwin.pipeline.recordings.indexed import PartIndex
 from fantwin.pipeline.recordings.interference import Interference
 from fantwin.pipeline.recordings.metadata import recording_metadata
-from fantwin.pipeline.recordings.open_part import OpenPart, PartsFolder
 from fantwin.pipeline.recordings.parts import RecordingParts
 from fantwin.pipeline.recordings.reading import LEFT_OUT_KEY, RecordingError
 from fantwin.pipeline.recordings.recorded_healths import RecordedHealths
@@ -40,6 +39,7 @@ from fantwin.pipeline.recordings.recorder_config import (
     recorded_topics,
 )
 from fantwin.pipeline.recordings.sequence_ledger import SequenceLedger
+from fantwin.pipeline.recordings.writing import RecordingWriter
 from fantwin.pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageError
 from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.health import Health
@@ -78,7 +78,7 @@ class Recorder(Core):
 
     def __init__(
         self,
-        parts: PartsFolder,
+        parts: RecordingParts,
         config: RecorderConfig,
         now_ns: int,
         left_out: Collection[str] = (),
@@ -96,7 +96,7 @@ class Recorder(Core):
         self._soon_ns = min(self._flush_ns, round(FLUSH_S * NS_PER_S))
         self._clips = clips
         self._room = DiskRoom(parts, config, clips)
-        self._part: OpenPart | None = None
+        self._part: RecordingWriter | None = None
         self._least_bytes = 0
         """size below which a part does not end: its attachments alone may be more than its limit"""
         self._ledger = SequenceLedger(parts.before, left_out)
@@ -274,7 +274,7 @@ class Recorder(Core):
             and self._now_ns - self._flushed_ns >= flush_ns / 4
         )
 
-    def _is_full(self, part: OpenPart) -> bool:
+    def _is_full(self, part: RecordingWriter) -> bool:
         is_large = part.size >= max(self._room.part_bytes, self._least_bytes)
         return is_large or self._now_ns - self._began_ns >= self._room.part_s * NS_PER_S
 

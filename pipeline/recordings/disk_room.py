@@ -18,7 +18,7 @@ from typing import NamedTuple
 from fantwin.pipeline.recordings.clips.alarm_clips import AlarmClips
 from fantwin.pipeline.recordings.clips.clip import Clip
 from fantwin.pipeline.recordings.disk import Disk, DiskError
-from fantwin.pipeline.recordings.open_part import PartsFolder
+from fantwin.pipeline.recordings.parts import RecordingParts
 from fantwin.pipeline.recordings.recorder_config import CLIPS_SHARE, PARTS_WITHIN_LIMITS, RecorderConfig
 from fantwin.pipeline.recordings.records import RecordingError
 from fantwin.pipeline.recordings.stored_recordings import Stored, StoredPart, StoredRecordings
@@ -48,7 +48,7 @@ class DiskRoom:
 
     def __init__(
         self,
-        parts: PartsFolder,
+        parts: RecordingParts,
         config: RecorderConfig,
         clips: AlarmClips | None,
         monotonic_s: Callable[[], float] = time.monotonic,

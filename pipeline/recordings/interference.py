@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 
-from fantwin.pipeline.recordings.open_part import OpenPart
+from fantwin.pipeline.recordings.writing import RecordingWriter
 from fantwin.schemas.units import NS_PER_S
 
 NEWS_SHOWN_NS = 60 * NS_PER_S
@@ -25,7 +25,7 @@ class Interference:
         """A new part is written from now on."""
         self._restored_reported = 0
 
-    def check(self, part: OpenPart, now_ns: int) -> None:
+    def check(self, part: RecordingWriter, now_ns: int) -> None:
         """Report that the file of the open part was restored since it was last asked."""
         if part.restored > self._restored_reported:
             self.counts["files_restored"] += part.restored - self._restored_reported
@@ -35,7 +35,7 @@ class Interference:
                 "restored with all messages; keep other programs away from it"
             )
 
-    def end_part(self, part: OpenPart, now_ns: int) -> None:
+    def end_part(self, part: RecordingWriter, now_ns: int) -> None:
         """Report what the part that has ended has lost."""
         self.check(part, now_ns)
         if part.lost:

@@ -102,7 +102,7 @@ class RecordingWriter:
         self._ended = False
         self._chunks: list[ChunkIndex] = []
         self._schemas: dict[str, int] = {}
-        self._channels: dict[str, tuple[int, str]] = {}
+        self._channels: dict[str, int] = {}
         self._chunk_bytes = 0
         self._active = active_path(path)
         try:
@@ -144,7 +144,7 @@ class RecordingWriter:
 
     def index(self) -> PartIndex:
         """What is flushed to the disk, and where."""
-        channels = {id: Channel(id, key, MessageEncoding.Protobuf, {}, 0) for key, (id, _) in self._channels.items()}
+        channels = {id: Channel(id, key, MessageEncoding.Protobuf, {}, 0) for key, id in self._channels.items()}
         return PartIndex(self._active, channels, list(self._chunks))
 
     def add(self, envelope: Envelope) -> None:
@@ -153,10 +153,9 @@ class RecordingWriter:
         Raises:
             RecordingError: the disk refuses; `pending` then has the messages that are not in the file.
         """
-        key, payload = envelope.key, envelope.payload
-        channel, _ = self._channels.get(key) or self._register_channel(key, topic_of(key).message)
+        payload = envelope.payload
         self._writer.add_message(
-            channel,
+            self._channels.get(envelope.key) or self._register_channel(envelope.key),
             max(0, envelope.received_t_ns),
             payload,
             max(0, envelope.newest_t_ns),
@@ -238,14 +237,14 @@ class RecordingWriter:
         else:
             self.discard()
 
-    def _register_channel(self, key: str, message_type: type[Message]) -> tuple[int, str]:
+    def _register_channel(self, key: str) -> int:
+        message_type = topic_of(key).message
         name = type_name(message_type)
         if name not in self._schemas:
             data = _schema(message_type)
             self._schemas[name] = self._writer.register_schema(name, SchemaEncoding.Protobuf, data)
             self._chunk_bytes += len(data)
-        channel = self._writer.register_channel(key, MessageEncoding.Protobuf, self._schemas[name])
-        self._channels[key] = (channel, topic_of(key).name)
+        self._channels[key] = self._writer.register_channel(key, MessageEncoding.Protobuf, self._schemas[name])
         return self._channels[key]
 
     def _finish_chunk(self) -> None:
@@ -277,20 +276,16 @@ class RecordingWriter:
         self._unsynced, self._unsynced_bytes, self._synced_size = [], 0, self._file.size
 
     def _count(self, chunk: _WrittenChunk) -> None:
-        times = [max(0, envelope.received_t_ns) for envelope in chunk.messages]
-        channels: set[int] = set()
         for envelope in chunk.messages:
-            header, (channel, topic) = envelope.header, self._channels[envelope.key]
-            channels.add(channel)
+            header = envelope.header
             self.ledger.add(envelope.key, header.producer, header.sequence, envelope.received_t_ns)
-            self.written[topic] += 1
-            if topic == HEALTH:
-                message = envelope.message
-                assert isinstance(message, Health)
-                self.ledger.add_health(message)
-        self._chunks.append(
-            ChunkIndex(0, chunk.offset, "zstd", 0, max(times), 0, dict.fromkeys(channels, 0), min(times), 0)
-        )
+            if envelope.topic == HEALTH:
+                assert isinstance(envelope.message, Health)
+                self.ledger.add_health(envelope.message)
+        self.written.update(envelope.topic for envelope in chunk.messages)
+        times = [max(0, envelope.received_t_ns) for envelope in chunk.messages]
+        held = {self._channels[key]: 0 for key in {envelope.key for envelope in chunk.messages}}
+        self._chunks.append(ChunkIndex(0, chunk.offset, "zstd", 0, max(times), 0, held, min(times), 0))
 
     def _take_back(self) -> None:
         """Remove what may not be on the disk from the file; it is pending again."""

@@ -24,6 +24,7 @@ from fantwin.pipeline.recordings import disk_room
 from fantwin.pipeline.recordings.contents import contents_of
 from fantwin.pipeline.recordings.disk import DiskError
 from fantwin.pipeline.recordings.indexed import PartIndex
+from fantwin.pipeline.recordings.parts import RecordingParts
 from fantwin.pipeline.recordings.reading import RecordingError, read_metadata, read_recording
 from fantwin.pipeline.recordings.scan import scan
 from fantwin.pipeline.recordings.sequence_ledger import SequenceLedger, StreamId
@@ -76,25 +77,33 @@ def raw(sequence: int, samples: int = 1) -> Raw:
     )
 
 
-class Part:
+class Part(RecordingWriter):
     """A stand-in for a part whose disk refuses after some number of messages. `flush` makes them permanent."""
 
     def __init__(self, disk: Disk, name: str, t_ns: int, ledger: SequenceLedger, about: Mapping[str, str]) -> None:
         self.path, self.t_ns, self.about, self.ledger = Path(name), t_ns, dict(about), ledger
         self._disk = disk
         self.written: Counter[str] = Counter()
-        self.pending: list[Envelope] = []
+        self.waiting: list[Envelope] = []
         self.content: list[Envelope] = []
         self.flushes = self.restored = self.lost = 0
         self.closed = ""
-        self.size = disk.attached_bytes
+        self.size_bytes = disk.attached_bytes
+
+    @property
+    def size(self) -> int:
+        return self.size_bytes
+
+    @property
+    def pending(self) -> list[Envelope]:
+        return self.waiting
 
     def index(self) -> PartIndex:
         return PartIndex(self.path, {}, ())
 
     def add(self, envelope: Envelope) -> None:
         self._touch()
-        self.pending.append(envelope)
+        self.waiting.append(envelope)
         if len(self.content) + len(self.pending) > self._disk.room:
             self._refuse()
 
@@ -106,9 +115,9 @@ class Part:
             header = envelope.message.header
             self.ledger.add(envelope.key, header.producer, header.sequence, envelope.received_t_ns)
         self.written.update(topic_of(pending.key).name for pending in self.pending)
-        self.size += sum(len(pending.payload) for pending in self.pending)
+        self.size_bytes += sum(len(pending.payload) for pending in self.pending)
         self.content += self.pending
-        self.pending = []
+        self.waiting = []
         self.flushes += 1
 
     def stay_in_place(self) -> None: ...
@@ -128,7 +137,7 @@ class Part:
         assert not self.closed, "nothing touches a part that has ended"
 
 
-class Disk:
+class Disk(RecordingParts):
     """A stand-in for the folder in which parts are created."""
 
     def __init__(self, before: dict[StreamId, int] | None = None) -> None:
@@ -141,7 +150,7 @@ class Disk:
         self.old: list[StoredPart] = []
         self.deleted: list[Path] = []
         self.freed_by_each = self.clips_bytes = self.attached_bytes = 0
-        self.gone = self.unreadable = self.undeletable = self.sizeless = ""
+        self.gone = self.refuses_to_list = self.undeletable = self.sizeless = ""
 
     def begin(self, t_ns: int, ledger: SequenceLedger, about: Mapping[str, str]) -> Part:
         if self.refuses:
@@ -160,8 +169,8 @@ class Disk:
         return self.disk
 
     def stored(self) -> Stored:
-        if self.unreadable:
-            raise RecordingError(self.unreadable)
+        if self.refuses_to_list:
+            raise RecordingError(self.refuses_to_list)
         numbered = enumerate(self.parts, 1000)
         ended = [StoredPart(part.t_ns, number, part.path) for number, part in numbered if part.closed]
         stored = [part for part in (*self.old, *ended) if part.path not in self.deleted]

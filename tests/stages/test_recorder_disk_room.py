@@ -137,9 +137,9 @@ def test_a_part_that_cannot_be_deleted_is_named_in_health_and_once_in_the_log(ca
 
 def test_a_folder_that_cannot_be_read_is_said_and_is_not_taken_for_empty():
     disk = Disk()
-    disk.old, disk.unreadable = ten_days_of_parts(), "runs/clips: cannot be read: Permission denied; correct it"
+    disk.old, disk.refuses_to_list = ten_days_of_parts(), "runs/clips: cannot be read: Permission denied; correct it"
     core = recorder(disk)
-    assert core.problem() == disk.unreadable and core.notes() == [] and disk.parts
-    disk.unreadable = ""
+    assert core.problem() == disk.refuses_to_list and core.notes() == [] and disk.parts
+    disk.refuses_to_list = ""
     core.tick(NOW_NS + 10 * SECOND_NS)
     assert core.problem() == "" and core.notes()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import select
 import sys
 import termios
@@ -23,35 +24,11 @@ class Key(Enum):
     QUIT = "q"
 
 
-_KEYS = {
-    b" ": Key.PAUSE,
-    b"s": Key.STEP,
-    b"q": Key.QUIT,
-    # terminals send arrows in one of two forms
-    **{start + b"C": Key.STEP for start in (b"\x1b[", b"\x1bO")},
-    **{start + b"A": Key.FASTER for start in (b"\x1b[", b"\x1bO")},
-    **{start + b"B": Key.SLOWER for start in (b"\x1b[", b"\x1bO")},
-}
-
-
-class KeyParser:
-    """Bytes to keys. An incomplete arrow is kept until the rest arrives; other bytes are ignored."""
-
-    def __init__(self) -> None:
-        self._rest = b""
-
-    def feed(self, data: bytes) -> list[Key]:
-        """The keys that these bytes complete."""
-        rest, keys = self._rest + data, []
-        while rest:
-            known = next((known for known in _KEYS if rest.startswith(known)), None)
-            if known is None and any(known.startswith(rest) for known in _KEYS):
-                break
-            if known is not None:
-                keys.append(_KEYS[known])
-            rest = rest[len(known) if known else 1 :]
-        self._rest = rest
-        return keys
+_ARROWS = {b"C": Key.STEP, b"A": Key.FASTER, b"B": Key.SLOWER}
+_LETTERS = {b" ": Key.PAUSE, b"s": Key.STEP, b"q": Key.QUIT}
+_KEYS = re.compile(rb"\x1b[\[O]([ABC])|([ sq])")
+"""terminals send arrows in one of two forms"""
+_INCOMPLETE = re.compile(rb"\x1b[\[O]?\Z")
 
 
 class Keys:
@@ -60,7 +37,8 @@ class Keys:
     def __init__(self) -> None:
         self._descriptor: int | None = None
         self._before: list[Any] = []
-        self._parser = KeyParser()
+        self._rest = b""
+        """an arrow of which only the first bytes have come"""
         with suppress(OSError, ValueError):  # standard input is closed or has no descriptor
             descriptor = sys.stdin.fileno()
             if os.isatty(descriptor) and os.tcgetpgrp(descriptor) == os.getpgrp():
@@ -94,5 +72,12 @@ class Keys:
                 data = b""
             if not data:  # the terminal was closed
                 self._descriptor = None
-            found += self._parser.feed(data)
+            found += self.parsed(data)
         return found
+
+    def parsed(self, data: bytes) -> list[Key]:
+        """The keys that these bytes complete; other bytes are ignored."""
+        data = self._rest + data
+        rest = _INCOMPLETE.search(data)
+        self._rest = rest[0] if rest else b""
+        return [_ARROWS.get(arrow) or _LETTERS[letter] for arrow, letter in _KEYS.findall(data)]

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import threading
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 from fantwin.pipeline.replay.live.keyboard import Key
 from fantwin.pipeline.replay.live.pace import Pace, faster, slower
-from fantwin.schemas.enums import StageStatus
+from fantwin.pipeline.replay.live.sender import Sender
 from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.messages import NewTwin, Raw
 from fantwin.schemas.topics import BY_NAME, TOPICS
@@ -22,42 +20,6 @@ _RANK = {topic.name: rank for rank, topic in enumerate(TOPICS)}
 
 class Stopped(Exception):  # noqa: N818  not an error
     """The user asked to stop."""
-
-
-class Time(Protocol):
-    """A monotonic clock that can be waited on."""
-
-    def now_s(self) -> float:
-        """Monotonic seconds."""
-        ...
-
-    def wait(self, for_s: float) -> bool:
-        """Wait for some seconds. Returns True, at once, when the replay has to stop."""
-        ...
-
-
-class RealTime:
-    """Waits on an event that a signal sets."""
-
-    def __init__(self, stop: threading.Event) -> None:
-        self._stop = stop
-
-    def now_s(self) -> float:
-        """Monotonic seconds."""
-        return time.monotonic()
-
-    def wait(self, for_s: float) -> bool:
-        """Wait for some seconds. Returns True, at once, when the replay has to stop."""
-        return self._stop.wait(for_s) if for_s > 0.0 else self._stop.is_set()
-
-
-class Output(Protocol):
-    """Publishes messages, clock and health; see `pipeline.replay.live.sender`."""
-
-    def send(self, entry: Envelope) -> None: ...  # noqa: D102
-    def publish_clock(self, t_ns: int, rate: float) -> None: ...  # noqa: D102
-    def publish_health(self, status: StageStatus = ..., problem: str = ...) -> None: ...  # noqa: D102
-    def published(self) -> Mapping[str, int]: ...  # noqa: D102
 
 
 @dataclass(frozen=True)
@@ -76,17 +38,19 @@ class Player:
 
     def __init__(
         self,
-        output: Output,
+        output: Sender,
         pace: Pace,
-        clock: Time,
+        wait: Callable[[float], bool],
         *,
+        now_s: Callable[[], float] = time.monotonic,
         keys: Callable[[], Sequence[Key]] = tuple,
         look: Callable[[Progress], None] = lambda _progress: None,
     ) -> None:
-        """`keys` returns the keys pressed since the last call; `look` is called about every 50 ms, and may raise."""
+        """wait: waits for some seconds; returns True, at once, when the replay has to stop. now_s: monotonic seconds.
+        keys: returns the keys pressed since the last call. look: is called about every 50 ms, and may raise."""
         self._output = output
         self._pace = pace
-        self._clock = clock
+        self._wait, self._now_s = wait, now_s
         self._keys = keys
         self._look = look
         self._next_beat_s = self._next_health_s = 0.0
@@ -97,7 +61,7 @@ class Player:
         self._clock_ns = 0
         self.first_ns = self.last_ns = 0
         """recorded time of the first and the newest message sent"""
-        self.began_s = self.ended_s = clock.now_s()
+        self.began_s = self.ended_s = now_s()
         """the same on this process's clock"""
 
     def play(self, rounds: Iterable[tuple[int, Envelope]]) -> None:
@@ -116,29 +80,29 @@ class Player:
                 self.last_ns = max(self.last_ns, entry.received_t_ns)
                 self._count_step(entry)
         finally:
-            self.ended_s = self._clock.now_s()
+            self.ended_s = self._now_s()
             self._pace.change(self.last_ns, self.ended_s)  # counts a pause that is not over
         self._output.publish_health()  # at once, so that stages know how many messages there are
 
     def heartbeat_after_end(self) -> None:
         """Keep publishing clock and health after the last message."""
-        if self._clock.now_s() >= self._next_beat_s:
-            self._beat(self._clock.now_s(), self.last_ns, self.last_ns)
+        if self._now_s() >= self._next_beat_s:
+            self._beat(self._now_s(), self.last_ns, self.last_ns)
 
     def _begin(self, entry: Envelope) -> None:
-        self.began_s = self._clock.now_s()
+        self.began_s = self._now_s()
         self.first_ns = self.last_ns = entry.received_t_ns
         self._pace.start(entry.received_t_ns, self.began_s)
 
     def _wait_for(self, entry: Envelope) -> None:
         """Return when the message is due."""
         while True:
-            now_s = self._clock.now_s()
+            now_s = self._now_s()
             if now_s >= self._next_beat_s:
                 self._press(entry, now_s)
                 self._beat(now_s, self._pace.position_ns(now_s, entry.received_t_ns), _latest_clock_ns(entry))
             wait_s = 0.0 if self._steps else self._pace.due_in_s(entry.received_t_ns, now_s)
-            if self._clock.wait(min(max(wait_s, 0.0), BEAT_S)):
+            if self._wait(min(max(wait_s, 0.0), BEAT_S)):
                 raise Stopped
             if wait_s <= 0.0:
                 return
@@ -177,8 +141,8 @@ class Player:
         self._leading = min(self._leading, _RANK[entry.topic])
         if self._steps and _RANK[entry.topic] == self._leading:
             self._steps -= 1
-            self._pace.change(entry.received_t_ns, self._clock.now_s(), paused=True)
-            self._next_beat_s = self._clock.now_s()  # publishes the clock at once
+            self._pace.change(entry.received_t_ns, self._now_s(), paused=True)
+            self._next_beat_s = self._now_s()  # publishes the clock at once
 
 
 def _latest_clock_ns(entry: Envelope) -> int:

@@ -14,7 +14,7 @@ from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.replay.live.keyboard import Key
 from fantwin.pipeline.replay.live.listeners import Listeners, conflict, made_by_stages
 from fantwin.pipeline.replay.live.pace import Pace
-from fantwin.pipeline.replay.live.player import Player, Progress, RealTime, Stopped
+from fantwin.pipeline.replay.live.player import Player, Progress, Stopped
 from fantwin.pipeline.replay.live.recording_playback import RecordingPlayback
 from fantwin.pipeline.replay.live.sender import Sender
 from fantwin.pipeline.replay.resolve_config import trays_of
@@ -99,7 +99,7 @@ def publish(
             where = f"site {config.site!r} at {config.bus.endpoint}"
             report(f"no stage on {where} reads {', '.join(recorded_topics)}; publishing anyway")
         sender = Sender(bus, config.site, trays)
-        player = Player(sender, pace, RealTime(stop), keys=keys, look=look)
+        player = Player(sender, pace, stop.wait, keys=keys, look=look)
         outcome.stopped = True
         try:
             with suppress(Stopped):

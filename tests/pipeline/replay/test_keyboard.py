@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from fantwin.pipeline.replay.live.keyboard import Key, KeyParser, Keys
+from fantwin.pipeline.replay.live.keyboard import Key, Keys
 
 
 @pytest.mark.parametrize(
@@ -24,12 +24,12 @@ from fantwin.pipeline.replay.live.keyboard import Key, KeyParser, Keys
     ],
 )
 def test_keys_and_both_manners_of_arrows_are_known_and_all_else_is_passed_over(typed, keys):
-    assert KeyParser().feed(typed) == keys
+    assert Keys().parsed(typed) == keys
 
 
 def test_an_arrow_that_comes_in_pieces_is_one_key():
-    parser = KeyParser()
-    assert [parser.feed(bytes([byte])) for byte in b"\x1b[C"] == [[], [], [Key.STEP]]
+    pressed = Keys()
+    assert [pressed.parsed(bytes([byte])) for byte in b"\x1b[C"] == [[], [], [Key.STEP]]
 
 
 def test_without_a_terminal_there_are_no_keys(monkeypatch, tmp_path):

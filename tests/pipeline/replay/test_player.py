@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import Any, cast
 
 import pytest
 
@@ -59,9 +60,6 @@ class Sent:
     def publish_health(self, status: StageStatus = StageStatus.OK, problem: str = "") -> None:
         self.healths.append(self.time.s - 50.0)
 
-    def published(self) -> Mapping[str, int]:
-        return {}
-
 
 class Script:
     """Keys at given moments, s since the start."""
@@ -101,7 +99,8 @@ def play(
 ) -> tuple[Sent, Player]:
     time = FakeTime(until_s=50.0 + until_s)
     sent = Sent(time, cost_s=cost_s)
-    player = Player(sent, Pace(rate, paused=paused), time, keys=Script(time, *keys), look=look)
+    pace, pressed = Pace(rate, paused=paused), Script(time, *keys)
+    player = Player(cast(Any, sent), pace, time.wait, now_s=time.now_s, keys=pressed, look=look)
     player.play(rounds)
     return sent, player
 

@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from itertools import takewhile
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -112,10 +112,14 @@ class Stages(Sent):
         return [entry.message for entry in self.entries if isinstance(entry.message, NewTwin)]
 
 
+def player_of(stages: Stages) -> Player:
+    return Player(cast(Any, stages), Pace(1.0), stages.time.wait, now_s=stages.time.now_s)
+
+
 def played(learned: Learned, start: str, start_s: float = 0.0, end_s: float = math.inf, rounds: int = 1) -> Stages:
     stages = Stages(learned)
     playback = RecordingPlayback([learned.path], TOPICS[start], start_s, end_s)
-    Player(stages, Pace(1.0), stages.time).play(takewhile(lambda each: each[0] < rounds, playback.rounds()))
+    player_of(stages).play(takewhile(lambda each: each[0] < rounds, playback.rounds()))
     stages.close()
     return stages
 
@@ -185,7 +189,7 @@ def test_the_clock_does_not_pass_the_samples_that_follow_a_twin(learned):
     versions = ComingVersions({TRAY: read_versions([learned.path])[TRAY]})
     entries = [*versions.before(block), block]
     assert [entry.topic for entry in entries] == ["new_twin", "raw"]
-    Player(stages, Pace(1.0), stages.time).play((0, entry) for entry in entries)
+    player_of(stages).play((0, entry) for entry in entries)
     before = [t_ns for at_s, t_ns, _ in stages.clocks if at_s <= stages.messages[1][0]]
     assert before
     assert max(before) <= 0
