@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 from fantwin.schemas.fields import columns, time_column
 from fantwin.schemas.health import Health
@@ -145,10 +146,8 @@ def most_samples(fans: int) -> int:
 
 def largest_bytes(key: str) -> int:
     """The length of the longest message that is accepted on a key or key expression, in bytes."""
-    try:
-        return topic_of(key).largest_bytes
-    except KeyError:
-        return max(topic.largest_bytes for topic in TOPICS)
+    topic = known_topic(key)
+    return topic.largest_bytes if topic else max(topic.largest_bytes for topic in TOPICS)
 
 
 def makes_samples_of_samples(reads: Sequence[str], writes: Sequence[str]) -> bool:
@@ -222,3 +221,12 @@ def topic_of(key: str) -> Topic:
     if len(parts) == 4 and parts[0] == ROOT:
         return BY_NAME[parts[3]]
     raise KeyError(key)
+
+
+@lru_cache(4096)
+def known_topic(key: str) -> Topic | None:
+    """The topic of a key, which may be of another program: None."""
+    try:
+        return topic_of(key)
+    except KeyError:
+        return None

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import BinaryIO
 
 from fantwin.pipeline.recordings.disk import is_being_written
 from fantwin.pipeline.recordings.indexed import IndexedRecording, PartIndex
+from fantwin.pipeline.recordings.message_counts import MessageCounts
 from fantwin.pipeline.recordings.reading import METADATA_NAME
 from fantwin.pipeline.recordings.records import CORRUPT_DATA_ERRORS, indexed_reader
 from fantwin.pipeline.recordings.run_recordings import RECORDING_KEY
@@ -25,11 +25,10 @@ from fantwin.pipeline.recordings.sequence_ledger import (
     recovered_from_metadata,
     sum_by_key,
 )
-from fantwin.schemas.codec import CodecError
 from fantwin.schemas.health import Health
 from fantwin.schemas.messages import ModelCard
 from fantwin.schemas.streams import StreamId
-from fantwin.schemas.topics import HEALTH, topic_of
+from fantwin.schemas.topics import HEALTH, known_topic
 
 TWIN = "twin"
 TRUNCATED = "it is truncated, as after a crash"
@@ -195,38 +194,22 @@ def _by_index(path: Path, file: BinaryIO) -> Contents | None:
     held = {channel.topic: statistics.channel_message_counts.get(id, 0) for id, channel in summary.channels.items()}
     if any(counts.messages > held.get(key, 0) for key, counts in sum_by_key(streams.items()).items()):
         return None  # somebody has removed messages: reading all of it tells which
-    sessions: dict[str, Health] = {}
-    cards: dict[str, ModelCard] = {}
-    indexed = IndexedRecording(PartIndex(path, summary.channels, summary.chunk_indexes), (HEALTH, TWIN))
-    for envelope in indexed:
-        with suppress(CodecError):
-            message = envelope.message
-            if isinstance(message, Health):
-                sessions.pop(message.header.producer, None)
-                sessions[message.header.producer] = message
-            elif isinstance(message, ModelCard):
-                cards[envelope.key] = message
+    last = MessageCounts()
+    for envelope in IndexedRecording(PartIndex(path, summary.channels, summary.chunk_indexes), (HEALTH, TWIN)):
+        last.add(envelope.key, envelope.received_t_ns, envelope.payload)
     return Contents(
         path=path,
         size_bytes=path.stat().st_size,
         metadata=records.get(METADATA_NAME, {}),
         attachments=tuple(index.name for index in summary.attachment_indexes),
         streams=streams,
-        others={topic: count for topic, count in held.items() if not _is_ours(topic)},
+        others={topic: count for topic, count in held.items() if known_topic(topic) is None},
         before=before_from_metadata(records.get(BEFORE_NAME, {})),
         first_ns=statistics.message_start_time if statistics.message_count else None,
         last_ns=statistics.message_end_time if statistics.message_count else None,
         messages=statistics.message_count,
-        sessions=tuple(sessions.values()),
-        cards=cards,
+        sessions=tuple(last.sessions.values()),
+        cards=last.cards,
         has_ended=ENDED in ledger,
         recovered=recovered_from_metadata(ledger),
     )
-
-
-def _is_ours(topic: str) -> bool:
-    try:
-        topic_of(topic)
-    except KeyError:
-        return False
-    return True

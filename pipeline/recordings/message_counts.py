@@ -6,11 +6,11 @@ from fantwin.pipeline.recordings.sequence_ledger import SequenceLedger, StreamCo
 from fantwin.schemas.codec import CodecError, decode, decode_header
 from fantwin.schemas.health import Health
 from fantwin.schemas.messages import ModelCard
-from fantwin.schemas.topics import Topic, topic_of
+from fantwin.schemas.topics import known_topic
 
 
 class MessageCounts:
-    """Of one file. Channels and messages are added in file order."""
+    """Of one file. Messages are added in file order."""
 
     def __init__(self) -> None:
         self.ledger = SequenceLedger()
@@ -21,23 +21,10 @@ class MessageCounts:
         self.cards: dict[str, ModelCard] = {}
         self.undecodable = 0
         """messages that do not have the type of their channel"""
-        self._channels: dict[int, tuple[str, Topic | None]] = {}
-        """by number: key and topic; None: not a topic of fantwin"""
 
-    def knows(self, channel: int) -> bool:
-        """Whether the channel has been added."""
-        return channel in self._channels
-
-    def add_channel(self, channel: int, key: str) -> None:
-        """Add a channel whose topic is `key`."""
-        try:
-            self._channels[channel] = key, topic_of(key)
-        except KeyError:
-            self._channels[channel] = key, None
-
-    def add(self, channel: int, received_t_ns: int, payload: bytes) -> None:
-        """Add a message of a known channel."""
-        key, topic = self._channels[channel]
+    def add(self, key: str, received_t_ns: int, payload: bytes) -> None:
+        """Add a message."""
+        topic = known_topic(key)
         if topic is None:
             counts = self.others.setdefault(key, StreamCounts(first_ns=received_t_ns))
             counts.messages += 1

@@ -30,7 +30,7 @@ from fantwin.schemas.codec import CodecError
 from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.messages import StatedTacho
 from fantwin.schemas.tacho import INSTANTANEOUS, Tacho, tachos_from_json
-from fantwin.schemas.topics import topic_of
+from fantwin.schemas.topics import known_topic
 
 __all__ = ["METADATA_NAME", "Reading", "RecordingError", "RecordingMetadata", "read_metadata", "read_recording"]
 
@@ -143,13 +143,10 @@ class Reading:
         """Add a channel to `channels`, by its id, if its messages are wanted."""
         key = channel.topic
         self._declared.add(channel.id)
-        try:
-            topic = topic_of(key).name
-        except KeyError:
-            return  # not a channel of fantwin
-        is_wanted = self.topics is None or topic in self.topics
-        if is_wanted and (self.tray is None or key.split("/")[2] == self.tray):
-            channels[channel.id] = (key, topic)
+        topic = known_topic(key)  # None: not a channel of fantwin
+        is_wanted = topic is not None and (self.topics is None or topic.name in self.topics)
+        if topic and is_wanted and (self.tray is None or key.split("/")[2] == self.tray):
+            channels[channel.id] = (key, topic.name)
 
 
 def read_recording(path: Path, topics: Collection[str] | None = None, tray: str | None = None) -> Reading:

@@ -9,22 +9,25 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import groupby, pairwise
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
 from fantwin.pipeline.recordings.left_out import left_out_hint
-from fantwin.pipeline.recordings.reading import RecordingError, read_metadata, read_recording
+from fantwin.pipeline.recordings.reading import Reading, RecordingError, read_metadata, read_recording
 from fantwin.pipeline.sources.tables.measured_table import hold_last
 from fantwin.pipeline.timebase.device_clock import DeviceClock
 from fantwin.schemas.channels import CHANNELS, measured_columns
+from fantwin.schemas.codec import CodecError
+from fantwin.schemas.fast_decode import decode_together
 from fantwin.schemas.messages import Array, Raw
 from fantwin.schemas.tacho import Tacho, tacho_of_each_fan
+from fantwin.schemas.topics import tray_of
 from fantwin.schemas.units import NS_PER_S
 
 MERGED_MESSAGES = 1024
-"""so many are kept as one while a recording is read"""
+"""so many are decoded as one while a recording is read"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,21 +81,19 @@ def read_runs(
     Raises:
         RecordingError: the file cannot be read, or has no such samples.
     """
-    reading = read_recording(path, topics=("raw",))
+    reading = read_recording(path, topics=("raw",), tray=tray)
     by_tray: dict[str, list[Raw]] = {}
-    pending: dict[str, list[Raw]] = {}
-    """the newest of each tray, which are not merged yet"""
-    for envelope in reading:
-        assert isinstance(envelope.message, Raw)
-        if tray is None or envelope.message.header.tray == tray:
-            name = envelope.message.header.tray
-            messages = pending.setdefault(name, [])
-            messages.append(envelope.message)
-            if len(messages) == MERGED_MESSAGES:
-                by_tray.setdefault(name, []).extend(merged(messages))
-                messages.clear()
-    for name, messages in pending.items():
-        by_tray.setdefault(name, []).extend(messages)
+    pending: dict[str, list[bytes]] = {}
+    """the newest of each tray, which are not decoded yet"""
+    for envelope in reading.undecoded():
+        payloads = pending.setdefault(tray_of(envelope.key), [])
+        payloads.append(envelope.payload)
+        if len(payloads) == MERGED_MESSAGES:
+            by_tray.setdefault(tray_of(envelope.key), []).extend(_decoded(payloads, reading))
+            payloads.clear()
+    for name, payloads in pending.items():
+        if messages := by_tray.get(name, []) + _decoded(payloads, reading):
+            by_tray[name] = messages
     if not by_tray:
         why = left_out_hint([path], ("raw",)) or "correct --tray, or name another recording"
         raise RecordingError(f"{path}: no raw samples{f' of tray {tray!r}' if tray else ''} in this recording: {why}")
@@ -105,19 +106,13 @@ def read_runs(
     return found
 
 
-def merged(messages: Sequence[Raw]) -> list[Raw]:
+def _decoded(payloads: Sequence[bytes], reading: Reading) -> list[Raw]:
     """The same samples in as few messages as possible; the many arrays of small ones take more memory than samples."""
-    groups = groupby(
-        messages,
-        key=lambda raw: (raw.fans, len(raw.device_clock_us) > 0, raw.tachos, [*measured_columns(raw)]),
-    )
-    return [_one(list(group)) for _, group in groups]
-
-
-def _one(messages: Sequence[Raw]) -> Raw:
-    names = ("host_receive_t_ns", "device_clock_us", "command", "speed_rad_s", *measured_columns(messages[0]))
-    columns = {name: np.concatenate([getattr(raw, name) for raw in messages]) for name in names}
-    return Raw(header=messages[0].header, fans=messages[0].fans, tachos=messages[0].tachos, **columns)
+    try:
+        return decode_together(Raw, payloads)
+    except CodecError:
+        reading.undecodable += len(payloads) == 1
+        return [raw for payload in payloads for raw in _decoded([payload], reading)] if len(payloads) > 1 else []
 
 
 def no_samples(path: Path, from_s: float, to_s: float) -> RecordingError:

@@ -227,23 +227,24 @@ class _Scanner:
     def _add_unchunked(self, record: Record) -> None:
         """A message outside of chunks, as other writers may write them."""
         channel, _, received_t_ns, _ = MESSAGE.unpack_from(record.content)
-        if not self._found.counts.knows(channel):
+        if channel not in self._found.index.channels:
             raise ValueError("a message without a channel")
-        self._found.counts.add(channel, received_t_ns, record.content[MESSAGE.size :])
+        key = self._found.index.channels[channel].topic
+        self._found.counts.add(key, received_t_ns, record.content[MESSAGE.size :])
         self._found.written[channel] += 1
         self._add_times(received_t_ns, received_t_ns)
 
     def _add_chunk(self, record: Record, chunk: Chunk) -> None:
-        found, data = self._found, chunk_data(chunk)
+        found, channels, data = self._found, self._found.index.channels, chunk_data(chunk)
         self.end_chunk()
         written: Counter[int] = Counter()
         for _, opcode, start, end in records_in(data):
             if opcode == Opcode.MESSAGE:
                 channel, _, received_t_ns, _ = MESSAGE.unpack_from(data, start)
-                if channel not in written and not found.counts.knows(channel):
+                if channel not in channels:
                     self._describe_from_summary(channel)
                 written[channel] += 1
-                found.counts.add(channel, received_t_ns, data[start + MESSAGE.size : end])
+                found.counts.add(channels[channel].topic, received_t_ns, data[start + MESSAGE.size : end])
             elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
                 self._describe(parse(Schema if opcode == Opcode.SCHEMA else Channel, data[start:end]))
         found.nameless += sum(written[channel] for channel in written.keys() & self._nameless)
@@ -281,7 +282,6 @@ class _Scanner:
             self._found.index.schemas[description.id] = description
         else:
             self._found.index.channels[description.id] = description
-            self._found.counts.add_channel(description.id, description.topic)
 
     def _describe_from_summary(self, number: int) -> None:
         """A channel that was described in a damaged chunk: taken from the summary, or else left without a name."""

@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass, fields, replace
 
 from fantwin.schemas.health import Health
 from fantwin.schemas.streams import StreamId, StreamState, output_streams
-from fantwin.schemas.topics import HEALTH, topic_of
+from fantwin.schemas.topics import HEALTH, known_topic
 
 LEDGER_NAME = "fantwin.ledger"
 """the metadata record, after the last message, that holds a finished ledger"""
@@ -145,11 +145,8 @@ class SequenceLedger:
         return {" ".join(stream): str(sequence) for stream, sequence in self.next.items()}
 
     def _is_recorded(self, key: str) -> bool:
-        try:
-            topic = topic_of(key)
-        except KeyError:
-            return False
-        return topic.recorded and topic.name not in self.left_out
+        topic = known_topic(key)
+        return topic is not None and topic.recorded and topic.name not in self.left_out
 
     def _state(self, stream: StreamId) -> StreamState:
         state = self._streams.get(stream)
@@ -242,10 +239,8 @@ def sum_by_key(streams: Iterable[tuple[StreamId, StreamCounts]]) -> dict[str, St
 
 def _is_thinned(stream: StreamId) -> bool:
     """Whether a stream has health messages: a recorder takes only those that report something new."""
-    try:
-        return topic_of(stream[0]).name == HEALTH
-    except KeyError:
-        return False
+    topic = known_topic(stream[0])
+    return topic is not None and topic.name == HEALTH
 
 
 def _stream(name: str) -> StreamId:

@@ -25,7 +25,7 @@ class SnapshotVerifier:
     """Compares what a replay of one tray makes, session by session, in order."""
 
     def __init__(
-        self, read: Callable[[], Iterable[Envelope]], limit_of: Callable[[str], Limit | None], found: Comparison
+        self, read: Callable[[], Iterable[Envelope]], limit_of: Callable[[str], Limit], found: Comparison
     ) -> None:
         """read: the recorded snapshots of the tray, from the beginning at each call. limit_of: the limit of a session
         of the scorer. found: takes the results."""
@@ -77,7 +77,7 @@ class SnapshotVerifier:
             return
         limit = self._limit_of(self._producer or "")
         at = f"{found.tray}: snapshot of {format_utc(recorded.t_ns)}"
-        if limit is not None and recorded.t_ns > limit.t_ns:
+        if recorded.t_ns > limit.t_ns:
             found.snapshots_not_comparable += 1
         elif not places:
             found.snapshots_different += 1

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import chain
 from operator import itemgetter
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -23,7 +23,7 @@ from fantwin.pipeline.replay.stage_chain import StageChain
 from fantwin.pipeline.runtime.stage import Context, Core, Stage
 from fantwin.schemas.blocks import cut
 from fantwin.schemas.header import Header
-from fantwin.schemas.messages import Message, NewTwin, Prediction, Request, ScorerSnapshot
+from fantwin.schemas.messages import Message, ModelCard, NewTwin, Prediction, Request, ScorerSnapshot
 from fantwin.schemas.messages import newest_t_ns as message_t_ns
 from fantwin.schemas.topics import BY_NAME
 
@@ -163,17 +163,11 @@ class OfflinePipeline:
             core.step(card)
         snapshots = ((t_ns, None) for t_ns in dict.fromkeys(session.snapshots_t_ns))
         events = deque(heapq.merge(snapshots, session.requests, key=itemgetter(0)))  # at one time snapshots first
-        for block in self._samples(session, self._last_inputs):
-            done = 0
-            while events and events[0][0] <= block.t_ns[-1]:
-                after_t_ns, request = events.popleft()
-                row = max(done, int(np.searchsorted(block.t_ns, after_t_ns, side="right")))
-                if row > done:
-                    yield from core.step(cut(block, done, row))
-                    done = row
-                yield from self._between_samples(core, request)
-            if done < len(block.t_ns):
-                yield from core.step(cut(block, done, len(block.t_ns)) if done else block)
+        for part in _interrupted(self._samples(session, self._last_inputs), events, "right"):
+            if part is None or isinstance(part, Request):
+                yield from self._between_samples(core, part)
+            else:
+                yield from core.step(part)
         for _, request in events:
             yield from self._between_samples(core, request)
 
@@ -194,18 +188,12 @@ class OfflinePipeline:
 
     def _with_twins(self, session: Session, inputs: Mapping[str, SampleStream[Any]]) -> Iterator[Any]:
         """The samples of a session, and before its first sample each learned twin."""
-        twins = deque(session.twins)
-        for block in self._samples(session, inputs):
-            done = 0
-            while twins and twins[0].t_ns <= block.t_ns[-1]:
-                card = twins.popleft()
-                row = max(done, int(np.searchsorted(block.t_ns, card.t_ns)))
-                if row > done:
-                    yield cut(block, done, row)
-                    done = row
-                yield NewTwin(t_ns=card.t_ns, twin=card.twin, sha256=card.sha256, content=card.content)
-            if done < len(block.t_ns):
-                yield cut(block, done, len(block.t_ns)) if done else block
+        cards = deque((card.t_ns, card) for card in session.twins)
+        for part in _interrupted(self._samples(session, inputs), cards, "left"):
+            if isinstance(part, ModelCard):
+                yield NewTwin(t_ns=part.t_ns, twin=part.twin, sha256=part.sha256, content=part.content)
+            else:
+                yield part
 
     def _core(self, stage: Stage) -> Core:
         return stage.build(self._contexts[stage.name]).core
@@ -215,3 +203,23 @@ class OfflinePipeline:
         closing = list(core.close())
         self.counts.update(core.counters() if counters is None else counters)
         return closing
+
+
+def _interrupted(
+    blocks: Iterable[Any], events: deque[tuple[int, Any]], side: Literal["left", "right"]
+) -> Iterator[Any]:
+    """Blocks of samples, cut where an event is due, and the events. What is due after the last sample is left.
+
+    events: in order, each with its time; it comes before a sample of that time (left), or after it (right).
+    """
+    for block in blocks:
+        done = 0
+        while events and events[0][0] <= block.t_ns[-1]:
+            t_ns, event = events.popleft()
+            row = max(done, int(np.searchsorted(block.t_ns, t_ns, side=side)))
+            if row > done:
+                yield cut(block, done, row)
+                done = row
+            yield event
+        if done < len(block.t_ns):
+            yield cut(block, done, len(block.t_ns)) if done else block

@@ -30,6 +30,10 @@ class Limit(NamedTuple):
     """why not those after it"""
 
 
+UNLIMITED = Limit(2**63 - 1, "")
+"""of a session of which everything can be reproduced"""
+
+
 @dataclass
 class Span:
     """Input of one producer, from `first` to `last`, both included: sequence numbers of raw messages, times in ns of

@@ -6,7 +6,7 @@ Numbers may differ within a tolerance (pipeline.replay.offline.tolerance).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import asdict
 from functools import cache
 from typing import Any, Generic, TypeVar
@@ -16,7 +16,7 @@ import numpy as np
 from fantwin.pipeline.recordings.dates import format_utc
 from fantwin.pipeline.replay.offline.compare_snapshots import SnapshotVerifier
 from fantwin.pipeline.replay.offline.comparison import Comparison
-from fantwin.pipeline.replay.offline.plan import Limit, Session
+from fantwin.pipeline.replay.offline.plan import UNLIMITED, Limit, Session
 from fantwin.pipeline.replay.offline.tolerance import Apart, differences, shares
 from fantwin.schemas.blocks import cut
 from fantwin.schemas.enums import Transition
@@ -53,14 +53,14 @@ class TrayVerifier:
         """read: the recorded messages of a topic of the tray, from the beginning at each call. limit_of: the limit of a
         session of the scorer, as known when its last scores were made. left_out: topics that are not recorded."""
         self._read = read
-        self._limit_of = limit_of
+        self._limit_of: Callable[[str], Limit] = lambda producer: limit_of(producer) or UNLIMITED
         self._producer: str | None = None
         self._recorded: RecordedSession[Score] | None = None
         self._visited: set[str] = set()
         self._inputs: dict[str, RecordedSession[Grid | Prediction]] = {}
         """by producer"""
         self._found = Comparison(tray, has_scores=SCORE not in left_out)
-        self._snapshots = SnapshotVerifier(lambda: read(SNAPSHOT), limit_of, self._found)
+        self._snapshots = SnapshotVerifier(lambda: read(SNAPSHOT), self._limit_of, self._found)
 
     def add(self, producer: str, message: Score | ScorerSnapshot) -> None:
         """Compare the next scores or snapshot that were replayed, of the recorded session `producer`."""
@@ -95,7 +95,7 @@ class TrayVerifier:
             )
             limit = self._limit_of(session.producer)
             compare_alarms(replayed, known, session.last_t_ns, self._found, limit)
-            if limit is not None and limit.t_ns < session.last_t_ns and not self._found.has_scores:
+            if limit.t_ns < session.last_t_ns and not self._found.has_scores:
                 self._found.add_limit(limit)
         if holes := self._found.holes:
             self._found.add_reason(f"{self._found.tray}: the recording lacks {holes} scored samples between others")
@@ -150,44 +150,29 @@ class RecordedSession(Generic[Samples]):
 
 
 def compare_inputs(
-    made: Samples, recorded: RecordedSession[Samples], found: Comparison, limit: Limit | None = None
+    made: Samples, recorded: RecordedSession[Samples], found: Comparison, limit: Limit = UNLIMITED
 ) -> None:
     """Compare a block of another stage than the scorer with what is recorded of it, up to its last sample."""
-    topic = _INPUTS[type(made)]
-    for block in recorded.until(int(made.t_ns[-1])):
-        at = np.searchsorted(made.t_ns, block.t_ns)
-        is_made = (at < len(made.t_ns)) & (made.t_ns[np.minimum(at, len(made.t_ns) - 1)] == block.t_ns)
-        if block.fans == made.fans and is_made.any():
-            one, other = (
-                {f"{topic}.{name}": values for name, values in _columns(message, rows).items()}
-                for message, rows in ((made, at[is_made]), (block, is_made))
-            )
-            within = _within(block.t_ns[is_made], limit)
-            different = _compare_samples(block.t_ns[is_made], one, other, within, found)
-            found.inputs_different += int((different & within).sum())
+    for block, rows, is_made in _beside(made, recorded):
+        if block.fans == made.fans and len(rows):
+            different = _compare_samples(made, rows, block, is_made, limit, found, f"{_INPUTS[type(made)]}.")
+            found.inputs_different += int((different & (block.t_ns[is_made] <= limit.t_ns)).sum())
 
 
-def compare_scores(
-    made: Score, recorded: RecordedSession[Score], found: Comparison, limit: Limit | None = None
-) -> None:
+def compare_scores(made: Score, recorded: RecordedSession[Score], found: Comparison, limit: Limit = UNLIMITED) -> None:
     """Compare a block of scores with the recorded ones up to its last sample."""
     is_taken = np.zeros(len(made.t_ns), np.bool_)
     had_begun = recorded.has_begun
-    for block in recorded.until(int(made.t_ns[-1])):
-        at = np.searchsorted(made.t_ns, block.t_ns)
-        is_made = (at < len(made.t_ns)) & (made.t_ns[np.minimum(at, len(made.t_ns) - 1)] == block.t_ns)
+    for block, rows, is_made in _beside(made, recorded):
         count_not_made(block.t_ns[~is_made], found, limit)
-        rows = at[is_made]
         is_taken[rows] = True
-        within = _within(block.t_ns[is_made], limit)
+        within = block.t_ns[is_made] <= limit.t_ns
         if block.fans != made.fans:
             different = np.ones(len(rows), np.bool_)
             found.name(f"{found.tray}: {made.fans} fans replayed, {block.fans} recorded")
         else:
-            one, other = _columns(made, rows), _columns(block, is_made)
-            different = _compare_samples(block.t_ns[is_made], one, other, within, found)
-        if limit is not None:
-            found.add_not_comparable(int((different & ~within).sum()), limit)
+            different = _compare_samples(made, rows, block, is_made, limit, found)
+        found.add_not_comparable(int((different & ~within).sum()), limit)
         found.different += int((different & within).sum())
         found.equal += int((~different).sum())
     found.not_recorded += int((~is_taken).sum())
@@ -196,7 +181,16 @@ def compare_scores(
         0 if had_begun else int(taken[0]) if len(taken) else len(is_taken),
         len(is_taken) if recorded.has_more else int(taken[-1]) if len(taken) else 0,
     )
-    found.holes += int((~is_taken & _within(made.t_ns, limit))[between].sum())
+    found.holes += int((~is_taken & (made.t_ns <= limit.t_ns))[between].sum())
+
+
+def _beside(made: Samples, recorded: RecordedSession[Samples]) -> Iterator[tuple[Samples, Array, Array]]:
+    """The recorded blocks up to the last sample of a replayed one; the rows of it that are recorded, and which of the
+    recorded ones they are, (n,) of bool."""
+    for block in recorded.until(int(made.t_ns[-1])):
+        at = np.searchsorted(made.t_ns, block.t_ns)
+        is_made = (at < len(made.t_ns)) & (made.t_ns[np.minimum(at, len(made.t_ns) - 1)] == block.t_ns)
+        yield block, at[is_made], is_made
 
 
 @cache
@@ -209,25 +203,26 @@ def _dtypes(kind: type[Message]) -> dict[str, np.dtype[Any]]:
     }
 
 
-def _columns(message: Message, rows: Array) -> dict[str, Array]:
-    return {name: getattr(message, name)[rows].astype(dtype) for name, dtype in _dtypes(type(message)).items()}
-
-
 def _compare_samples(
-    t_ns: Array, made: Mapping[str, Array], recorded: Mapping[str, Array], within: Array, found: Comparison
+    made: Samples, rows: Array, recorded: Samples, is_made: Array, limit: Limit, found: Comparison, prefix: str = ""
 ) -> Array:
-    """(n,) whether a sample differs. within: (n,) samples within the limit of their session; only these are named."""
-    differ = {name: _differ(name, values, recorded[name], found) for name, values in made.items()}
-    is_number = {name: values.dtype.kind == "f" for name, values in made.items()}
-    number_differs = np.any([differs for name, differs in differ.items() if is_number[name]], axis=0)
+    """(n,) whether a sample differs; only those within the limit of their session are named."""
+    t_ns = recorded.t_ns[is_made]
+    within = t_ns <= limit.t_ns
+    one, other = (
+        {f"{prefix}{name}": getattr(message, name)[of].astype(dtype) for name, dtype in _dtypes(type(message)).items()}
+        for message, of in ((made, rows), (recorded, is_made))
+    )
+    differ = {name: _differ(name, values, other[name], found) for name, values in one.items()}
+    number_differs = np.any([differs for name, differs in differ.items() if one[name].dtype.kind == "f"], axis=0)
     found.numbers_different += int((number_differs.any(axis=1) & within).sum())
     for name, differs in differ.items():
         named = differs & within[:, np.newaxis]
         if named.any():
             row, fan = np.argwhere(named)[0].tolist()
             found.name(
-                f"{found.tray}: {format_utc(int(t_ns[row]))}, fan {fan}: {name} {made[name][row, fan]!s} replayed, "
-                f"{recorded[name][row, fan]!s} recorded (in {int(named.any(axis=1).sum())} of {len(t_ns)} samples "
+                f"{found.tray}: {format_utc(int(t_ns[row]))}, fan {fan}: {name} {one[name][row, fan]!s} replayed, "
+                f"{other[name][row, fan]!s} recorded (in {int(named.any(axis=1).sum())} of {len(t_ns)} samples "
                 f"from here on){'' if number_differs[row, fan] else ', ' + AT_A_LIMIT}"
             )
     return np.any([differs.any(axis=1) for differs in differ.values()], axis=0)
@@ -247,19 +242,14 @@ def _differ(name: str, one: Array, other: Array, found: Comparison) -> Array:
     return differs
 
 
-def _within(t_ns: Array, limit: Limit | None) -> Array:
-    return np.ones(len(t_ns), np.bool_) if limit is None else t_ns <= limit.t_ns
-
-
-def count_not_made(t_ns: Array, found: Comparison, limit: Limit | None = None) -> None:
+def count_not_made(t_ns: Array, found: Comparison, limit: Limit = UNLIMITED) -> None:
     """Count samples that were recorded and not replayed."""
-    if limit is not None:
-        within = _within(t_ns, limit)
-        found.add_not_comparable(int((~within).sum()), limit)
-        t_ns = t_ns[within]
-    if len(t_ns):
-        found.not_made += len(t_ns)
-        found.name(f"{found.tray}: {format_utc(int(t_ns[0]))}: recorded and not replayed, {len(t_ns)} samples")
+    within = t_ns <= limit.t_ns
+    found.add_not_comparable(int((~within).sum()), limit)
+    if within.any():
+        found.not_made += int(within.sum())
+        first_t_ns = int(t_ns[within][0])
+        found.name(f"{found.tray}: {format_utc(first_t_ns)}: recorded and not replayed, {int(within.sum())} samples")
 
 
 def compare_alarms(
@@ -267,7 +257,7 @@ def compare_alarms(
     recorded: Iterable[Alarm],
     last_scored_t_ns: int,
     found: Comparison,
-    limit: Limit | None = None,
+    limit: Limit = UNLIMITED,
 ) -> None:
     """Compare the alarms of one session with the recorded ones, matched by fan, time, transition and request.
 
@@ -280,7 +270,7 @@ def compare_alarms(
         where = first_difference(alarm, other, found.note) if other is not None else ""
         if other is not None and not where:
             found.alarms_equal += 1
-        elif limit is not None and alarm.t_ns > limit.t_ns:
+        elif alarm.t_ns > limit.t_ns:
             found.alarms_not_comparable += 1
         elif other is not None:
             found.alarms_different += 1
@@ -291,7 +281,7 @@ def compare_alarms(
             found.alarms_different += 1
             found.name(f"{found.tray}: alarm {_describe(alarm)} replayed, none recorded{at_a_limit}")
     for alarm in left.values():
-        if limit is not None and alarm.t_ns > limit.t_ns:
+        if alarm.t_ns > limit.t_ns:
             found.alarms_not_comparable += 1
             continue
         found.alarms_different += 1

@@ -9,12 +9,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from fantwin.pipeline.recordings import read_arrays
-from fantwin.pipeline.recordings.arrays import Arrays, Block, block_columns, read_topics
-from fantwin.pipeline.recordings.order import Seen
+from fantwin.pipeline.recordings.arrays import Arrays, Block, block_columns
 from fantwin.pipeline.recordings.reading import RecordingError
 from fantwin.pipeline.recordings.writing import RecordingWriter
 from fantwin.schemas.enums import InvalidReason, Statistic, Transition
@@ -168,11 +165,6 @@ def test_health_belongs_to_no_tray_and_keeps_its_order(tmp_path):
     assert "counters" not in block.columns
 
 
-def test_several_topics_are_read_in_one_pass(tmp_path):
-    path = write(tmp_path / "r.mcap", [raw(0), alarm(0), raw(1)])
-    assert [(block.topic, len(block)) for block in read_topics([path], ("raw", "alarm"))] == [("raw", 20), ("alarm", 1)]
-
-
 def test_parts_in_any_order_are_one_recording_each_time_it_is_read_and_duplicates_count_once(tmp_path):
     first = write(tmp_path / "z.mcap", (raw(n) for n in range(6)))
     second = write(tmp_path / "a.mcap", (raw(n) for n in range(4, 9)), start=100)
@@ -184,14 +176,6 @@ def test_parts_in_any_order_are_one_recording_each_time_it_is_read_and_duplicate
     same_numbers = [raw(0, producer="a"), raw(0, producer="b"), raw(0, tray="other")]
     arrays = read_arrays(write(tmp_path / "r.mcap", same_numbers), "raw")
     assert (sum(len(block) for block in arrays), arrays.duplicated) == (30, 0), "numbers are of a producer and a key"
-
-
-@given(st.lists(st.integers(0, 30)))
-def test_a_sequence_number_is_new_once_in_any_order(sequences):
-    seen, known = Seen(), set()
-    for sequence in sequences:
-        assert seen.is_new(sequence) == (sequence not in known)
-        known.add(sequence)
 
 
 def test_an_imported_recording_is_not_a_part_of_another(tmp_path):

@@ -173,18 +173,3 @@ def test_only_clips_with_a_file_are_listed_and_damaged_lists_have_none(tmp_path:
     assert [clip.alarms[0].fan for clip in kept_clips(tmp_path)] == [1, 0]
     assert kept_clips(tmp_path / "none") == []
     assert clip_lines({"clip": '{"tray": "tray1", "alarms": 3}'}) == ["alarm clip, whose metadata are damaged"]
-
-
-def test_that_a_clip_waits_for_the_disk_is_said_no_longer_once_none_waits():
-    of = tracker(most_bytes=1000)
-    follow(of, alarm(0, 10.0), alarm(0, 10.0, "tray2"))
-    first, second = (clip.name for clip in of.due(T0 + 80 * S))
-    of.cut(CutResult(first, 2000))
-    of.cut(CutResult(second, problem="the disk is full", may_pass=True))
-    follow(of, alarm(0, 85.0, transition=Transition.ACKNOWLEDGED, acknowledged=True))
-    assert "cannot be cut yet: the disk is full" in of.problem()
-    assert of.due(T0 + 100 * S) == [], "it is over the limit now, and is dropped"
-    oldest = of.to_delete()
-    assert oldest and oldest.name == first
-    of.deleted(oldest)
-    assert (of.to_delete(), of.problem()) == (None, "")

@@ -140,19 +140,19 @@ def test_with_a_new_calibration_alone_what_was_learned_and_alarms_go_on(tmp_path
 
 def test_wear_goes_on_in_a_replay_as_it_did_when_a_twin_took_over(tmp_path: Path) -> None:
     """The second twin takes one more of the command for healthy."""
-    settings = "wear_every_s = 2.0\n"
+    settings = "wear_every_s = 1.0\n"
     site = Site(tmp_path, 7, raw_samples=20, learns=True, scorer_settings=settings)
     model = balanced_hybrid()
     site.put_in_force("tray1-1", write_twin(tmp_path / "1.onnx", model, fans=FANS, name="tray1-1").read_bytes())
-    site.run(2400)
+    site.run(1200)
     balance = asdict(made_up_card(model, FANS).balance) | {"friction": [1.0] * FANS}
     second = write_twin(tmp_path / "2.onnx", model, fans=FANS, name="tray1-2", balance=balance)
     site.put_in_force("tray1-2", second.read_bytes())
-    site.run(2400)
+    site.run(1200)
     recording, replayed = site.finished(), tmp_path / "replayed.mcap"
     with open_replay_input([recording], None, (), None) as replay_input:
         (tray,) = rescore(replay_input, replayed, verify=True)
-    assert made_equal(tray) > 4400
+    assert made_equal(tray) > 2200
     of_recorded, of_replayed = (
         json.loads(recorded(path, "snapshot")[-1].state_json)["wear"] for path in (recording, replayed)
     )

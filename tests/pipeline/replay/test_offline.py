@@ -118,14 +118,6 @@ def test_with_another_setting_a_session_continues_from_the_replayed_state_of_the
     assert tray.counts["snapshots_of_another_twin"] == 0
 
 
-def test_with_another_twin_a_restart_takes_no_snapshot_of_another_one(scorer_killed, tmp_path):
-    other = write_twin(tmp_path / "other.onnx", fans=1)
-    with open_replay_input([scorer_killed], None, (), other) as replay_input:
-        (tray,) = rescore(replay_input, None, verify=False)
-    assert tray.plan.restarts == 1
-    assert tray.counts["snapshots_of_another_twin"] == 0
-
-
 def test_a_number_beyond_the_tolerance_is_found_and_named(short, tmp_path):
 
     def change(entry):

@@ -12,7 +12,6 @@ from fantwin.pipeline.recordings.reading import RecordingError
 from fantwin.pipeline.replay.offline.comparison import CannotCompareError
 from fantwin.pipeline.replay.offline.replay_input import open_replay_input
 from fantwin.pipeline.replay.offline.rescoring import rescore
-from fantwin.schemas import fan_pb2
 from tests.support.killed_site import Site
 from tests.support.offline_replay import changed, made_equal, recorded, verified, verified_in_part
 
@@ -27,23 +26,6 @@ def test_row_14_a_session_cannot_be_reproduced_without_the_snapshot_it_began_wit
     assert found.equal >= 211
     (reason,) = found.reasons
     assert re.fullmatch("tray1: the first messages of scorer-.* were not recorded", reason)
-
-
-def test_a_recording_whose_predictions_cannot_be_decoded_is_judged_from_its_raw_samples(short):
-    with open_replay_input([short], None, (), None) as replay_input:
-        envelopes = list(replay_input.envelopes("tray1", ("grid", "prediction", "score", "raw")))
-        old = [p if p.topic != "prediction" else replace(p, payload=_without("command", p.payload)) for p in envelopes]
-        replay_input.envelopes = lambda tray, topics: (p for p in old if p.topic in topics)  # type: ignore[method-assign]
-        plan, _, _ = replay_input.read_plan("tray1")
-        (tray,) = rescore(replay_input, None, verify=False)
-    assert plan is None
-    assert tray.scored > 200
-
-
-def _without(column: str, payload: bytes) -> bytes:
-    prediction = fan_pb2.Prediction.FromString(payload)
-    prediction.ClearField(column)
-    return prediction.SerializeToString()
 
 
 def test_row_14_scores_before_raw_messages_that_the_recorder_never_got_are_compared(tmp_path):
@@ -185,15 +167,6 @@ def test_grids_of_a_session_that_are_nowhere_leave_nothing_to_compare(short, tmp
     with open_replay_input([no_grid], None, (), None) as replay_input:
         (tray,) = rescore(replay_input, None, verify=False)
     assert tray.scored > 200
-
-
-def test_samples_that_never_reached_the_resampler_are_not_invented(tmp_path):
-    site = Site(tmp_path, seed=5, raw_samples=10)
-    site.run(205)
-    site.loses(3)
-    site.run(300)
-    path = site.finished()
-    assert made_equal(verified(path)) == sum(len(score.t_ns) for score in recorded(path, "score"))
 
 
 def test_samples_that_never_reached_a_resampler_before_its_first_output_are_no_difference(tmp_path):
