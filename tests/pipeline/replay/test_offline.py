@@ -34,17 +34,6 @@ def test_a_run_that_nothing_disturbed_is_decided_the_same(undisturbed):
     assert tray.plan.restarts == 0
 
 
-def test_samples_that_time_had_given_up_are_given_up_again(tmp_path):
-    site = Site(tmp_path, seed=2, raw_samples=4)
-    site.run(200)
-    site.fall_silent(1.5)
-    site.run(200)
-    tray = verified(site.finished())
-    assert tray.plan.first[0].timer_outputs, "the silence was long enough for the resampler to go on without samples"
-    assert tray.counts["lost_too_late"] > 0
-    assert made_equal(tray) > 400
-
-
 def test_requests_of_operators_are_replayed_at_the_same_samples(tmp_path):
     site = Site(tmp_path, 1, raw_samples=4, calibrated=True)
     site.run(210)
