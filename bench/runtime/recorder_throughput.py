@@ -20,13 +20,14 @@ from mcap_protobuf.schema import register_schema
 
 from bench.printing import JsonOption, progress, show
 from fantwin.pipeline.recordings.parts import RecordingParts
+from fantwin.pipeline.recordings.recorder import Recorder
+from fantwin.pipeline.recordings.recorder_config import RecorderConfig
 from fantwin.pipeline.recordings.writing import CHUNK_BYTES
 from fantwin.schemas.codec import encode, proto_type
 from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Grid, Message, Prediction, Raw, Score, newest_t_ns
 from fantwin.schemas.topics import topic_of, tray_key
-from fantwin.stages.recorder import Recorder, RecorderConfig
 
 FANS = 8
 STEP_NS = 10_000_000

@@ -26,6 +26,8 @@ from fantwin.pipeline.recordings.disk import DiskError
 from fantwin.pipeline.recordings.indexed import PartIndex
 from fantwin.pipeline.recordings.parts import RecordingParts
 from fantwin.pipeline.recordings.reading import RecordingError, read_metadata, read_recording
+from fantwin.pipeline.recordings.recorder import Recorder
+from fantwin.pipeline.recordings.recorder_config import RecorderConfig
 from fantwin.pipeline.recordings.scan import scan
 from fantwin.pipeline.recordings.sequence_ledger import SequenceLedger, StreamId
 from fantwin.pipeline.recordings.stored_recordings import Stored, StoredPart
@@ -38,7 +40,7 @@ from fantwin.schemas.header import Header
 from fantwin.schemas.health import Health, Input, Output
 from fantwin.schemas.messages import Message, ModelCard, Raw, ScorerSnapshot
 from fantwin.schemas.topics import TOPICS, health_key, topic_of, tray_key
-from fantwin.stages.recorder import STAGE, Recorder, RecorderConfig
+from fantwin.stages.recorder import STAGE
 from tests.support.message_strategies import any_message, same
 
 SECOND_NS = 1_000_000_000
@@ -399,7 +401,7 @@ def test_the_part_after_a_pause_states_the_gap():
 
 
 def test_a_pause_that_exceeds_memory_loses_the_oldest_messages_and_counts_them(monkeypatch):
-    monkeypatch.setattr("fantwin.stages.recorder.HELD_BYTES", 10 * len(encode(raw(100))))
+    monkeypatch.setattr("fantwin.pipeline.recordings.recorder.HELD_BYTES", 10 * len(encode(raw(100))))
     disk = Disk()
     core = recorder(disk)
     record(core, range(100, 103))

@@ -15,11 +15,12 @@ from fantwin.pipeline.recordings.clips.tracker import ClipTracker, CutResult
 from fantwin.pipeline.recordings.indexed import PartIndex
 from fantwin.pipeline.recordings.parts import RecordingParts
 from fantwin.pipeline.recordings.reading import RecordingError, read_recording
+from fantwin.pipeline.recordings.recorder import Recorder
+from fantwin.pipeline.recordings.recorder_config import RecorderConfig
 from fantwin.pipeline.recordings.writing import RecordingWriter
 from fantwin.schemas.enums import Severity, Transition
 from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Alarm
-from fantwin.stages.recorder import Recorder, RecorderConfig
 from tests.stages.test_recorder import NOW_NS, SECOND_NS, Disk, envelope, old_parts
 from tests.support.clipped_recordings import record
 from tests.support.offline_replay import recorded, recording_of

@@ -13,10 +13,11 @@ from fantwin.pipeline.recordings.clips.alarm_clips import AlarmClips
 from fantwin.pipeline.recordings.clips.clip import Clip, ClipAlarm
 from fantwin.pipeline.recordings.parts import RecordingParts
 from fantwin.pipeline.recordings.reading import read_metadata, read_recording
+from fantwin.pipeline.recordings.recorder import Recorder
+from fantwin.pipeline.recordings.recorder_config import RecorderConfig
 from fantwin.schemas.codec import encode
 from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.messages import Alarm
-from fantwin.stages.recorder import Recorder, RecorderConfig
 
 S = 1_000_000_000
 

@@ -12,8 +12,9 @@ from mcap.reader import make_reader
 from fantwin.pipeline.recordings import disk_room
 from fantwin.pipeline.recordings.contents import contents_of
 from fantwin.pipeline.recordings.reading import read_metadata, read_recording
+from fantwin.pipeline.recordings.recorder import Recorder
 from fantwin.pipeline.recordings.scan import scan
-from fantwin.stages.recorder import STAGE, Recorder
+from fantwin.stages.recorder import STAGE
 from tests.stages.test_recorder import RAW_KEY, SECOND_NS, context, envelope
 from tests.support.small_disk import SIZE_BYTES, mount, unmount
 from tests.support.written_recordings import raw
@@ -99,7 +100,7 @@ def test_a_full_disk_loses_nothing_that_memory_can_hold(small_disk, monkeypatch)
 
 
 def test_messages_that_memory_cannot_hold_are_missing_in_the_ledger(small_disk, monkeypatch):
-    monkeypatch.setattr("fantwin.stages.recorder.HELD_BYTES", 400_000)
+    monkeypatch.setattr("fantwin.pipeline.recordings.recorder.HELD_BYTES", 400_000)
     run = Run(small_disk, min_free_bytes=3_000_000)
     for _ in range(3):
         run.second()

@@ -1,0 +1,339 @@
+"""The core of the recorder: adds every message to the open part, begins new parts, and waits while the disk refuses."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import suppress
+
+from fantwin.pipeline.config.registry import RECORDER
+from fantwin.pipeline.recordings.clips.alarm_clips import AlarmClips
+from fantwin.pipeline.recordings.disk import DiskError
+from fantwin.pipeline.recordings.disk_room import DiskRoom
+from fantwin.pipeline.recordings.held_messages import HeldMessages
+from fantwin.pipeline.recordings.indexed import PartIndex
+from fantwin.pipeline.recordings.interference import Interference
+from fantwin.pipeline.recordings.parts import RecordingParts
+from fantwin.pipeline.recordings.reading import RecordingError
+from fantwin.pipeline.recordings.recorded_healths import RecordedHealths
+from fantwin.pipeline.recordings.recorder_config import FLUSH_BYTES, FLUSH_S, RecorderConfig
+from fantwin.pipeline.recordings.sequence_ledger import SequenceLedger
+from fantwin.pipeline.recordings.writing import RecordingWriter
+from fantwin.pipeline.runtime.stage import Core
+from fantwin.schemas.envelope import Envelope
+from fantwin.schemas.health import Health
+from fantwin.schemas.messages import Message
+from fantwin.schemas.streams import StreamId
+from fantwin.schemas.topics import HEALTH
+from fantwin.schemas.units import NS_PER_S
+
+HELD_BYTES = 16 << 20
+"""the most bytes of messages kept in memory while nothing can be recorded"""
+TICK_NS = 50_000_000
+"""about the time between ticks"""
+DISK_CHECK_NS = NS_PER_S
+"""time between two checks of the free space"""
+LIMITS_CHECK_NS = 10 * NS_PER_S
+"""time between two checks of the limits on age and size; they are also checked before each part"""
+URGENT = ("alarm", "request", "twin")
+"""topics whose messages are on the disk within FLUSH_S"""
+ROOM_TO_RESUME = 1 << 20
+"""bytes that must be free beyond the minimum to resume, so that recording does not pause again at once"""
+
+
+class Recorder(Core):
+    """Adds every message to the open part, and begins new parts.
+
+    While the disk refuses, messages are kept in memory up to HELD_BYTES and the health reports a problem; about once a
+    second the recorder tries to resume.
+    """
+
+    def __init__(
+        self,
+        parts: RecordingParts,
+        config: RecorderConfig,
+        now_ns: int,
+        left_out: Collection[str] = (),
+        clips: AlarmClips | None = None,
+    ) -> None:
+        """Begin the first part, at `now_ns`. If the disk is full or gone, wait for it. left_out: topics that are left
+        out on purpose. clips: of alarms; None: no clips are kept.
+
+        Raises:
+            RecordingError: nothing can be recorded there.
+        """
+        self._parts = parts
+        self._config = config
+        self._flush_ns = round(config.flush_interval_s * NS_PER_S)
+        self._soon_ns = min(self._flush_ns, round(FLUSH_S * NS_PER_S))
+        self._clips = clips
+        self._room = DiskRoom(parts, config, clips)
+        self._part: RecordingWriter | None = None
+        self._least_bytes = 0
+        """size below which a part does not end: its attachments alone may be more than its limit"""
+        self._ledger = SequenceLedger(parts.before, left_out)
+        self._before = parts.before
+        self._cards: dict[str, Envelope] = {}
+        self._own_producer = ""
+        self._duplicated: dict[StreamId, int] = {}
+        self._recorded: Counter[str] = Counter()
+        self._counts: Counter[str] = Counter(lost_unwritten=0)
+        self._held = HeldMessages()
+        self._interference = Interference()
+        self._healths = RecordedHealths()
+        self._lost_in_pause = 0
+        self._problem = self._paused_because = ""
+        self._now_ns = self._paused_ns = self._began_ns = self._checked_ns = now_ns
+        self._limited_ns = now_ns - LIMITS_CHECK_NS
+        self._flushed_ns = 0
+        self._unflushed_ns: int | None = None
+        """time of receipt of the oldest message that may not be on the disk yet"""
+        self._unflushed_bytes = 0
+        self._is_urgent = False
+        """true if a message must be on the disk soon"""
+        try:
+            self._keep_limits()
+            shortage = self._room.shortage(0)
+            if not shortage:
+                self._begin({})
+        except DiskError as error:
+            shortage = str(error)
+        if shortage:
+            self._pause(shortage)
+
+    def step(self, item: Envelope) -> Sequence[Message]:
+        """Record one message."""
+        self._now_ns = max(self._now_ns, item.received_t_ns)
+        if item.topic == "twin":
+            self._cards[item.key] = item
+        elif self._before and self._was_recorded(item):
+            self._ledger.add_duplicated(item.key, item.header.producer)
+            return ()
+        if item.topic == HEALTH and isinstance(item.message, Health):
+            self._count_duplicated(item.message)
+            if not self._healths.is_due(item, item.message):
+                return ()
+            self._is_urgent |= bool(item.message.problem)
+        elif item.topic in URGENT:
+            self._is_urgent = True
+        self._record(item)
+        if self._clips and item.topic == "alarm":
+            self._clips.add(item)
+        return ()
+
+    def tick(self, now_ns: int) -> Sequence[Message]:
+        """Flush, begin a new part and check the disk when each is due."""
+        if now_ns < self._now_ns - DISK_CHECK_NS:  # the host's clock was set back: restart all intervals
+            self._checked_ns = self._began_ns = self._limited_ns = now_ns
+            self._paused_ns = min(self._paused_ns, now_ns)
+            self._interference.clock_set_back(now_ns)
+            self._flushed_ns = now_ns - self._flush_ns
+            self._unflushed_ns = None if self._unflushed_ns is None else self._flushed_ns  # due at once
+        self._now_ns = now_ns
+        if self._part and self._is_flush_due():
+            self._unflushed_ns, self._flushed_ns = None, now_ns
+            self._unflushed_bytes, self._is_urgent = 0, False
+            self._attempt(self._part.flush)
+        if now_ns - self._checked_ns >= DISK_CHECK_NS:
+            self._checked_ns = now_ns
+            if self._part:
+                self._check_disk()
+            else:
+                self._resume()
+        if now_ns - self._limited_ns >= LIMITS_CHECK_NS:
+            self._keep_limits()
+        if self._part and self._is_full(self._part):
+            self._attempt(self._end_part)
+            self._keep_limits(has_ended_part=True)
+            if not self._problem:
+                self._attempt(lambda: self._begin({}))
+        if self._clips:
+            held_since_ns = self._held.first_received_t_ns
+            self._clips.tick(now_ns, self._index, self._unflushed_ns if held_since_ns is None else held_since_ns)
+        return ()
+
+    def close(self) -> Sequence[Message]:
+        """Finish the file; messages that could not be written are lost now."""
+        self._attempt(lambda: self._end_part(has_ended=True))
+        if self._held:
+            self._resume()
+            self._attempt(lambda: self._end_part(has_ended=True))
+        self._counts["lost_unwritten"] += len(self._held.take_all())
+        if self._clips:
+            self._clips.close(self._index)
+        return ()
+
+    def abort(self) -> None:
+        """Finish the file after a crash; it does not say that the recorder ended in order. A recorder that has received
+        nothing, such as one that is refused at its start, leaves no file."""
+        if self._part and not (self._recorded or self._part.written or self._part.pending):
+            with suppress(OSError):
+                self._part.discard()
+            self._part = None
+        self._attempt(self._end_part)
+
+    def counters(self) -> Mapping[str, int]:
+        """Messages of each topic that are on the disk, messages lost because they could not be written or because their
+        file was deleted, parts, and files that were restored."""
+        recorded = self._recorded + (self._part.written if self._part else Counter())
+        written = {f"recorded_{topic}": count for topic, count in recorded.items()}
+        of_clips = self._clips.tracker.counts if self._clips else {}
+        return {**written, **self._counts, **self._room.counts, **self._interference.counts, **of_clips}
+
+    def notes(self) -> Sequence[str]:
+        """The space and days that recordings take of their limits, and the topics that are left out on purpose."""
+        left_out = ", ".join(self._ledger.left_out)
+        of_topics = [f"not recorded: {left_out} (recorder.topics)"] if left_out else []
+        return [*self._room.notes(), *of_topics]
+
+    def unsaved(self) -> Sequence[Envelope]:
+        """Messages that are not flushed to the disk yet."""
+        return self._part.pending if self._part else self._held.messages
+
+    def problem(self) -> str:
+        """Why nothing is recorded now, what another program did to the file, and why limits are not kept; empty if all
+        is well."""
+        of_clips = self._clips.problem() if self._clips else ""
+        others = self._interference.problem(self._now_ns), self._room.problem, of_clips
+        return self._problem or "; ".join(filter(None, others))
+
+    def _was_recorded(self, item: Envelope) -> bool:
+        """Whether a recorder before this one has recorded the message."""
+        return item.header.sequence < self._before.get((item.key, item.header.producer), 0)
+
+    def _index(self) -> PartIndex | None:
+        return self._part.index() if self._part else None
+
+    def _record(self, envelope: Envelope) -> None:
+        if self._part is None:
+            self._hold([envelope])
+            return
+        if self._unflushed_ns is None:
+            self._unflushed_ns = min(envelope.received_t_ns, self._now_ns)
+        self._unflushed_bytes += len(envelope.payload)
+        try:
+            self._part.add(envelope)
+        except RecordingError as error:
+            self._pause(str(error))
+
+    def _attempt(self, action: Callable[[], None]) -> None:
+        """Do something that the disk may refuse, and pause if it does."""
+        try:
+            action()
+        except RecordingError as error:
+            self._pause(str(error))
+
+    def _begin(self, about: Mapping[str, str]) -> None:
+        held_since_ns = self._held.first_received_t_ns
+        self._began_ns = self._now_ns if held_since_ns is None else min(held_since_ns, self._now_ns)
+        self._part = self._parts.begin(self._began_ns, self._ledger, about)
+        self._least_bytes = 2 * self._part.size
+        self._interference.begin_part()
+        self._counts["parts"] += 1
+        self._problem = ""
+        for card in self._cards.values():
+            self._part.add(card.received_at(self._began_ns))
+
+    def _is_flush_due(self) -> bool:
+        """Return whether a message would be unflushed for too long at the next tick; not at every tick behind a
+        backlog."""
+        is_clip_running = self._clips is not None and self._clips.tracker.needed_since_ns is not None
+        is_soon = self._is_urgent or is_clip_running or self._unflushed_bytes >= FLUSH_BYTES
+        flush_ns = self._soon_ns if is_soon else self._flush_ns
+        return (
+            self._unflushed_ns is not None
+            and self._now_ns - self._unflushed_ns >= flush_ns - TICK_NS
+            and self._now_ns - self._flushed_ns >= flush_ns / 4
+        )
+
+    def _is_full(self, part: RecordingWriter) -> bool:
+        is_large = part.size >= max(self._room.part_bytes, self._least_bytes)
+        return is_large or self._now_ns - self._began_ns >= self._room.part_s * NS_PER_S
+
+    def _keep_limits(self, *, has_ended_part: bool = False) -> None:
+        self._limited_ns = self._now_ns
+        self._room.keep_limits(self._now_ns, has_ended_part=has_ended_part)
+
+    def _end_part(self, *, has_ended: bool = False) -> None:
+        """Finish the open part. It is closed even if this raises RecordingError."""
+        if self._part is None:
+            return
+        try:
+            for health in self._healths.take_waiting():
+                self._part.add(health)
+            self._part.finish(has_ended=has_ended)
+        finally:
+            self._release_part()
+
+    def _release_part(self) -> None:
+        if self._part:
+            self._interference.end_part(self._part, self._now_ns)
+            self._recorded += self._part.written
+            self._lost_in_pause += self._part.lost
+            self._ledger = self._ledger.as_lost() if self._part.lost else self._ledger.for_next_part()
+            unwritten, self._part, self._unflushed_ns = self._part.pending, None, None
+            self._unflushed_bytes, self._is_urgent = 0, False
+            self._hold(unwritten)
+
+    def _hold(self, unwritten: Sequence[Envelope]) -> None:
+        """Keep messages in memory until they can be recorded; beyond HELD_BYTES the oldest are lost."""
+        for lost in self._held.add(unwritten, HELD_BYTES):
+            self._ledger.add_lost(lost.key, lost.message.header.producer, lost.message.header.sequence)
+            self._counts["lost_unwritten"] += 1
+            self._lost_in_pause += 1
+
+    def _check_disk(self) -> None:
+        try:
+            shortage = self._room.shortage(0)
+        except RecordingError as error:
+            shortage = str(error)
+        if shortage:
+            with suppress(RecordingError):  # the reason is known already
+                self._end_part()
+            self._pause(shortage)
+        elif self._part:
+            self._attempt(self._part.stay_in_place)
+        if self._part:
+            self._interference.check(self._part, self._now_ns)
+
+    def _pause(self, reason: str) -> None:
+        self._release_part()
+        if not self._problem:
+            self._paused_ns, self._paused_because = self._now_ns, reason
+            self._counts["pauses"] += 1
+        self._problem = f"NOTHING IS RECORDED: {reason}; recording resumes automatically when this is resolved"
+
+    def _resume(self) -> None:
+        about = {
+            "paused_t_ns": str(self._paused_ns),
+            "resumed_t_ns": str(self._now_ns),
+            "paused_because": self._paused_because,
+            "lost_in_pause": str(self._lost_in_pause),
+        }
+        try:
+            shortage = self._room.shortage(ROOM_TO_RESUME + self._held.size_bytes)
+            if not shortage:
+                self._begin(about)
+        except RecordingError as error:
+            shortage = str(error)
+        if shortage:
+            self._pause(shortage)
+            return
+        self._lost_in_pause = 0
+        self._limited_ns = self._now_ns - LIMITS_CHECK_NS  # due now: the disk may be another
+        for envelope in self._held.take_all():
+            self._record(envelope)
+
+    def _count_duplicated(self, health: Health) -> None:
+        """Count what the bus delivered twice, from this recorder's own health: the first the runner passes to it."""
+        if health.stage != RECORDER:
+            return
+        self._own_producer = self._own_producer or health.header.producer
+        if health.header.producer == self._own_producer:
+            for line in health.inputs:
+                before = self._duplicated.get((line.key, line.producer), 0)
+                if (
+                    line.producer and line.duplicated > before
+                ):  # without a name: earlier producers, which are counted already
+                    self._ledger.add_duplicated(line.key, line.producer, line.duplicated - before)
+                    self._duplicated[line.key, line.producer] = line.duplicated
