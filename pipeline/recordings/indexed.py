@@ -39,10 +39,10 @@ class IndexedRecording:
         chunks: those that may hold messages of these channels.
     """
 
-    def __init__(self, index: PartIndex, topics: Collection[str] | None = None) -> None:
-        """topics: those wanted; None: all."""
+    def __init__(self, index: PartIndex, topics: Collection[str] | None = None, tray: str | None = None) -> None:
+        """topics, tray: those wanted; None: all. The health of stages belongs to no tray, and is wanted with any."""
         self._path = index.path
-        self.reading = Reading(index.path, topics, None)
+        self.reading = Reading(index.path, topics, tray)
         self.channels: dict[int, tuple[str, str]] = {}
         for channel in index.channels.values():
             self.reading.add_channel(channel, self.channels)
@@ -52,7 +52,7 @@ class IndexedRecording:
         self.last_ns = max((chunk.message_end_time for chunk in in_order), default=0)
 
     @classmethod
-    def of(cls, path: Path, topics: Collection[str] | None = None) -> Self | None:
+    def of(cls, path: Path, topics: Collection[str] | None = None, tray: str | None = None) -> Self | None:
         """None if the file has no index that lists chunks.
 
         Raises:
@@ -62,7 +62,7 @@ class IndexedRecording:
         with suppress(LookupError, *CORRUPT_DATA_ERRORS), path.open("rb") as file:
             summary = indexed_reader(file).get_summary()
             if summary and summary.chunk_indexes:
-                return cls(PartIndex(path, summary.channels, summary.chunk_indexes), topics)
+                return cls(PartIndex(path, summary.channels, summary.chunk_indexes), topics, tray)
         return None
 
     @property

@@ -30,7 +30,7 @@ from fantwin.schemas.codec import CodecError
 from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.messages import StatedTacho
 from fantwin.schemas.tacho import INSTANTANEOUS, Tacho, tachos_from_json
-from fantwin.schemas.topics import known_topic
+from fantwin.schemas.topics import HEALTH_CHUNK, known_topic
 
 __all__ = ["METADATA_NAME", "Reading", "RecordingError", "RecordingMetadata", "read_metadata", "read_recording"]
 
@@ -145,12 +145,13 @@ class Reading:
         self._declared.add(channel.id)
         topic = known_topic(key)  # None: not a channel of fantwin
         is_wanted = topic is not None and (self.topics is None or topic.name in self.topics)
-        if topic and is_wanted and (self.tray is None or key.split("/")[2] == self.tray):
+        if topic and is_wanted and (self.tray is None or key.split("/")[2] in (self.tray, HEALTH_CHUNK)):
             channels[channel.id] = (key, topic.name)
 
 
 def read_recording(path: Path, topics: Collection[str] | None = None, tray: str | None = None) -> Reading:
-    """The messages of a recording, to iterate over: of all topics and trays, or only of those named.
+    """The messages of a recording, to iterate over: of all topics and trays, or only of those named. The health of
+    stages belongs to no tray, and is read with any.
 
     Raises:
         RecordingError: the file cannot be opened, is not a recording, or is of an unknown format.

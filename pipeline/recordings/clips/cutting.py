@@ -94,7 +94,7 @@ class ClipCutter:
     def _write(self, clip: Clip, path: Path, open_part: PartIndex | None) -> str:
         """Write a clip to a file. Returns what it lacks. Raises RecordingError, OSError."""
         margin_ns, lead_ns = round(self.margin_s * NS_PER_S), round(LEAD_S * NS_PER_S)
-        parts = _parts_since(self.recording, open_part, clip.judged_since_ns - lead_ns - margin_ns)
+        parts = _parts_since(self.recording, open_part, clip.tray, clip.judged_since_ns - lead_ns - margin_ns)
         site = next((key.split("/")[1] for part in parts for key, _ in part.channels.values()), "")
         snapshot = _last_before(parts, tray_key(site, clip.tray, "snapshot"), clip.judged_since_ns)
         from_ns = max(snapshot.received_t_ns, clip.judged_since_ns - lead_ns) if snapshot else clip.judged_since_ns
@@ -146,14 +146,14 @@ def remove_unfinished(folder: Path) -> None:
                 path.unlink()
 
 
-def _parts_since(recording: Path, open_part: PartIndex | None, t_ns: int) -> list[IndexedRecording]:
-    """The parts with a message from this time on, and PARTS_SEARCHED before them, the oldest first.
+def _parts_since(recording: Path, open_part: PartIndex | None, tray: str, t_ns: int) -> list[IndexedRecording]:
+    """The parts with a message from this time on, and PARTS_SEARCHED before them, the oldest first; of a tray.
 
     Where the host's clock was set back after a part, it and all before it have later times, and may be thousands.
     """
     found: list[IndexedRecording] = []
     before = 0
-    for part in _parts_backwards(recording, open_part):
+    for part in _parts_backwards(recording, open_part, tray):
         if found and part.first_ns > found[-1].first_ns + SET_BACK_NS:
             break
         found.append(part)
@@ -163,18 +163,20 @@ def _parts_since(recording: Path, open_part: PartIndex | None, t_ns: int) -> lis
     return found[::-1]
 
 
-def _parts_backwards(recording: Path, open_part: PartIndex | None) -> Iterator[IndexedRecording]:
+def _parts_backwards(recording: Path, open_part: PartIndex | None, tray: str) -> Iterator[IndexedRecording]:
     """The parts of a recording, the newest first; those that cannot be read are left out."""
     files = sorted(part_files(recording), reverse=True)
     if open_part and open_part.chunks and open_part.path in (path for _, path in files):
-        yield IndexedRecording(open_part)
+        yield IndexedRecording(open_part, tray=tray)
     for _, path in files:
         if path.suffix == recording.suffix:
             with suppress(OSError, RecordingError):
                 if read_metadata(path).metadata.get(RECORDING_KEY) == recording.name:
-                    found = scan(path).index if (part := IndexedRecording.of(path)) is None else None
-                    part = IndexedRecording(PartIndex(path, found.channels, found.chunk_indexes)) if found else part
-                    if part and part.chunks:
+                    part = IndexedRecording.of(path, tray=tray)
+                    if part is None:
+                        found = scan(path).index
+                        part = IndexedRecording(PartIndex(path, found.channels, found.chunk_indexes), tray=tray)
+                    if part.chunks:
                         yield part
 
 
@@ -197,8 +199,6 @@ def _is_wanted(envelope: Envelope, clip: Clip, start_ns: int, judged_after_ns: i
         return False
     if envelope.topic == HEALTH:
         return envelope.received_t_ns >= clip.since_ns
-    if envelope.key.split("/")[2] != clip.tray:
-        return False
     is_judged = envelope.topic in _JUDGED or (BY_NAME[envelope.topic].has_samples and envelope.topic != "raw")
     return not is_judged or judged_after_ns is None or envelope.newest_t_ns > judged_after_ns
 
