@@ -10,6 +10,7 @@ the stages are slower than real time, the feed waits for them, and `rate` says w
 from __future__ import annotations
 
 import json
+import math
 import os
 import statistics
 import sys
@@ -27,14 +28,12 @@ from bench.fleet.stage_cost import calibrated_twin
 from bench.printing import JsonOption, progress, show
 from bench.runtime.stage_memory import free_endpoint, memory_mb
 from bench.training.published_fan import RATE_HZ
+from fantwin.pipeline.bus.recovery import ALL_PRODUCERS, recovery_key
 from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.config.models import BusConfig
-from fantwin.pipeline.runtime.inbox import Inbox, Newest
-from fantwin.pipeline.runtime.newest_messages import NewestMessages
 from fantwin.pipeline.site.site_watcher import SiteWatcher
 from fantwin.schemas.codec import decode, encode, type_name
 from fantwin.schemas.enums import Transition
-from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.messages import Alarm, Raw, Score
 from fantwin.schemas.topics import BY_NAME, tray_key
 from fantwin.schemas.units import NS_PER_S
@@ -46,6 +45,7 @@ from tests.support.running_chain import RunningCommand, eventually
 STAGES = ("resampler", "twin_integrator", "scorer", "recorder")
 BEGINNING_S = 30.0
 """time in which the fans become known; it is not measured"""
+ANSWER_S = 4.0
 LATE_S = 10.0
 """an alarm may come so long after the end of its fault"""
 DEADLINE_S = 1800.0
@@ -170,22 +170,17 @@ class NewestScores:
     """Until when each tray is scored, asked of the scorers: to receive all scores would cost as much as a stage."""
 
     def __init__(self, bus: Bus, hall: Hall, epoch_ns: int) -> None:
-        self._inbox = Inbox(drops_oldest=False)
-        self._newest = NewestMessages(bus, self._inbox)
-        self._keys = {tray_key(SITE, name, "score") for name in hall.names}
-        self._newest.watch(self._keys)
-        self._until_s: dict[str, float] = {}
-        self._epoch_ns = epoch_ns
+        self._bus, self._epoch_ns = bus, epoch_ns
+        self._keys = [tray_key(SITE, name, "score") for name in hall.names]
 
     def have_reached(self, seconds: float) -> bool:
         """Whether all trays are scored until then, but for what waits for the next message."""
-        self._newest.ask()
-        while isinstance(item := self._inbox.get(0.0), Newest):
-            of_answer = [Envelope(key, "score", payload, 0) for key, payload in item.answer.messages]
-            if found := self._newest.finish(item, of_answer):
-                newest_ns = int(decode(Score, found.payload).t_ns[-1])
-                self._until_s[found.key] = (newest_ns - self._epoch_ns) / NS_PER_S
-        return len(self._until_s) == len(self._keys) and min(self._until_s.values()) >= seconds
+        return all(self._until_s(key) >= seconds for key in self._keys)
+
+    def _until_s(self, key: str) -> float:
+        replies = self._bus._session.get(f"{recovery_key(key, ALL_PRODUCERS)}?newest=1", timeout=ANSWER_S)
+        newest_ns = [int(decode(Score, reply.ok.payload.to_bytes()).t_ns[-1]) for reply in replies if reply.ok]
+        return (max(newest_ns) - self._epoch_ns) / NS_PER_S if newest_ns else -math.inf
 
 
 def _at_work(watcher: SiteWatcher) -> list[tuple[str, int]]:
