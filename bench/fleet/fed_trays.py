@@ -31,9 +31,9 @@ SITE, PRODUCER, FANS, RATE_HZ = "fleet", "feed-1", 8, 100
 FAULT_S, PERIOD_S = 6.0, 10.0
 """a fault of this length begins once in each period"""
 FREE_RUN_BEGINS_AGAIN_S = 13.0
-"""by how much an alarm may move where resampler or integrator are restarted: the free run begins again and is valid after
-the warm-up of 3 s, and the ten seconds for which a fan must be like a healthy one are counted again. Where only scorer
-and recorder are restarted, no alarm moves"""
+"""by how much an alarm may move where resampler or integrator are restarted: the free run begins again and is valid
+after the warm-up of 3 s, and the ten seconds for which a fan must be like a healthy one are counted again. Where only
+scorer and recorder are restarted, no alarm moves"""
 SHIFT = 50
 """samples by which a tray begins later in the run of the fans than the one before"""
 BUSY = "stop_timeout_s = 120\n"
