@@ -221,7 +221,7 @@ class ModbusWorld(World):
         self.port = free_port()
         scaled = {"scale": 0.001}
         fans = [{"speed": {"address": fan}, "command": {"address": 10 + fan, **scaled}, "unit": 3} for fan in (0, 1)]
-        self.settings = {"host": "127.0.0.1", "tcp_port": self.port, "fan": fans, "timeout_s": 2.0, **POLLED}
+        self.settings = {"host": "127.0.0.1", "tcp_port": self.port, "fan": fans, **POLLED}
         self.speeds, self.refuses = (0.0, 0.0), False
 
     async def access(self, _function: int, start: int, address: int, count: int, registers: list[int], values: Any):
