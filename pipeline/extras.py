@@ -10,7 +10,7 @@ from importlib.util import find_spec
 from fantwin.pipeline.errors import UserError
 
 EXTRAS: dict[str, tuple[str, ...]] = {
-    "view": ("rerun", "PIL"),
+    "view": ("rerun",),
     "report": ("matplotlib", "jinja2"),
     "devices": ("paho", "pymodbus", "sushy"),
     "outputs": ("apprise", "asyncua", "paho"),

@@ -29,7 +29,6 @@ from fantwin.pipeline.outputs.notify.notifications import Notifications, Saved
 from fantwin.pipeline.outputs.notify.outbox import Outbox
 from fantwin.pipeline.outputs.notify.wording import Place
 from fantwin.pipeline.outputs.rerun.fleet_view import FleetView
-from fantwin.pipeline.outputs.rerun.plot_places import FleetPlots, PlotPlaces
 from fantwin.pipeline.outputs.rerun.viewer_core import ViewerCore
 from fantwin.pipeline.plugins import StageRow
 from fantwin.pipeline.prediction.twin_file import TwinFile
@@ -111,7 +110,7 @@ CORES: dict[str, Callable[[TwinFile], Core]] = {
 
 
 def fleet() -> FleetView:
-    return FleetView(TRAYS, PlotPlaces(FleetPlots([Fan("tray1", 0)], 1), 0), 2_000_000_000)
+    return FleetView(TRAYS, [Fan("tray1", 0)], 1, 0, 2_000_000_000)
 
 
 def all_valid(message: Message) -> Message:

@@ -32,7 +32,7 @@ from fantwin.schemas.header import Header
 from fantwin.schemas.health import Health
 from fantwin.schemas.messages import Message, ModelCard, Score
 from fantwin.schemas.topics import tray_key
-from fantwin.schemas.units import RAD_S_PER_UNIT, SpeedUnit
+from fantwin.schemas.units import RAD_S_PER_UNIT
 from fantwin.stages.viewer import ViewerConfig, build, check
 from tests.support.score_data import SIGMA, START_NS, STEP_NS, made_up_tray
 
@@ -46,8 +46,7 @@ class FakeSink:
     traces: list[Trace] = field(default_factory=list)
     states: list[tuple[str, int, list[int], list[str]]] = field(default_factory=list)
     lines: list[LogLine] = field(default_factory=list)
-    places: dict[Fan, int] = field(default_factory=dict)
-    hidden: list[tuple[Fan, int]] = field(default_factory=list)
+    shown: list[tuple[Fan, ...]] = field(default_factory=list)
     pages: list[str] = field(default_factory=list)
     wear: list[tuple[str, WearPoints]] = field(default_factory=list)
     tables: list[tuple[int, str]] = field(default_factory=list)
@@ -61,12 +60,8 @@ class FakeSink:
     def change_states(self, tray: str, fan: int, t_ns: Any, names: Sequence[str]) -> None:
         self.states.append((tray, fan, t_ns.tolist(), list(names)))
 
-    def show_fan(self, fan: Fan, place: int, unit: SpeedUnit) -> None:
-        self.places[fan] = place
-
-    def hide_fan(self, fan: Fan, t_ns: int) -> None:
-        self.hidden.append((fan, t_ns))
-        del self.places[fan]
+    def show_fans(self, fans: Sequence[Fan]) -> None:
+        self.shown.append(tuple(fans))
 
     def draw_wear(self, tray: str, points: Sequence[WearPoints]) -> None:
         self.wear += [(tray, each) for each in points]

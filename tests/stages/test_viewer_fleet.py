@@ -12,7 +12,6 @@ import pytest
 
 from fantwin.pipeline.config.models import TrayConfig
 from fantwin.pipeline.outputs.rerun.fleet_view import FleetView
-from fantwin.pipeline.outputs.rerun.plot_places import FleetPlots, PlotPlaces
 from fantwin.pipeline.outputs.rerun.viewer_core import FLUSH_PERIOD_NS, ViewerCore
 from fantwin.pipeline.runtime.stage import Context, StageError
 from fantwin.pipeline.site.fleet import SILENT, Fan
@@ -28,8 +27,8 @@ TRAYS = ("tray1", "tray2", "tray3")
 
 def fleet_core(sink: FakeSink, *, show: tuple[Fan, ...] = (), for_alarms: int = 2, hold_s: int = HOLD_S) -> ViewerCore:
     trays = [TrayConfig(name=name, fans=3) for name in TRAYS]
-    places = PlotPlaces(FleetPlots(show, for_alarms), hold_s * 1_000_000_000)
-    return ViewerCore("site", trays, sink, FleetView(trays, places, WINDOW_S * 1_000_000_000))
+    fleet = FleetView(trays, show, for_alarms, hold_s * 1_000_000_000, WINDOW_S * 1_000_000_000)
+    return ViewerCore("site", trays, sink, fleet)
 
 
 def messages_of(seconds: float = 20.0, **of_tray: Any) -> list[Score | Alarm]:
@@ -75,9 +74,8 @@ def test_only_the_fan_in_alarm_is_drawn_with_what_was_before_and_for_a_while_aft
     assert begin_s - WINDOW_S <= before[0] <= begin_s - WINDOW_S + 0.5 and np.allclose(np.diff(before), 0.5, atol=0.11)
     after = seconds[seconds >= begin_s + 0.1]
     assert np.allclose(np.diff(after), STEP_NS / 1e9), "from then on every sample"
-    (hidden,) = sink.hidden
-    assert hidden[0] == faulty and hidden[1] == t_ns[-1] + 1
-    assert 14.5 + HOLD_S <= (hidden[1] - START_NS) / 1e9 <= 14.5 + HOLD_S + 1
+    assert sink.shown == [(faulty,), ()]
+    assert 14.5 + HOLD_S <= seconds[-1] <= 14.5 + HOLD_S + 1
     recorded = {int(t): s for m in messages if isinstance(m, Score) and m.header.tray == "tray2" for t, s in rows(m)}
     np.testing.assert_allclose(measured, [recorded[int(t)] for t in t_ns])
 
@@ -86,14 +84,16 @@ def rows(score: Score) -> list[tuple[int, float]]:
     return list(zip(score.t_ns.tolist(), score.measured_speed_rad_s[:, 2].tolist(), strict=True))
 
 
-def test_a_plot_that_begins_again_repeats_no_sample() -> None:
+def test_a_plot_that_begins_again_repeats_no_sample_and_has_a_hole_where_it_was_not_drawn() -> None:
     sink = FakeSink()
     core = fleet_core(sink, hold_s=0)
-    first, second = (messages_of(seconds=10, fault_s=fault_s) for fault_s in ((2.0, 3.0), (5.0, 6.0)))
-    middle_ns = START_NS + 4_500_000_000
+    first, second = (messages_of(seconds=16, fault_s=fault_s) for fault_s in ((2.0, 3.0), (13.0, 14.0)))
+    middle_ns = START_NS + 6_000_000_000
     play(core, [m for m in first if last_t_ns(m) < middle_ns] + [m for m in second if last_t_ns(m) >= middle_ns])
-    t_ns, _ = drawn(sink, Fan("tray2", 2))
-    assert len(sink.hidden) == 2 and (np.diff(t_ns) > 0).all()
+    t_ns, measured = drawn(sink, Fan("tray2", 2))
+    assert len(sink.shown) == 4 and (np.diff(t_ns) > 0).all()
+    (hole,) = np.flatnonzero(np.isnan(measured))
+    assert t_ns[hole] == t_ns[hole - 1] + 1_000_000_000 and t_ns[hole + 1] >= START_NS + 9_000_000_000
 
 
 def test_fans_asked_for_are_drawn_from_the_first_sample_on() -> None:
@@ -101,7 +101,7 @@ def test_fans_asked_for_are_drawn_from_the_first_sample_on() -> None:
     core = fleet_core(sink, show=(Fan("tray3", 1), Fan("tray3", 0)), for_alarms=0)
     play(core, messages_of(seconds=5))
     core.close()
-    assert sink.places == {Fan("tray3", 1): 1, Fan("tray3", 0): 2}
+    assert sink.shown == [(Fan("tray3", 1), Fan("tray3", 0))]
     assert {(trace.tray, *trace.fan_numbers) for trace in sink.traces} == {("tray3", 0, 1)}
     t_ns, _ = drawn(sink, Fan("tray3", 1))
     assert len(t_ns) == 500 and (np.diff(t_ns) == STEP_NS).all()
@@ -111,7 +111,7 @@ def test_a_tray_that_sends_no_more_becomes_silent_and_its_alarm_gives_up_its_plo
     sink = FakeSink()
     core = fleet_core(sink)
     play(core, [m for m in messages_of() if m.header.tray != "tray2" or last_t_ns(m) < START_NS + 10_000_000_000])
-    assert [fan for fan, _ in sink.hidden] == [Fan("tray2", 2)]
+    assert sink.shown == [(Fan("tray2", 2),), ()]
 
 
 def test_the_lane_of_a_silent_fan_says_so_until_it_is_heard_again() -> None:
@@ -183,7 +183,7 @@ def with_supply(message: Score | Alarm) -> Score | Alarm:
     return replace(message, supply_voltage_v=np.full(message.score.shape, 12.5, np.float32))
 
 
-def test_the_file_of_a_fleet_shows_at_each_time_what_was_shown_then(
+def test_the_file_of_a_fleet_has_the_fans_that_were_drawn_and_one_log(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("fantwin.stages.viewer.FLEET_ABOVE", 3)
@@ -194,15 +194,12 @@ def test_the_file_of_a_fleet_shows_at_each_time_what_was_shown_then(
     core.close()
     path = tmp_path / "view.rrd"
     rows = rows_of(path)
-    plots = {entity.split("/fan")[0] for entity in rows if entity.endswith("/speed")}
-    assert plots == {"/shown/plot_1/tray1", "/shown/plot_2/tray2"}
-    assert styles_of(path, "/shown/plot_2/tray2/fan_2/speed", "Measurements:names")[0] == "tray2/2 measured (rad/s)"
-    speed = rows["/shown/plot_2/tray2/fan_2/speed"]
-    assert np.isnan(np.array(speed[-1][1]["Measurements:values"], float)).all(), "its lines end"
-    *volts, last_v = [row["Scalars:scalars"][0] for _, row in rows["/shown/supply_voltage_v/plot_2"]]
-    assert set(volts) == {12.5} and np.isnan(last_v), "that of what is measured beside, too"
-    states = [row["StateChange:state"][0] for _, row in rows["/shown/state/plot_2"]]
-    assert states[0] in ("normal", "suspect") and "alarm" in states and states[-1] == "free"
+    assert {entity for entity in rows if entity.endswith("/speed")} == {"/tray1/fan_0/speed", "/tray2/fan_2/speed"}
+    assert styles_of(path, "/tray2/score/page_2", "SeriesLines:names") == ["score", "limit", "limit"]
+    assert {len(row["Scalars:scalars"]) for _, row in rows["/tray2/score/page_2"]} == {3}, "of this fan alone"
+    assert {row["Scalars:scalars"][0] for _, row in rows["/tray2/supply_voltage_v/fan_2"]} == {12.5}
+    states = [row["StateChange:state"][0] for _, row in rows["/tray2/state/fan_2"]]
+    assert states[0] in ("normal", "suspect") and "alarm" in states
     texts = [row["TextLog:text"][0] for _, row in rows["/fleet/log"]]
     assert texts[0].startswith("22:13:28  tray2 fan 2: alarm raised") and len(texts) == 2
 

@@ -1,8 +1,7 @@
-"""`fantwin view`: a recording as a view file for Rerun or as a plot; a view file as a picture."""
+"""`fantwin view`: a recording as a view file for Rerun or as a plot."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -25,9 +24,7 @@ PLOTS = (".png", ".svg", ".pdf")
 
 
 def view(
-    files: Annotated[
-        list[Path], typer.Argument(metavar="REC.mcap...", help="A recording, or its parts; or a view file (.rrd).")
-    ],
+    files: Annotated[list[Path], typer.Argument(metavar="REC.mcap...", help="A recording, or its parts.")],
     output: Annotated[
         Path,
         typer.Option("-o", "--output", help="What to write: a view file .rrd for Rerun, or a plot .png, .svg or .pdf."),
@@ -36,9 +33,9 @@ def view(
         ViewLayout, typer.Option(help="all: every fan; alarms: fans that were in alarm; wear: change over days.")
     ] = ViewLayout.ALL,
     window: Annotated[float, typer.Option(min=0.1, help="Length of time shown, s.")] = 30.0,
-    tray: Annotated[str | None, typer.Option(help="Pictures: which tray, if there are several.")] = None,
+    tray: Annotated[str | None, typer.Option(help="Plot: which tray, if there are several.")] = None,
     fans: Annotated[
-        str | None, typer.Option(help="Pictures: which fans, e.g. 2,5. Default: with alarms, and one without.")
+        str | None, typer.Option(help="Plot: which fans, e.g. 2,5. Default: with alarms, and one without.")
     ] = None,
     unit: Annotated[
         str | None, typer.Option(help="Plot: unit of speed, rpm or rad/s. Default: the recording's.")
@@ -49,8 +46,7 @@ def view(
 ) -> None:
     """Turn a recording into a view file for Rerun, or plot its speeds, predictions, bands, alarms and states.
 
-    Topics that the recorder left out (recorder.topics) are made again first. A view file becomes a picture .png with a
-    headless Rerun viewer, which needs a Vulkan driver.
+    Topics that the recorder left out (recorder.topics) are made again first.
 
     Exits with 3 if the recording could not be read in full, or if making the topics again shows that data were lost.
     The rest is shown then.
@@ -64,11 +60,6 @@ def view(
         raise UsageError(f"--unit {unit}: no such unit of speed; known: rpm, rad/s")
     if output.suffix not in (".rrd", *PLOTS):
         raise UsageError(f"{output}: name a file that ends in .rrd, {', '.join(PLOTS)} with -o")
-    if files[0].suffix == ".rrd":
-        if output.suffix != ".png" or len(files) > 1:
-            raise UsageError(f"{files[0]}: a view file becomes a picture: name one, and -o NAME.png")
-        _draw(files[0], output, tray, chosen, window, layout, json_output=json_output)
-        return
     require("a plot", "report", "matplotlib") if is_plot else require("a view", "view")
     if output.exists() and not is_plot and not force:
         raise UserError(f"{output}: exists; name another file with -o, or use --force")
@@ -94,32 +85,6 @@ def view(
         typer.echo(line, err=True)
     if damage:
         raise typer.Exit(3)
-
-
-def _draw(
-    view_file: Path,
-    output: Path,
-    tray: str | None,
-    fans: list[int] | None,
-    window_s: float,
-    layout: ViewLayout,
-    *,
-    json_output: bool,
-) -> None:
-    """Draw a view file as a PNG, and say what the viewer reported."""
-    require("a picture of a view", "view")
-    from fantwin.pipeline.outputs.rerun.rerun_picture import draw_picture  # noqa: PLC0415  an extra
-
-    with working(f"drawing {view_file}"):
-        drawn = draw_picture(view_file, tray=tray, fans=fans, window_s=window_s, layout=layout.value)
-    output.write_bytes(drawn.png)
-    if json_output:
-        typer.echo(json.dumps({"picture": str(output), "views": drawn.reports}))
-        return
-    typer.echo(f"{output}: {', '.join(sorted(drawn.reports))}")
-    for name, reports in drawn.reports.items():
-        for report in reports:
-            typer.echo(f"{name}: {report}", err=True)
 
 
 @dataclass

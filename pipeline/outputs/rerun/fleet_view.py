@@ -1,16 +1,16 @@
-"""Which fans of a fleet are drawn, and what was before: a plot that begins with an alarm shows the window before it.
+"""The fans of a fleet that are drawn: those asked for always, and those in alarm for as long as there is room.
 
-It is fed with the newest sample of each tray, once or twice a second.
+What was before is kept too: the plot of a fan that goes into alarm begins with the window before it. It is fed with the
+newest sample of each tray, once or twice a second.
 """
 
 from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 from fantwin.pipeline.config.models import TrayConfig
-from fantwin.pipeline.outputs.rerun.plot_places import PlotPlaces
 from fantwin.pipeline.site.fleet import Fan, last_sample
 from fantwin.pipeline.site.trace import MEASURED_COLUMNS
 from fantwin.schemas.messages import Score
@@ -21,18 +21,28 @@ ADDED_EVERY_NS = NS_PER_S // 2
 
 
 class FleetView:
-    """The plots of a fleet, and the last window of all fans."""
+    """The fans that are drawn, and the last window of all fans.
 
-    def __init__(self, trays: Sequence[TrayConfig], places: PlotPlaces, window_ns: int) -> None:
-        """window_ns: how far back a plot begins."""
-        self._places = places
+    A fan in alarm is drawn until its alarm has been over for `hold_ns`; if there is no room, a new one replaces the fan
+    whose alarm has been over for longest. A fan in alarm never gives way to another.
+    """
+
+    def __init__(
+        self, trays: Sequence[TrayConfig], asked: Sequence[Fan], most_in_alarm: int, hold_ns: int, window_ns: int
+    ) -> None:
+        """asked: fans that are always drawn. window_ns: how far back a plot begins."""
+        self._asked = tuple(asked)
+        self._most_in_alarm = most_in_alarm
+        self._hold_ns = hold_ns
         self._window_ns = window_ns
+        self._alarm_ns: dict[Fan, int] = {}
+        """when each fan was in alarm last, host time"""
         self._history = {tray.name: deque[Score](maxlen=math.ceil(window_ns / ADDED_EVERY_NS)) for tray in trays}
 
     @property
-    def places(self) -> Mapping[Fan, int]:
-        """The fans that have a plot, with the number of its place."""
-        return self._places.taken()
+    def drawn(self) -> tuple[Fan, ...]:
+        """The fans that are drawn."""
+        return (*self._asked, *self._alarm_ns)
 
     def history(self, tray: str) -> Sequence[Score]:
         """The samples of a tray that were added within the last window, one score each, with `MEASURED_COLUMNS`."""
@@ -44,5 +54,15 @@ class FleetView:
         self._history[score.header.tray].append(last_sample(score, MEASURED_COLUMNS))
 
     def update(self, in_alarm: Sequence[Fan], now_ns: int) -> None:
-        """Give plots to the fans in alarm, the first first. now_ns: host time."""
-        self._places.update(in_alarm, now_ns)
+        """Draw the fans in alarm, the first first. now_ns: host time."""
+        self._alarm_ns |= {fan: now_ns for fan in in_alarm if fan in self._alarm_ns}
+        self._alarm_ns = {fan: t_ns for fan, t_ns in self._alarm_ns.items() if now_ns - t_ns <= self._hold_ns}
+        for fan in in_alarm:
+            if fan in self._alarm_ns or fan in self._asked:
+                continue
+            if len(self._alarm_ns) >= self._most_in_alarm:
+                over = [each for each, t_ns in self._alarm_ns.items() if t_ns < now_ns]
+                if not over:
+                    break
+                del self._alarm_ns[min(over, key=self._alarm_ns.__getitem__)]
+            self._alarm_ns[fan] = now_ns

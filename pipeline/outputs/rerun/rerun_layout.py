@@ -1,15 +1,15 @@
-"""The layout of a view in Rerun. Live views, view files and pictures have the same: it comes from here alone.
+"""The layout of a view in Rerun. Live views and view files have the same: it comes from here alone.
 
-`all`: for each tray a tab with plots, state lanes, alarms and log, and a tab for the stages; of a fleet, see
-`rerun_fleet`. `alarms`: the fans that are in alarm or were, and nothing else. `wear`: how the speed of each fan has
-changed, on a timeline of days. All plots of a layout share one time axis. Only the modules whose names begin with
-`rerun_` import rerun. Measured with Rerun 0.41; see docs/how-to/viewing.md.
+`all`: for each tray a tab with plots, state lanes, alarms and log, and a tab for the stages. `alarms`: the fans that
+are in alarm or were, and nothing else; of a fleet, the fans that are drawn, in both layouts. `wear`: how the speed of
+each fan has changed, on a timeline of days. All plots of a layout share one time axis. Only the modules whose names
+begin with `rerun_` import rerun. Measured with Rerun 0.41; see docs/how-to/viewing.md.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import rerun as rr
@@ -32,9 +32,6 @@ from fantwin.pipeline.outputs.rerun.rerun_paths import (
     judged_path,
     log_path,
     pages_of,
-    place_beside,
-    place_lane,
-    place_root,
     state_path,
     wear_path,
 )
@@ -63,45 +60,54 @@ _SHARED_VIEW = "view/5c0dca6a-e63f-9cf7-f657-2602590474cc"
 
 @dataclass(frozen=True)
 class TrayLayout:
-    """The fans of a tray that are shown, counted from 0, and their unit of speed.
+    """The fans of a tray and what is shown of them.
 
-    all_fans: how many the tray has. places: in the view of a fleet, the numbers of the plots that have shown each fan.
-    auxiliary: the columns beside command and speed that are drawn. alarmed: the fans that have been in alarm.
+    Attributes:
+        fans: how many it has.
+        is_of_fleet: only some fans are drawn, each apart.
+        auxiliary: the columns beside command and speed that are drawn.
+        alarmed: the fans that have been in alarm; of a fleet, those that are drawn.
     """
 
     name: str
-    fans: Sequence[int]
+    fans: int
     speed_unit: SpeedUnit
-    all_fans: int
-    places: Mapping[int, Sequence[int]] = field(default_factory=dict[int, Sequence[int]])
+    is_of_fleet: bool = False
     auxiliary: Sequence[Channel] = ()
     alarmed: Sequence[int] = ()
 
-    def roots(self, fan: int) -> list[str]:
-        """The entities below which the fan is drawn."""
-        return [place_root(place, self.name) for place in self.places.get(fan, ())] or [self.name]
-
-    def lanes(self, fan: int) -> list[str]:
-        """The entities of the state lane of a fan."""
-        return [place_lane(place) for place in self.places.get(fan, ())] or [state_path(self.name, fan)]
+    @property
+    def judged_together(self) -> int:
+        """How many fans have their torque balances, and their scores, in one entity."""
+        return 1 if self.is_of_fleet else FANS_ON_A_PAGE
 
     @property
     def log(self) -> str:
         """The entity of the log."""
-        return FLEET_LOG if self.places else log_path(self.name)
+        return FLEET_LOG if self.is_of_fleet else log_path(self.name)
 
 
 FanPlot = tuple[TrayLayout, int]
 
 
-def log_styles(recording: rr.RecordingStream, tray: TrayLayout) -> None:
-    """Log the static names, colours and widths of every series of a tray."""
-    for fan in tray.fans:
+def log_styles(recording: rr.RecordingStream, tray: TrayLayout, fans: Sequence[int]) -> None:
+    """Log the static names, colours and widths of every series of some fans."""
+    for fan in fans:
         log_fan_styles(recording, tray.name, fan, speed_style(tray.speed_unit, LINE_WIDTH))
         log_state_styles(recording, state_path(tray.name, fan), state_names())
-    for page, fans in enumerate(pages_of(tray.fans)):
-        recording.log(judged_path(tray.name, BALANCE, page), balance_style(len(fans)), static=True)
-        recording.log(judged_path(tray.name, SCORE, page), score_style(len(fans)), static=True)
+    for page, of_page in enumerate(pages_of(range(tray.fans), tray.judged_together)):
+        if not set(of_page).isdisjoint(fans):
+            recording.log(judged_path(tray.name, BALANCE, page), balance_style(len(of_page)), static=True)
+            recording.log(judged_path(tray.name, SCORE, page), score_style(len(of_page)), static=True)
+
+
+def site_blueprint(name: LayoutName, trays: Sequence[TrayLayout], window_s: float) -> rrb.Blueprint:
+    """One of the layouts."""
+    if name == "wear":
+        return wear_blueprint([tray.name for tray in trays])
+    if name == "alarms" or trays[0].is_of_fleet:
+        return alarms_blueprint(trays, window_s)
+    return trays_blueprint(trays, window_s)
 
 
 class _Linked(rrb.Blueprint):
@@ -116,54 +122,48 @@ class _Linked(rrb.Blueprint):
         stream.log(f"{_SHARED_VIEW}/TimeAxis", self._axis)
 
 
-def blueprint(
-    tabs: Sequence[rrb.Container | rrb.View], window_s: float, margin: float, *, for_picture: bool = False
-) -> rrb.Blueprint:
-    """The whole layout of some tabs; it follows the newest data. A picture has no panels and no tab for the stages.
+def _blueprint(tabs: Sequence[rrb.Container | rrb.View], window_s: float, margin: float) -> rrb.Blueprint:
+    """The whole layout of some tabs and one for the stages; it follows the newest data.
 
     window_s: length of time shown. margin: the share of it that is kept free at the right.
     """
-    if not for_picture:
-        tabs = [*tabs, rrb.TextDocumentView(origin=f"/{STAGES_PATH}", name="stages")]
     cursor = rrb.TimeRangeBoundary.cursor_relative
     window = rr.TimeRange(start=cursor(seconds=-window_s), end=cursor(seconds=margin * window_s))
-    return _tabbed(tabs, TIMELINE, window, for_picture=for_picture)
+    return _tabbed([*tabs, rrb.TextDocumentView(origin=f"/{STAGES_PATH}", name="stages")], TIMELINE, window)
 
 
-def _tabbed(
-    tabs: Sequence[rrb.Container | rrb.View], timeline: str, shown: rr.TimeRange, *, for_picture: bool
-) -> rrb.Blueprint:
+def _tabbed(tabs: Sequence[rrb.Container | rrb.View], timeline: str, shown: rr.TimeRange) -> rrb.Blueprint:
     return _Linked(
         rrb.Tabs(*tabs, active_tab=0) if len(tabs) > 1 else tabs[0],
-        rrb.TopPanel(state="hidden" if for_picture else "expanded"),
-        rrb.TimePanel(timeline=timeline, play_state="following", state="hidden" if for_picture else "collapsed"),
+        rrb.TopPanel(state="expanded"),
+        rrb.TimePanel(timeline=timeline, play_state="following", state="collapsed"),
         shown=shown,
         auto_views=False,
         collapse_panels=True,
     )
 
 
-def trays_blueprint(trays: Sequence[TrayLayout], window_s: float, *, for_picture: bool = False) -> rrb.Blueprint:
+def trays_blueprint(trays: Sequence[TrayLayout], window_s: float) -> rrb.Blueprint:
     """The layout `all` of some trays."""
-    margin = max(MARGIN_FOR_LEGEND[columns_of(len(page))] for tray in trays for page in pages_of(tray.fans))
-    return blueprint([_tray_tab(tray) for tray in trays], window_s, margin, for_picture=for_picture)
+    margin = max(MARGIN_FOR_LEGEND[columns_of(len(page))] for tray in trays for page in pages_of(range(tray.fans)))
+    return _blueprint([_tray_tab(tray) for tray in trays], window_s, margin)
 
 
-def alarms_blueprint(trays: Sequence[TrayLayout], window_s: float, *, for_picture: bool = False) -> rrb.Blueprint:
+def alarms_blueprint(trays: Sequence[TrayLayout], window_s: float) -> rrb.Blueprint:
     """The layout `alarms` of some trays: the fans that are in alarm or were, four on a page."""
     plots = [(tray, fan) for tray in trays for fan in tray.alarmed]
     pages = [plots[start : start + ALARMS_ON_A_PAGE] for start in range(0, len(plots), ALARMS_ON_A_PAGE)]
-    tabs = [page_tab("fans that were in alarm" if len(pages) == 1 else _names(page), page) for page in pages]
-    lists = rrb.Horizontal(alarms_view(), log_view([tray.log for tray in trays], "alarm log"), name="alarms")
+    tabs = [_page_tab(_names(page), page) for page in pages]
+    logs = list(dict.fromkeys(tray.log for tray in trays))
+    lists = rrb.Horizontal(_alarms_view(), _log_view(logs), name="alarms")
     margin = max((MARGIN_FOR_LEGEND[columns_of(len(page))] for page in pages), default=0.0)
-    return blueprint(tabs or [lists], window_s, margin, for_picture=for_picture)
+    return _blueprint(tabs or [lists], window_s, margin)
 
 
-def wear_blueprint(trays: Sequence[str], *, for_picture: bool = False) -> rrb.Blueprint:
+def wear_blueprint(trays: Sequence[str]) -> rrb.Blueprint:
     """The layout `wear`: a tab for each of these trays."""
-    tabs = [_wear_tab(tray) for tray in trays]
     everything = rr.TimeRange(start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.infinite())
-    return _tabbed(tabs, DAYS, everything, for_picture=for_picture)
+    return _tabbed([_wear_tab(tray) for tray in trays], DAYS, everything)
 
 
 def _wear_tab(tray: str) -> rrb.Container:
@@ -182,38 +182,36 @@ def columns_of(plots: int) -> int:
 
 
 def _tray_tab(tray: TrayLayout) -> rrb.Container:
-    pages = [
-        page_tab(_page_name(tray, fans), [(tray, fan) for fan in fans], tray.auxiliary) for fans in pages_of(tray.fans)
-    ]
+    pages = [_page_tab(_page_name(tray, fans), [(tray, fan) for fan in fans]) for fans in pages_of(range(tray.fans))]
     return rrb.Tabs(*pages, active_tab=0, name=tray.name) if len(pages) > 1 else pages[0]
 
 
 def _page_name(tray: TrayLayout, fans: Sequence[int]) -> str:
-    return tray.name if len(fans) == len(tray.fans) else f"{tray.name} / fans {fans[0]} to {fans[-1]}"
+    return tray.name if len(fans) == tray.fans else f"{tray.name} / fans {fans[0]} to {fans[-1]}"
 
 
 def _names(plots: Iterable[FanPlot]) -> str:
     return ", ".join(f"{tray.name}/{fan}" for tray, fan in plots)
 
 
-def page_tab(name: str, plots: Sequence[FanPlot], auxiliary: Sequence[Channel] = ()) -> rrb.Container:
+def _page_tab(name: str, plots: Sequence[FanPlot]) -> rrb.Container:
     """Up to `FANS_ON_A_PAGE` fans, each with speed above torque balance and score; their lanes, the alarms, the log."""
     columns = columns_of(len(plots))
     lanes = rrb.StateTimelineView(
         origin="/",
-        contents=[f"/{path}" for tray, fan in plots for path in tray.lanes(fan)],
+        contents=[f"/{state_path(tray.name, fan)}" for tray, fan in plots],
         name="state of each fan",
         time_view=LINKED,
     )
     lane_share = max(MIN_LANE_SHARE, (1.6 + len(plots)) / 25)
     above: rrb.Container = rrb.Grid(*(_fan_rows(*plot, columns) for plot in plots), grid_columns=columns)
-    if auxiliary:
+    if auxiliary := list(dict.fromkeys(column for tray, _ in plots for column in tray.auxiliary)):
         beside = [_auxiliary_view(plots, column) for column in auxiliary]
         above = rrb.Vertical(above, rrb.Horizontal(*beside), row_shares=[4, 1])
     logs = list(dict.fromkeys(tray.log for tray, _ in plots))
     return rrb.Vertical(
         above,
-        rrb.Horizontal(lanes, alarms_view(), log_view(logs, "alarm log"), column_shares=[4, 4, 3]),
+        rrb.Horizontal(lanes, _alarms_view(), _log_view(logs), column_shares=[4, 4, 3]),
         row_shares=[1 - lane_share, lane_share],
         name=name,
     )
@@ -221,76 +219,64 @@ def page_tab(name: str, plots: Sequence[FanPlot], auxiliary: Sequence[Channel] =
 
 def _auxiliary_view(plots: Sequence[FanPlot], column: Channel) -> rrb.TimeSeriesView:
     """What is measured of some fans beside command and speed: one line for each."""
-    contents = [path for tray, fan in plots for path in _beside(tray, fan, column.name)]
     return rrb.TimeSeriesView(
         origin="/",
-        contents=[f"/{path}" for path in contents],
+        contents=[f"/{auxiliary_path(tray.name, column.name, fan)}" for tray, fan in plots],
         name=f"{column.title} ({column.unit})",
         axis_x=LINKED,
     )
 
 
-def _beside(tray: TrayLayout, fan: int, column: str) -> list[str]:
-    places = tray.places.get(fan, ())
-    return [place_beside(place, column) for place in places] or [auxiliary_path(tray.name, column, fan)]
-
-
 def _fan_rows(tray: TrayLayout, fan: int, columns: int) -> rrb.Container:
     fill, lines = speed_style(tray.speed_unit, 0.0), speed_style(tray.speed_unit, LINE_WIDTH)
-    roots = tray.roots(fan)
     speed = rrb.TimeSeriesView(
-        origin=f"/{roots[0]}/fan_{fan}",
-        contents=[f"/{fan_path(root, fan, part)}" for root in roots for part in FAN_PARTS],
+        origin=f"/{tray.name}/fan_{fan}",
+        contents=[f"/{fan_path(tray.name, fan, part)}" for part in FAN_PARTS],
         name=f"{tray.name} / fan {fan} speed ({tray.speed_unit})",
         axis_x=LINKED,
         plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.RightTop, visible=columns < FANS_ON_A_PAGE // 2),
         # A single band is faint. Drawing the same data twice makes it solid and sends no more bytes.
-        overrides={fan_path(root, fan, "speed"): [fill.visualizer(), lines.visualizer()] for root in roots},
+        overrides={fan_path(tray.name, fan, "speed"): [fill.visualizer(), lines.visualizer()]},
     )
-    page, number = divmod(fan, FANS_ON_A_PAGE)
-    on_page = min(FANS_ON_A_PAGE, tray.all_fans - page * FANS_ON_A_PAGE)
+    page, number = divmod(fan, tray.judged_together)
+    on_page = min(tray.judged_together, tray.fans - page * tray.judged_together)
     names = (f"{tray.name} / fan {fan} torque balance", f"{tray.name} / fan {fan} score")
     if columns == 4:  # narrow: a longer name is cut off
         names = (f"balance {fan}", f"score {fan}")
-    places = tray.places.get(fan, ())
     styles = {BALANCE: balance_style(on_page, number), SCORE: score_style(on_page, number)}
     kinds = [
-        judged_view(
-            [place_beside(place, kind) for place in places] or [judged_path(tray.name, kind, page)],
-            name,
-            None if places else style,
-        )
+        _judged_view(judged_path(tray.name, kind, page), name, style)
         for (kind, style), name in zip(styles.items(), names, strict=True)
     ]
     return rrb.Vertical(speed, rrb.Horizontal(*kinds), row_shares=[5, 3])
 
 
-def judged_view(paths: Sequence[str], name: str, style: rr.SeriesLines | None) -> rrb.TimeSeriesView:
+def _judged_view(path: str, name: str, style: rr.SeriesLines) -> rrb.TimeSeriesView:
     """The view of a fan's torque balance beside what is expected, or of its score beside the limit.
 
-    style: shows the series of this fan, where an entity has those of others too.
+    style: shows the series of this fan alone.
     """
     return rrb.TimeSeriesView(
-        origin=f"/{paths[0]}",
-        contents=[f"/{path}" for path in paths],
+        origin=f"/{path}",
+        contents=[f"/{path}"],
         name=name,
         axis_x=LINKED,
         plot_legend=rrb.PlotLegend(visible=False),
-        overrides={path: style.visualizer() for path in paths} if style else None,
+        overrides={path: style.visualizer()},
     )
 
 
-def alarms_view() -> rrb.TextDocumentView:
+def _alarms_view() -> rrb.TextDocumentView:
     """The view of the table of alarms."""
     return rrb.TextDocumentView(origin=f"/{ALARMS_PATH}", name="alarms")
 
 
-def log_view(paths: Sequence[str], name: str) -> rrb.TextLogView:
+def _log_view(paths: Sequence[str]) -> rrb.TextLogView:
     """The view of one or more logs."""
     return rrb.TextLogView(
         origin="/",
         contents=[f"/{path}" for path in paths],
-        name=name,
+        name="alarm log",
         columns=TextLogColumns(
             timeline_columns=[TimelineColumn(TIMELINE, visible=False)],  # too narrow to read: lines begin with it
             text_log_columns=[TextLogColumn("LogLevel"), TextLogColumn("Body")],

@@ -11,7 +11,6 @@ DAYS = "day"
 STAGES_PATH = "stages"
 ALARMS_PATH = "site/alarms"
 FLEET_LOG = "fleet/log"
-SHOWN = "shown"
 WEAR = "wear"
 FAN_PARTS = ("speed", "deviation", "outside", "not_scored")
 BALANCE, SCORE = "balance", "score"
@@ -19,21 +18,22 @@ FANS_ON_A_PAGE = 8
 """Rerun draws a page of a hundred plots only seven times a second"""
 
 
-def fan_path(root: str, fan: int, part: str) -> str:
-    """Entity of one fan below the root of its tray, which is the tray's name but in a fleet.
+def fan_path(tray: str, fan: int, part: str) -> str:
+    """Entity of one fan below its tray.
 
     `part` is `speed` (measured, twin), `deviation`, `outside` or `not_scored`.
     """
-    return f"{root}/fan_{fan}/{part}"
+    return f"{tray}/fan_{fan}/{part}"
 
 
-def pages_of(fans: Sequence[int]) -> list[Sequence[int]]:
+def pages_of(fans: Sequence[int], size: int = FANS_ON_A_PAGE) -> list[Sequence[int]]:
     """The fans of a tray, a page at a time."""
-    return [fans[start : start + FANS_ON_A_PAGE] for start in range(0, len(fans), FANS_ON_A_PAGE)]
+    return [fans[start : start + size] for start in range(0, len(fans), size)]
 
 
 def judged_path(tray: str, kind: str, page: int) -> str:
-    """Entity of the torque balances or the scores of the fans of a page, side by side: one call for all of them."""
+    """Entity of the torque balances or the scores of the fans of a page, side by side: one call for all of them. Of a
+    fleet, each fan is a page of its own."""
     return f"{tray}/{kind}/page_{page}"
 
 
@@ -55,24 +55,3 @@ def log_path(tray: str) -> str:
 def wear_path(tray: str, fan: int | None = None) -> str:
     """Entity of the wear of a fan; without a fan, that of all fans of the tray."""
     return f"{WEAR}/{tray}" if fan is None else f"{WEAR}/{tray}/fan_{fan}"
-
-
-def place_root(place: int, tray: str) -> str:
-    """In a fleet, the root of a tray's fans in plot number `place`."""
-    return f"{SHOWN}/plot_{place}/{tray}"
-
-
-def place_in(root: str) -> int | None:
-    """The number of the plot whose root begins so; None: it is no root of a plot."""
-    shown, _, name = root.partition("/")
-    return int(name.removeprefix("plot_")) if shown == SHOWN and name.startswith("plot_") else None
-
-
-def place_lane(place: int) -> str:
-    """In a fleet, the entity of the state lane of plot number `place`."""
-    return f"{SHOWN}/state/plot_{place}"
-
-
-def place_beside(place: int, kind: str) -> str:
-    """In a fleet, the entity of the fan in plot number `place`: its balance or score, or a column of its source."""
-    return f"{SHOWN}/{kind}/plot_{place}"

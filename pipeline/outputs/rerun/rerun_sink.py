@@ -8,22 +8,21 @@ import subprocess
 import sys
 import threading
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import groupby
 from operator import itemgetter
 from pathlib import Path
 
 import numpy as np
 import rerun as rr
+import rerun.blueprint as rrb
 
 from fantwin.pipeline.config.models import TrayConfig
 from fantwin.pipeline.outputs.rerun.alarm_log import LogLine
-from fantwin.pipeline.outputs.rerun.plot_places import FleetPlots
 from fantwin.pipeline.outputs.rerun.rerun_bands import RerunBands
-from fantwin.pipeline.outputs.rerun.rerun_fleet import log_plot_styles
-from fantwin.pipeline.outputs.rerun.rerun_layout import LayoutName, TrayLayout, log_styles
-from fantwin.pipeline.outputs.rerun.rerun_paths import ALARMS_PATH, FLEET_LOG, STAGES_PATH, TIMELINE, log_path
+from fantwin.pipeline.outputs.rerun.rerun_layout import LayoutName, TrayLayout, log_styles, site_blueprint
+from fantwin.pipeline.outputs.rerun.rerun_paths import ALARMS_PATH, STAGES_PATH, TIMELINE
 from fantwin.pipeline.outputs.rerun.rerun_wear import RerunWear
-from fantwin.pipeline.outputs.rerun.site_layout import SiteLayout
 from fantwin.pipeline.outputs.rerun.view_file import ViewFile
 from fantwin.pipeline.outputs.rerun.wear_points import WearPoints
 from fantwin.pipeline.runtime.stage import StageError
@@ -32,7 +31,6 @@ from fantwin.pipeline.site.loopback import LOOPBACK, check_free
 from fantwin.pipeline.site.trace import Trace
 from fantwin.schemas.channels import CHANNELS
 from fantwin.schemas.messages import Array
-from fantwin.schemas.units import SpeedUnit
 
 APPLICATION = "fantwin"
 FLUSH_LIMIT_S = 2.0
@@ -83,7 +81,7 @@ class RerunSink:
         *,
         name: str,
         trays: Sequence[TrayConfig],
-        fleet: FleetPlots | None,
+        is_fleet: bool,
         started_t_ns: int,
         layout: LayoutName,
         window_s: float,
@@ -95,8 +93,8 @@ class RerunSink:
     ) -> None:
         """Open `file`, a data server at `grpc_port` and a page for browsers at `web_port`; None leaves one out.
 
-        file_bytes: the size at which the file ends. layout: which of the layouts is shown. fleet: None shows every fan
-        with its band.
+        file_bytes: the size at which the file ends. layout: which of the layouts is shown. is_fleet: only the fans that
+        `show_fans` names are shown.
 
         Raises:
             StageError: the file cannot be written, or a port is taken.
@@ -106,9 +104,10 @@ class RerunSink:
                 check_free(port, f"viewer.{key}", "viewer.serve = false")
         self._recording = rr.RecordingStream(APPLICATION)
         self._bands = RerunBands(self._recording)
-        self._is_fleet = fleet is not None
-        layouts = [] if fleet else [TrayLayout(t.name, range(t.fans), t.speed_unit, t.fans) for t in trays]
-        self._layout = SiteLayout(tuple(layouts), window_s, fleet)
+        self._is_fleet = is_fleet
+        self._trays = {each.name: TrayLayout(each.name, each.fans, each.speed_unit, is_fleet) for each in trays}
+        self._styled: set[Fan] = set()
+        self._window_s = window_s
         self._wear = RerunWear(self._recording)
         self._layout_name: LayoutName = layout
         self._late = False
@@ -120,34 +119,52 @@ class RerunSink:
         if grpc_port is not None:
             server = rr.GrpcServerSink(LOOPBACK, grpc_port, server_memory_limit=memory_limit)
             sinks.append(server)
-        self._recording.set_sinks(*sinks, default_blueprint=self._layout.blueprint(layout))
+        self._recording.set_sinks(*sinks, default_blueprint=self._blueprint())
         if self._file is not None:
             self._file.release_pipe()
         self._recording.send_recording_name(f"{name} {np.datetime64(started_t_ns, 'ns').astype('datetime64[s]')} UTC")
-        for of_tray in layouts:
-            log_styles(self._recording, of_tray)
-        if fleet:
-            log_plot_styles(self._recording, fleet.count)
+        if not is_fleet:
+            self._style([Fan(each.name, number) for each in trays for number in range(each.fans)])
         self.flush()  # the styles reach the file first, so that the file of a killed viewer has them
         self._page = _serve_page(web_port, grpc_port) if web_port is not None and grpc_port is not None else None
 
     def draw(self, trace: Trace) -> None:
         """Send the next stretch of a tray."""
         self._lay_out(trace)
-        self._bands.draw(trace)
+        self._bands.draw(trace, self._trays[trace.tray].judged_together)
+
+    def show_fans(self, fans: Sequence[Fan]) -> None:
+        """Show these fans of a fleet, and no others, from now on."""
+        self._style(fans)
+        for name, tray in self._trays.items():
+            drawn = [fan.number for fan in fans if fan.tray == name]
+            if drawn or tray.alarmed:
+                self._trays[name] = replace(tray, alarmed=drawn)
+        self._recording.send_blueprint(self._blueprint())
+
+    def _style(self, fans: Sequence[Fan]) -> None:
+        new = [fan for fan in fans if fan not in self._styled]
+        self._styled.update(new)
+        for name in {fan.tray for fan in new}:
+            log_styles(self._recording, self._trays[name], [fan.number for fan in new if fan.tray == name])
 
     def _lay_out(self, trace: Trace) -> None:
         """Give its plots to what a source measures beside command and speed, when it comes for the first time, and in
         the layout `alarms` to a fan that goes into alarm for the first time."""
-        before, drawn = self._layout, self._layout.auxiliary_of(trace.tray)
-        if not trace.auxiliary.keys() <= {column.name for column in drawn}:
-            shown = [column for column in CHANNELS if column in drawn or column.name in trace.auxiliary]
-            self._layout = self._layout.with_auxiliary(trace.tray, shown)
-        if self._layout_name == "alarms":
+        before = tray = self._trays[trace.tray]
+        if not trace.auxiliary.keys() <= {column.name for column in tray.auxiliary}:
+            shown = [each for each in CHANNELS if each in tray.auxiliary or each.name in trace.auxiliary]
+            tray = replace(tray, auxiliary=shown)
+        if self._layout_name == "alarms" and not self._is_fleet:
             in_alarm = [trace.fan_numbers[column] for column in np.flatnonzero(trace.in_alarm.any(axis=0)).tolist()]
-            self._layout = self._layout.with_alarmed(trace.tray, in_alarm)
-        if self._layout is not before:
-            self._recording.send_blueprint(self._layout.blueprint(self._layout_name))
+            if new := [fan for fan in in_alarm if fan not in tray.alarmed]:
+                tray = replace(tray, alarmed=(*tray.alarmed, *new))
+        if tray is not before:
+            self._trays[trace.tray] = tray
+            self._recording.send_blueprint(self._blueprint())
+
+    def _blueprint(self) -> rrb.Blueprint:
+        return site_blueprint(self._layout_name, list(self._trays.values()), self._window_s)
 
     def draw_wear(self, tray: str, points: Sequence[WearPoints]) -> None:
         """Send the newest points of the wear of some fans."""
@@ -165,17 +182,9 @@ class RerunSink:
         """Set the state of a fan's lane from each time on."""
         self._bands.change_states(tray, fan, t_ns, names)
 
-    def show_fan(self, fan: Fan, place: int, unit: SpeedUnit) -> None:
-        """From now on a fan of a fleet is drawn in this place."""
-        self._bands.show(fan, place, unit)
-
-    def hide_fan(self, fan: Fan, t_ns: int) -> None:
-        """From `t_ns` on a fan of a fleet has no place."""
-        self._bands.hide(fan, t_ns)
-
     def log(self, lines: Sequence[LogLine]) -> None:
         """Add lines to the log of their tray, or of the fleet, with their time of day (UTC)."""
-        placed = [(FLEET_LOG if self._is_fleet else log_path(line.tray), line) for line in lines]
+        placed = [(self._trays[line.tray].log, line) for line in lines]
         for path, group in groupby(sorted(placed, key=itemgetter(0)), key=itemgetter(0)):
             of_log = [line for _, line in group]
             times = np.array([line.t_ns for line in of_log]).astype("datetime64[ns]")

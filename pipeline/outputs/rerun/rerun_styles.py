@@ -38,53 +38,50 @@ STATE_COLORS = {
 UNKNOWN_COLOR = (110, 110, 110)
 
 
-def speed_style(unit: SpeedUnit, width: float, name: str = "") -> rr.Measurements:
+def speed_style(unit: SpeedUnit, width: float) -> rr.Measurements:
     """Style of the series of a fan's `speed`: measured, twin with band, and the lowest and highest ends of the band,
     which are not seen: an axis fits the lines, not the bands around them.
 
-    Width 0 shows the band only. `name` is that of the fan, where the plot has another title.
+    Width 0 shows the band only.
     """
-    prefix = f"{name} " if name else ""
-    twin = f"{prefix}twin ± 2σ ({unit})"
+    twin = f"twin ± 2σ ({unit})"
     return rr.Measurements.from_fields(
-        names=[f"{prefix}measured ({unit})", twin, twin, twin],
+        names=[f"measured ({unit})", twin, twin, twin],
         colors=[VIOLET, GREEN, GREEN, GREEN],
         widths=[width, width, 0.0, 0.0],
     )
 
 
-def balance_style(fans: int, shown: int | None = None, name: str = "") -> rr.SeriesLines:
+def balance_style(fans: int, shown: int | None = None) -> rr.SeriesLines:
     """Style of the torque balances of some fans and what is expected of each; shown: of which alone, None: of all."""
-    prefix = f"{name} " if name else ""
     return rr.SeriesLines.from_fields(
-        names=[*[f"{prefix}torque balance"] * fans, *["expected"] * fans],
+        names=[*["torque balance"] * fans, *["expected"] * fans],
         colors=[*[VIOLET] * fans, *[GREEN] * fans],
         widths=LINE_WIDTH,
         visible_series=None if shown is None else [number % fans == shown for number in range(2 * fans)],
     )
 
 
-def score_style(fans: int, shown: int | None = None, name: str = "") -> rr.SeriesLines:
+def score_style(fans: int, shown: int | None = None) -> rr.SeriesLines:
     """Style of the scores of some fans, of their limit, and of a line above it that is not seen: without it the limit
     would be the edge of the plot. shown: of which fan alone, None: of all."""
-    prefix = f"{name} " if name else ""
     return rr.SeriesLines.from_fields(
-        names=[*[f"{prefix}score"] * fans, "limit", "limit"],
+        names=[*["score"] * fans, "limit", "limit"],
         colors=[*[VIOLET] * fans, RED, RED],
         widths=[*[LINE_WIDTH] * (fans + 1), 0.0],
         visible_series=None if shown is None else [number == shown or number >= fans for number in range(fans + 2)],
     )
 
 
-def log_fan_styles(recording: rr.RecordingStream, root: str, fan: int, speed: rr.Measurements) -> None:
+def log_fan_styles(recording: rr.RecordingStream, tray: str, fan: int, speed: rr.Measurements) -> None:
     """Log the static names, colours and widths of the series of a fan; `speed`: see `speed_style`."""
     deviation = rr.Measurements.from_fields(names="area in alarm", colors=RED, widths=0.0)
-    recording.log(fan_path(root, fan, "speed"), speed, static=True)
-    recording.log(fan_path(root, fan, "deviation"), deviation, static=True)
+    recording.log(fan_path(tray, fan, "speed"), speed, static=True)
+    recording.log(fan_path(tray, fan, "deviation"), deviation, static=True)
     outside = rr.SeriesPoints(names="dots outside band", colors=RED, marker_sizes=2.0)
-    recording.log(fan_path(root, fan, "outside"), outside, static=True)
+    recording.log(fan_path(tray, fan, "outside"), outside, static=True)
     not_scored = rr.SeriesLines(names="not scored", colors=GREY, widths=LINE_WIDTH)
-    recording.log(fan_path(root, fan, "not_scored"), not_scored, static=True)
+    recording.log(fan_path(tray, fan, "not_scored"), not_scored, static=True)
 
 
 def log_state_styles(recording: rr.RecordingStream, path: str, names: Sequence[str]) -> None:

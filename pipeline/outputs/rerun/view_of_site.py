@@ -9,7 +9,6 @@ from pathlib import Path
 
 from fantwin.pipeline.config.models import TrayConfig
 from fantwin.pipeline.outputs.rerun.fleet_view import FleetView
-from fantwin.pipeline.outputs.rerun.plot_places import FleetPlots, PlotPlaces
 from fantwin.pipeline.outputs.rerun.rerun_layout import LayoutName
 from fantwin.pipeline.outputs.rerun.rerun_sink import RerunSink
 from fantwin.pipeline.outputs.rerun.viewer_core import ViewerCore
@@ -53,11 +52,10 @@ def view_of_site(
     is_fleet = sum(tray.fans for tray in trays) > options.fleet_above
     if is_fleet and options.layout == "wear":
         raise StageError(NO_WEAR.format(fleet_above=options.fleet_above))
-    plots = FleetPlots(options.show, options.alarm_plots)
     sink = RerunSink(
         name=site,
         trays=trays,
-        fleet=plots if is_fleet else None,
+        is_fleet=is_fleet,
         started_t_ns=started_t_ns,
         layout=options.layout,
         window_s=options.window_s,
@@ -69,6 +67,6 @@ def view_of_site(
     )
     fleet = None
     if is_fleet:
-        places = PlotPlaces(plots, round(options.alarm_plot_hold_s * NS_PER_S))
-        fleet = FleetView(trays, places, round(options.window_s * NS_PER_S))
+        hold_ns, window_ns = round(options.alarm_plot_hold_s * NS_PER_S), round(options.window_s * NS_PER_S)
+        fleet = FleetView(trays, options.show, options.alarm_plots, hold_ns, window_ns)
     return ViewerCore(site, trays, sink, fleet)

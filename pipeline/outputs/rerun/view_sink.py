@@ -10,7 +10,6 @@ from fantwin.pipeline.outputs.rerun.wear_points import WearPoints
 from fantwin.pipeline.site.fleet import Fan
 from fantwin.pipeline.site.trace import Trace
 from fantwin.schemas.messages import Array
-from fantwin.schemas.units import SpeedUnit
 
 
 class ViewSink(Protocol):
@@ -24,12 +23,8 @@ class ViewSink(Protocol):
         """Set the state of a fan's lane from each time on."""
         ...
 
-    def show_fan(self, fan: Fan, place: int, unit: SpeedUnit) -> None:
-        """Draw a fan of a fleet in the plot with this number from now on."""
-        ...
-
-    def hide_fan(self, fan: Fan, t_ns: int) -> None:
-        """Draw a fan of a fleet no more from `t_ns` on."""
+    def show_fans(self, fans: Sequence[Fan]) -> None:
+        """Show these fans of a fleet, and no others, from now on."""
         ...
 
     def draw_wear(self, tray: str, points: Sequence[WearPoints]) -> None:

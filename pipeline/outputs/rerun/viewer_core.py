@@ -67,7 +67,8 @@ class ViewerCore(SiteCore):
         self._views = {tray.name: _TrayView(tray, () if fleet else None) for tray in trays}
         self._sink = sink
         self._fleet = fleet
-        self._places: dict[Fan, int] = {}
+        self._drawn: Sequence[Fan] = ()
+        """of a fleet"""
         self._lines: list[LogLine] = []
         self._shown_alarms = ""
         self._alarms_t_ns = 0
@@ -77,7 +78,7 @@ class ViewerCore(SiteCore):
         self._page_t_ns = 0
         self._samples_drawn = 0
         self._newest_t_ns = 0
-        self._show_places()
+        self._show_fans()
 
     def _now_s(self) -> float:
         """The model's clock: what has been heard before the first tick is not silent then."""
@@ -215,7 +216,7 @@ class ViewerCore(SiteCore):
             self._newest_t_ns = t_ns
 
     def _flush_fleet(self, fleet: FleetView) -> None:
-        """Keep the newest sample of every tray, and give plots to the fans in alarm."""
+        """Keep the newest sample of every tray, and draw the fans in alarm."""
         for view in self._views.values():
             if view.newest is not None:
                 fleet.add_newest(view.newest)
@@ -223,28 +224,23 @@ class ViewerCore(SiteCore):
                 view.newest = None
         heard = {name for name in self._views if not self._model.is_silent(name)}
         fleet.update([fan for fan in self._model.in_alarm() if fan.tray in heard], self._now_ns or 0)
-        self._show_places()
+        self._show_fans()
 
-    def _show_places(self) -> None:
+    def _show_fans(self) -> None:
         """Begin and end the plots of a fleet."""
-        places = dict(self._fleet.places) if self._fleet else {}
-        left = [fan for fan, place in self._places.items() if places.get(fan) != place]
-        come = [fan for fan, place in places.items() if self._places.get(fan) != place]
-        for fan in left:
-            view = self._views[fan.tray]
-            view.states.pop(fan.number, None)
-            self._sink.hide_fan(fan, view.drawn_t_ns.get(fan.number, 0) + 1)
-        self._places = places
-        for name in {fan.tray for fan in (*left, *come)}:
-            fans = tuple(sorted(fan.number for fan in places if fan.tray == name))
-            self._views[name].fans = fans
-            if not fans:
-                self._views[name].before_t_ns = None
-        for fan in come:
-            view = self._views[fan.tray]
-            self._sink.show_fan(fan, places[fan], view.config.speed_unit)
-            self._draw_before(view, fan)
-        for fan in places:
+        drawn = self._fleet.drawn if self._fleet else ()
+        left, come = (set(one) - set(other) for one, other in ((self._drawn, drawn), (drawn, self._drawn)))
+        self._drawn = drawn
+        for name in {fan.tray for fan in left | come}:
+            view = self._views[name]
+            view.fans = tuple(sorted(fan.number for fan in drawn if fan.tray == name))
+            if not view.fans:
+                view.before_t_ns = None
+        if left or come:
+            self._sink.show_fans(drawn)
+        for fan in sorted(come):
+            self._draw_before(self._views[fan.tray], fan)
+        for fan in drawn:
             view = self._views[fan.tray]
             if view.drawn_t_ns and self._model.is_silent(fan.tray) and view.states.get(fan.number, SILENT) != SILENT:
                 view.states[fan.number] = SILENT
@@ -257,4 +253,4 @@ class ViewerCore(SiteCore):
         before = [s for s in self._fleet.history(fan.tray) if drawn_t_ns is None or int(s.t_ns[0]) > drawn_t_ns]
         if before:
             trace = trace_of(fan.tray, before, view.config.speed_unit, (fan.number,))
-            self._draw(view, trace, len(trace.t_ns))
+            self._draw(view, with_holes(trace, NS_PER_S, drawn_t_ns), len(trace.t_ns))

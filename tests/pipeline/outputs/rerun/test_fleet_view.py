@@ -1,4 +1,4 @@
-"""What is kept of the past of a fleet."""
+"""Which fans of a fleet are drawn, and what is kept of its past."""
 
 from __future__ import annotations
 
@@ -6,20 +6,24 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from fantwin.pipeline.config.models import TrayConfig
 from fantwin.pipeline.outputs.rerun.fleet_view import FleetView
-from fantwin.pipeline.outputs.rerun.plot_places import FleetPlots, PlotPlaces
+from fantwin.pipeline.site.fleet import Fan
 from fantwin.schemas.messages import Score
 from fantwin.schemas.units import NS_PER_S
 from tests.support.score_data import START_NS, made_up_tray
 
 WINDOW_S = 4
+HOLD_NS = 10
+ASKED = Fan("tray1", 0)
+A, B, C = (Fan("tray1", number) for number in (1, 2, 3))
 
 
-def view_of(*trays: str) -> FleetView:
-    configured = [TrayConfig(name=name, fans=3) for name in trays]
-    return FleetView(configured, PlotPlaces(FleetPlots(), 0), WINDOW_S * NS_PER_S)
+def view_of(most_in_alarm: int = 0, asked: tuple[Fan, ...] = ()) -> FleetView:
+    return FleetView([TrayConfig(name="tray1", fans=3)], asked, most_in_alarm, HOLD_NS, WINDOW_S * NS_PER_S)
 
 
 def at(seconds: float, tray: str = "tray1") -> Score:
@@ -28,9 +32,10 @@ def at(seconds: float, tray: str = "tray1") -> Score:
 
 
 @pytest.mark.parametrize("period_s", [0.5, 1.0])
-def test_the_history_is_one_window_however_often_samples_come(period_s: float) -> None:
-    view = view_of("tray1")
+def test_the_history_is_one_window_however_often_samples_come_and_nothing_of_before_a_replay(period_s: float) -> None:
+    view = view_of()
     assert view.history("tray1") == []
+    view.add_newest(at(1000.0))
     times = np.arange(0.0, 5 * WINDOW_S, period_s)
     for seconds in times:
         view.add_newest(at(seconds))
@@ -38,8 +43,29 @@ def test_the_history_is_one_window_however_often_samples_come(period_s: float) -
     assert kept == [seconds for seconds in times if seconds > times[-1] - WINDOW_S]
 
 
-def test_the_history_of_a_replay_has_nothing_of_the_live_samples_before_it() -> None:
-    view = view_of("tray1")
-    for seconds in (1000.0, 1001.0, 3.0, 4.0):
-        view.add_newest(at(seconds))
-    assert [int(score.t_ns[0] - START_NS) / NS_PER_S for score in view.history("tray1")] == [3.0, 4.0]
+def test_a_new_alarm_replaces_the_fan_whose_alarm_has_been_over_for_longest() -> None:
+    view = view_of(2)
+    for now_ns, in_alarm in ((1, [A, B]), (3, [B]), (5, [C])):
+        view.update(in_alarm, now_ns)
+    assert view.drawn == (B, C)
+
+
+@given(
+    st.lists(st.tuples(st.integers(0, 15), st.lists(st.sampled_from([ASKED, A, B, C]), unique=True)), max_size=30),
+    st.integers(0, 3),
+)
+def test_a_fan_in_alarm_keeps_its_plot_and_no_other_has_one_for_longer_than_it_is_held(
+    steps: list[tuple[int, list[Fan]]], most: int
+) -> None:
+    view, now_ns, before = view_of(most, (ASKED,)), 0, set[Fan]()
+    last_ns: dict[Fan, int] = {}
+    for step_ns, in_alarm in steps:
+        now_ns += step_ns
+        last_ns |= dict.fromkeys(in_alarm, now_ns)
+        view.update(in_alarm, now_ns)
+        drawn = set(view.drawn)
+        assert ASKED in drawn and len(view.drawn) == len(drawn) <= most + 1
+        assert before & set(in_alarm) <= drawn, "those in alarm stay"
+        assert all(now_ns - last_ns[fan] <= HOLD_NS for fan in drawn - {ASKED})
+        assert len(drawn) == most + 1 or set(in_alarm) <= drawn, "and come while there is room"
+        before = drawn

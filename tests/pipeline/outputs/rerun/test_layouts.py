@@ -2,74 +2,94 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
+from fantwin.pipeline.outputs.rerun.viewer_core import PAGE_PERIOD_NS
+from fantwin.stages.viewer import build
 from tests.pipeline.outputs.rerun.test_recorded_view import live_view, recorded_view
-from tests.pipeline.outputs.rerun.test_viewer_picture import colors, needs_a_driver, rerun_picture
+from tests.stages.test_viewer import LATER_NS, card, context, free_port, health, sent
+from tests.stages.test_viewer_fleet import context as fleet_context
+from tests.stages.test_viewer_fleet import messages_of, play
 from tests.support.running_chain import eventually
-from tests.support.score_data import START_NS
+from tests.support.score_data import made_up_tray
 
-ALL = {
-    *(f"tray1 / fan {fan} speed (rad/s)" for fan in range(3)),
-    *(f"tray1 / fan {fan} {kind}" for fan in range(3) for kind in ("torque balance", "score")),
-    *("temperature (°C)", "state of each fan", "alarms", "alarm log"),
-}
-ALARMS = {
-    *("tray1 / fan 2 speed (rad/s)", "tray1 / fan 2 torque balance", "tray1 / fan 2 score"),
-    *("state of each fan", "alarms", "alarm log"),
-}
-WEAR = {"tray1 / speed since commissioning (%)"}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("made", "layout", "names"),
-    [
-        (recorded_view, "alarms", ALARMS),
-        (live_view, "wear", WEAR),
-    ],
+DRIVERS = Path("/usr/share/vulkan/icd.d")
+needs_a_driver = pytest.mark.skipif(
+    not DRIVERS.is_dir(), reason="no Vulkan driver here: apt-get install mesa-vulkan-drivers"
 )
-@needs_a_driver
-def test_a_layout_of_a_live_view_and_of_a_recording_opens_without_a_report(
-    made: Any, layout: str, names: set[str], tmp_path: Path
-) -> None:
-    with rerun_picture._headless_viewer([made(tmp_path, layout)]) as viewer:
-        eventually(lambda: shown(viewer).keys() - {"stages"} == names, f"the views of the layout {layout}")
-        rerun_picture._stable_screenshot(viewer, None)
-        assert {name: reports for name, reports in shown(viewer).items() if reports} == {}
-        assert [entry for entry in viewer.get_logs() if entry.level.lower() in ("warn", "error")] == []
+
+
+def plots(*fans: str) -> set[str]:
+    kinds = ("speed (rad/s)", "torque balance", "score")
+    lists = {"state of each fan", "alarms", "alarm log", "stages"}
+    return lists | {f"{tray} / fan {fan} {kind}" for tray, fan in (each.split("/") for each in fans) for kind in kinds}
+
+
+def fleet_view(folder: Path) -> Path:
+    """A view that ends while fan 2 of tray2 is in alarm."""
+    core: Any = build(fleet_context(folder, 3, 3, fleet_above=3, show=("tray1/0",))).core
+    play(core, messages_of(seconds=12))
+    core.close()
+    return folder / "view.rrd"
+
+
+@contextmanager
+def headless_viewer() -> Iterator[Any]:
+    client = pytest.importorskip("rerun.experimental").ViewerClient
+    with client.spawn(headless=True, port=free_port(), hide_welcome_screen=True) as viewer:
+        yield viewer
+
+
+def reports(viewer: Any) -> dict[str, list[str]]:
+    """What the viewer reports of each view, by name."""
+    return {view.name: [str(report) for report in view.reports] for view in viewer.get_state().views}
 
 
 @pytest.mark.slow
 @needs_a_driver
-def test_without_a_report_all_time_axes_are_linked_and_show_the_window_before_the_cursor(tmp_path: Path) -> None:
-    with rerun_picture._headless_viewer([live_view(tmp_path, window_s=1.0)]) as viewer:
-        eventually(lambda: shown(viewer).keys() - {"stages"} == ALL, "the views")
-        axes = [part["TimeAxis"] for part in viewer.get_blueprint().blueprint.values() if "TimeAxis" in part]
-        assert [axis["link"] for axis in axes if "link" in axis] == ["LinkToGlobal"] * (len(ALL) - 2), "but for texts"
-        assert len([axis for axis in axes if "view_range" in axis]) == 1
-        in_the_hole, after_it = (score_line(viewer, seconds) for seconds in (5.5, 9.0))
-        assert {name: reports for name, reports in shown(viewer).items() if reports} == {}
-        assert in_the_hole == 0.0 and after_it > 0.005, "the window is a second long, and no samples are from 4 to 6 s"
+def test_each_layout_of_a_live_view_a_recording_and_a_fleet_opens_without_a_report(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("RUST_LOG", "error")  # it warns of a host without a graphics card
+    made = {
+        live_view(tmp_path, window_s=1.0): plots("tray1/0", "tray1/1", "tray1/2") | {"temperature (°C)"},
+        live_view(tmp_path / "wear", "wear"): {"tray1 / speed since commissioning (%)"},
+        recorded_view(tmp_path, "alarms"): plots("tray1/2") | {"temperature (°C)"},
+        fleet_view(tmp_path / "fleet"): plots("tray1/0", "tray2/2"),
+    }
+    for path, names in made.items():
+        with headless_viewer() as viewer:
+            viewer.open(str(path))
+            eventually(lambda: reports(viewer).keys() == names, f"the views of {path}")  # noqa: B023  at once
+            axes = [part["TimeAxis"] for part in viewer.get_blueprint().blueprint.values() if "TimeAxis" in part]
+            assert len([axis for axis in axes if "view_range" in axis]) == 1, "all others are linked to it"
+            viewer.take_screenshot()
+            assert {name: of for name, of in reports(viewer).items() if of} == {}
+            assert [entry for entry in viewer.get_logs() if entry.level.lower() in ("warn", "error")] == []
 
 
-def score_line(viewer: Any, seconds: float) -> float:
-    """The share of a score's plot that its line covers, with the cursor there."""
-    viewer.set_time("time", timestamp=np.datetime64(START_NS + round(seconds * 1e9), "ns"), play_state="paused")
+@pytest.mark.slow
+@needs_a_driver
+def test_a_live_viewer_follows_an_old_recording_while_health_is_of_today(tmp_path: Path) -> None:
+    scores, _ = made_up_tray(seconds=5)
+    port = free_port()
+    core = build(context(tmp_path, serve=True, grpc_port=port, web_port=0)).core
+    with headless_viewer() as viewer:
+        viewer.open(f"rerun+http://127.0.0.1:{port}/proxy")
+        for number, item in enumerate((card(), health(), *scores, health(problem="something is wrong"))):
+            core.step(sent(item))
+            core.tick(LATER_NS + number * PAGE_PERIOD_NS)
+        last_ns = int(scores[-1].t_ns[-1])
+        eventually(lambda: abs(shown_ns(viewer) - last_ns) < 1000, "the last sample is under the cursor")
+        assert not any(reports(viewer).values())
+    core.close()
 
-    def drawn() -> list[float]:
-        view = next(view for view in viewer.get_state().views if view.name == "tray1 / fan 0 score")
-        with suppress(ConnectionError):  # the viewer has made its views again meanwhile
-            return [colors(rerun_picture._stable_screenshot(viewer, view.view_id))["measured"]]
-        return []
 
-    return eventually(drawn, "the plot is drawn")[0]
-
-
-def shown(viewer: Any) -> dict[str, list[str]]:
-    return {view.name: [str(report) for report in view.reports] for view in viewer.get_state().views}
+def shown_ns(viewer: Any) -> int:
+    """The position of the cursor in the only recording of a viewer; 0 if it shows nothing in time yet."""
+    return next((entry.current_time or 0 for entry in viewer.get_state().recordings), 0)

@@ -38,7 +38,7 @@ def test_row_09_a_view_on_a_full_disk_is_reported_and_the_viewer_goes_on_and_end
     sink = RerunSink(
         name="x",
         trays=trays,
-        fleet=None,
+        is_fleet=False,
         started_t_ns=START_NS,
         layout="all",
         window_s=30.0,
