@@ -150,7 +150,6 @@ class _Running(Server):
             "clients": server.clients,
             "events_sent": server.events_sent,
             "events_left_out": server.events_lost,
-            "clients_cut_off": server.cut_off,
         }
 
 

@@ -1,19 +1,24 @@
-"""What exists once in the address space: the types of fans and their alarms, and the folder of the site."""
+"""The address space: what exists once, which is types and the folder of the site, and the nodes of fans."""
 
 # pyright: reportPrivateImportUsage=false, reportArgumentType=false
 # (the library declares its names and integers otherwise than it uses them)
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import count
+from typing import Any
 
 from asyncua import Node, Server, ua
+from asyncua.server.address_space import AddressSpace
 
 from fantwin.pipeline.config.models import TrayConfig
 from fantwin.pipeline.outputs.opcua.conditions import OWN_FIELDS
+from fantwin.pipeline.outputs.opcua.encoding import STATUS
 from fantwin.pipeline.outputs.opcua.fan_values import VARIABLES
 from fantwin.pipeline.outputs.opcua.identifiers import COMMISSION, FAN_ALARM_TYPE, FAN_TYPE, SITE_FOLDER
 from fantwin.pipeline.outputs.opcua.requests import FAN_METHODS
-from fantwin.pipeline.outputs.opcua.site_nodes import SiteNodes, ValueOf
+from fantwin.pipeline.outputs.opcua.site_nodes import SiteNode, SiteNodes, ValueOf
 from fantwin.pipeline.outputs.opcua.templates import standard
 
 _NOTIFIES = [ua.EventNotifier.SubscribeToEvents, ua.EventNotifier.HistoryRead]
@@ -21,10 +26,81 @@ _FIRST_DECLARATION = 100
 """number of the first node below a type"""
 
 
+@dataclass
+class Watched:
+    """A value of the site to which a client subscribes."""
+
+    node: SiteNode
+    attribute: int
+    callback: Callable[..., Any]
+    _sent: tuple[object, ...] = ()
+
+    async def publish(self, handle: int) -> None:
+        """Send the value, if it is another one than when it was sent last."""
+        value = self.node.read(self.attribute)
+        before, self._sent = self._sent, (value.Value, value.StatusCode, value.SourceTimestamp)
+        if self._sent != before:
+            await self.callback(handle, value)
+
+
+class SiteAddressSpace(AddressSpace):
+    """The address space of the library with the nodes of a site, of which there are too many to keep.
+
+    Attributes:
+        namespace: index of the server's own nodes.
+        site: the nodes of trays and fans; None: not yet.
+        watched: the values to which clients subscribe, by handle.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.namespace = 0
+        self.site: SiteNodes | None = None
+        self.watched: dict[int, Watched] = {}
+        self._handles = count(1 << 30)  # the library counts from 201
+
+    def _of_site(self, nodeid: ua.NodeId) -> SiteNode | None:
+        return self.site.node(nodeid) if self.site else None
+
+    def __contains__(self, nodeid: ua.NodeId) -> bool:
+        return super().__contains__(nodeid) or self._of_site(nodeid) is not None
+
+    def __getitem__(self, nodeid: ua.NodeId) -> Any:
+        return self._of_site(nodeid) or super().__getitem__(nodeid)
+
+    def get(self, nodeid: ua.NodeId) -> Any:
+        """A node; None: there is none."""
+        return self._of_site(nodeid) or super().get(nodeid)
+
+    def read_attribute_value(self, nodeid: ua.NodeId, attr: ua.AttributeIds) -> ua.DataValue:
+        """The value of an attribute."""
+        node = self._of_site(nodeid)
+        return node.read(attr) if node else super().read_attribute_value(nodeid, attr)
+
+    def add_datachange_callback(
+        self, nodeid: ua.NodeId, attr: ua.AttributeIds, callback: Callable[..., Any]
+    ) -> tuple[ua.StatusCode, int]:
+        """Subscribe to an attribute: whether it is there, and a handle."""
+        node = self._of_site(nodeid)
+        if node is None:
+            return super().add_datachange_callback(nodeid, attr, callback)
+        if node.read(attr).StatusCode == STATUS["BadAttributeIdInvalid"]:
+            return STATUS["BadAttributeIdInvalid"], 0
+        handle = next(self._handles)
+        self.watched[handle] = Watched(node, attr, callback)
+        return ua.StatusCode(), handle
+
+    def delete_datachange_callback(self, handle: int) -> None:
+        """End a subscription."""
+        if self.watched.pop(handle, None) is None:
+            super().delete_datachange_callback(handle)
+
+
 async def build_address_space(
-    server: Server, namespace: int, site: str, trays: Sequence[TrayConfig], value_of: ValueOf
+    server: Server, nodes: SiteAddressSpace, site: str, trays: Sequence[TrayConfig], value_of: ValueOf
 ) -> SiteNodes:
-    """Add all that the server has of its own; returns the nodes of the site. namespace: index of its own nodes."""
+    """Add all that the server has of its own; returns the nodes of the site. nodes: those of the server."""
+    namespace = nodes.namespace
     await _add_types(server, namespace)
     folder = await server.nodes.objects.add_folder(ua.NodeId(SITE_FOLDER, namespace), _name(site, namespace))
     await folder.set_event_notifier(_NOTIFIES)
@@ -32,10 +108,14 @@ async def build_address_space(
     await server.nodes.server.add_reference(folder, ua.ObjectIds.HasNotifier)
     history = server.get_node(ua.NodeId(ua.ObjectIds.HistoryServerCapabilities_AccessHistoryEventsCapability))
     await history.write_value(True)
-    nodes = SiteNodes(server.iserver.aspace._nodes, namespace, site, trays, value_of)
-    server.iserver.aspace._nodes = nodes  # type: ignore[assignment]  as the library does it for nodes in a file
-    nodes[folder.nodeid].references.extend(nodes.trays_in_folder())
-    return nodes
+
+    def name_of(node: ua.NodeId) -> ua.QualifiedName:
+        found = nodes.read_attribute_value(node, ua.AttributeIds.BrowseName).Value
+        return found.Value if found is not None else ua.QualifiedName()
+
+    nodes.site = SiteNodes(name_of, namespace, site, trays, value_of)
+    nodes[folder.nodeid].references.extend(nodes.site.trays_in_folder())
+    return nodes.site
 
 
 async def _add_types(server: Server, namespace: int) -> None:

@@ -115,7 +115,7 @@ class Methods:
         return any(alarm.onset_t_ns == current.newest.onset_t_ns and event_id(alarm) == wanted for _, alarm in past)
 
     async def _refresh(self, parent: ua.NodeId, *arguments: ua.Variant) -> ua.StatusCode:
-        """ConditionRefresh of a subscription, ConditionRefresh2 of one of its monitored items."""
+        """ConditionRefresh of a subscription; ConditionRefresh2, which names one of its items, does the same."""
         numbers = [each.Value for each in arguments]
         if not numbers or not all(isinstance(each, int) for each in numbers):
             return _code("BadArgumentsMissing" if not numbers else "BadInvalidArgument")
@@ -123,12 +123,9 @@ class Methods:
         subscription = session.subscription_service.subscriptions.get(numbers[0])
         if subscription is None or subscription.session_id != session.session_id:
             return _code("BadSubscriptionIdInvalid")
-        item = numbers[1] if len(numbers) > 1 else None
-        if item is not None and item not in subscription.monitored_item_srv._monitored_items:
-            return _code("BadMonitoredItemIdInvalid")
         current = self._model.current_alarms()
         conditions = [Condition(Fan(each.newest.header.tray, each.newest.fan), each) for each in current]
-        await self._delivery.refresh(subscription, item, [each for each in conditions if each.retain])
+        await self._delivery.refresh(numbers[0], [each for each in conditions if each.retain])
         return _code(GOOD)
 
 

@@ -9,25 +9,22 @@ import contextlib
 import logging
 import socket
 import threading
-import time
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from asyncua import Server, ua
-from asyncua.common.connection import TransportLimits
 
 from fantwin.pipeline.config.models import TrayConfig
-from fantwin.pipeline.outputs.opcua.address_space import build_address_space
+from fantwin.pipeline.outputs.opcua.address_space import SiteAddressSpace, build_address_space
 from fantwin.pipeline.outputs.opcua.conditions import Condition
-from fantwin.pipeline.outputs.opcua.events import EventDelivery, system_event
+from fantwin.pipeline.outputs.opcua.events import EventDelivery
 from fantwin.pipeline.outputs.opcua.history import EventHistory
 from fantwin.pipeline.outputs.opcua.identifiers import NAMESPACE
 from fantwin.pipeline.outputs.opcua.log_in import LogIn, Permissions, TrustedClients
 from fantwin.pipeline.outputs.opcua.methods import Methods
 from fantwin.pipeline.outputs.opcua.sessions import SiteServer
-from fantwin.pipeline.outputs.opcua.site_nodes import SiteNode, SiteNodes
 from fantwin.pipeline.outputs.opcua.site_values import SiteValues
 from fantwin.pipeline.runtime.stage import StageError
 from fantwin.pipeline.site.request_desk import RequestDesk
@@ -37,10 +34,6 @@ UPDATE_PERIOD_S = 1.0
 START_LIMIT_S, STOP_LIMIT_S = 120.0, 5.0
 MOST_PENDING = 20_000
 """transitions that wait to become events; of more, the oldest are left out, and clients are asked to refresh"""
-LARGEST_BACKLOG_BYTES, LONGEST_BACKLOG_S = 16 << 20, 30.0
-"""answers that wait because a client does not read them; with more, or after so long, it is cut off"""
-_LARGEST_REQUEST_BYTES = 16 << 20
-_CHUNK_BYTES = 65_535
 _AT_ONCE = 200
 """values that are published before others may do something"""
 
@@ -58,18 +51,6 @@ class Listening:
     key: Path
     uri: str
     is_open: bool
-
-
-class RequestLimits(TransportLimits):
-    """How large a request may be. The library takes what a client can receive for what it may send."""
-
-    def create_acknowledge_and_set_limits(self, msg: ua.Hello) -> ua.Acknowledge:
-        """The answer to a client's greeting."""
-        largest, chunks = self.max_message_size, self.max_chunk_count
-        answer = super().create_acknowledge_and_set_limits(msg)
-        self.max_message_size, self.max_chunk_count = largest, chunks
-        answer.MaxMessageSize, answer.MaxChunkCount = ua.UInt32(largest), ua.UInt32(chunks)
-        return answer
 
 
 class OpcuaServer:
@@ -97,9 +78,7 @@ class OpcuaServer:
         self._lost_unsaid = False
         self._error = ""
         self._is_ready = threading.Event()
-        self.events_sent = self.events_lost = self.clients = self.cut_off = 0
-        self._waiting_since_s: dict[asyncio.Transport, float] = {}
-        """since when answers wait for a client that does not read them"""
+        self.events_sent = self.events_lost = self.clients = 0
         self._loop: asyncio.AbstractEventLoop | None = None
         self._thread = threading.Thread(target=self._run, name="OPC UA server", daemon=True)
         self._thread.start()
@@ -145,7 +124,7 @@ class OpcuaServer:
 
     async def _serve(self) -> None:
         self._stopping, self._woken = asyncio.Event(), asyncio.Event()
-        server, nodes, values, namespace = await self._made()
+        server, nodes, values, delivery = await self._made()
         try:
             await server.start()
         except OSError as error:
@@ -154,7 +133,6 @@ class OpcuaServer:
             return
         self._loop = asyncio.get_running_loop()
         self._is_ready.set()
-        delivery = EventDelivery(server.iserver.subscription_service.subscriptions, namespace)
         tasks = [
             asyncio.create_task(self._stopping.wait()),
             asyncio.create_task(self._publish_values(server, nodes, values)),
@@ -168,10 +146,9 @@ class OpcuaServer:
         for task in done:
             task.result()
 
-    async def _made(self) -> tuple[Server, SiteNodes, SiteValues, int]:
+    async def _made(self) -> tuple[Server, SiteAddressSpace, SiteValues, EventDelivery]:
         iserver = SiteServer(self._log_in, self._trusted)
         server = Server(iserver=iserver)
-        iserver.connections = lambda: server.bserver.clients if server.bserver else ()
         await server.init()
         listening = self._listening
         await server.load_certificate(listening.certificate)
@@ -183,9 +160,6 @@ class OpcuaServer:
         host = listening.host.strip("[]")
         server.set_endpoint(f"opc.tcp://{f'[{host}]' if ':' in host else host}:{listening.port}/fantwin")
         server.socket_address = (host, listening.port)
-        server.limits = RequestLimits(
-            _CHUNK_BYTES, _CHUNK_BYTES, _LARGEST_REQUEST_BYTES // _CHUNK_BYTES + 1, _LARGEST_REQUEST_BYTES
-        )
         policies = [
             ua.SecurityPolicyType.Basic256Sha256_SignAndEncrypt,
             ua.SecurityPolicyType.Aes256Sha256RsaPss_SignAndEncrypt,
@@ -196,38 +170,29 @@ class OpcuaServer:
             tokens.append(ua.AnonymousIdentityToken)
         server.set_security_policy(policies, permission_ruleset=Permissions(self._log_in))  # type: ignore[arg-type]
         server.set_identity_tokens(tokens)
-        namespace = await server.register_namespace(NAMESPACE)
+        nodes = iserver.site_nodes
+        namespace = nodes.namespace = await server.register_namespace(NAMESPACE)
         values = SiteValues(self._model, namespace)
-        nodes = await build_address_space(server, namespace, self._site, self._trays, values.of)
-        delivery = EventDelivery(iserver.subscription_service.subscriptions, namespace)
-        Methods(self._model, self._desk, nodes, delivery).bind(server, namespace)
+        of_site = await build_address_space(server, nodes, self._site, self._trays, values.of)
+        delivery = EventDelivery(iserver.subscription_service, namespace, self._trays)
+        Methods(self._model, self._desk, of_site, delivery).bind(server, namespace)
         iserver.history_manager.set_storage(EventHistory(self._model, namespace))
-        return server, nodes, values, namespace
+        return server, nodes, values, delivery
 
-    async def _publish_values(self, server: Server, nodes: SiteNodes, values: SiteValues) -> None:
+    async def _publish_values(self, server: Server, nodes: SiteAddressSpace, values: SiteValues) -> None:
         """Once a second: what has changed, to those who subscribe to it."""
         loop = asyncio.get_running_loop()
         due_s = loop.time()
         while True:
             values.use(await asyncio.to_thread(values.newest))
-            for number, node in enumerate(list(nodes.subscribed.values())):
-                await _publish(node)
+            for number, (handle, watched) in enumerate(list(nodes.watched.items())):
+                if handle in nodes.watched:
+                    await watched.publish(handle)
                 if number % _AT_ONCE == _AT_ONCE - 1:
                     await asyncio.sleep(0)
-            self._cut_off(server)
+            self.clients = len(server.iserver.asyncio_transports)
             due_s = max(due_s + UPDATE_PERIOD_S, loop.time())
             await asyncio.sleep(due_s - loop.time())
-
-    def _cut_off(self, server: Server) -> None:
-        """Clients that send requests and read no answers."""
-        now_s, transports = time.monotonic(), list(server.iserver.asyncio_transports)
-        self.clients = len(transports)
-        waiting = {each: size for each in transports if (size := each.get_write_buffer_size())}
-        self._waiting_since_s = {each: self._waiting_since_s.get(each, now_s) for each in waiting}
-        for transport, size in waiting.items():
-            if size > LARGEST_BACKLOG_BYTES or now_s - self._waiting_since_s[transport] > LONGEST_BACKLOG_S:
-                transport.abort()
-                self.cut_off += 1
 
     async def _publish_events(self, delivery: EventDelivery) -> None:
         while True:
@@ -240,23 +205,13 @@ class OpcuaServer:
             await delivery.to_all(taken)
             self.events_sent += len(taken)
             if lost:
-                await delivery.of_server_to_all(system_event("RefreshRequiredEventType", "events were left out"))
+                await delivery.ask_for_refresh()
 
     async def _end(self, server: Server) -> None:
         for transport in list(server.iserver.asyncio_transports):
             transport.abort()
         with contextlib.suppress(TimeoutError):  # the thread ends with its loop
             await asyncio.wait_for(server.stop(), STOP_LIMIT_S / 2)
-
-
-async def _publish(node: SiteNode) -> None:
-    attribute = node.attributes.get(ua.AttributeIds.Value)
-    if attribute is None or node.value is None or not attribute.datachange_callbacks:
-        return
-    value = node.value()
-    if node.is_news(value):
-        for handle, callback in list(attribute.datachange_callbacks.items()):
-            await callback(handle, value)
 
 
 def application_uri(site: str) -> str:
