@@ -14,11 +14,11 @@ from collections.abc import Mapping, Sequence, Set
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.extras import require
 from fantwin.pipeline.outputs.mqtt.config import MqttConfig
-from fantwin.pipeline.outputs.mqtt.fan_states import FanStates, shown_alarm, topics_of
+from fantwin.pipeline.outputs.mqtt.fan_states import FanStates, shown_alarm
 from fantwin.pipeline.outputs.mqtt.home_assistant import OFFLINE, ONLINE, HomeAssistant
 from fantwin.pipeline.outputs.mqtt.json_text import json_text
 from fantwin.pipeline.outputs.mqtt.link import BrokerLink, Link
-from fantwin.pipeline.outputs.mqtt.outbox import Outbox, Outgoing
+from fantwin.pipeline.outputs.mqtt.outbox import REMOVED, Outbox, Outgoing
 from fantwin.pipeline.outputs.mqtt.requests import Requests
 from fantwin.pipeline.outputs.mqtt.topics import Topics, do_overlap
 from fantwin.pipeline.outputs.mqtt.transition_queue import TransitionQueue
@@ -41,8 +41,6 @@ SETTLED_AFTER_NS = 2 * NS_PER_S
 """time after the start in which alarms of before are heard again, and nothing is published"""
 KNOWN_AFTER_NS = 10 * NS_PER_S
 """time after the start until a fan of which no alarm was heard has none, and a tray without a score is silent"""
-FOUND_WITHIN_NS = 10 * NS_PER_S
-"""time after connecting in which the broker sends what it had retained"""
 PERIOD_S = 5.0
 """between two states of a fan of which only numbers have changed; a change of state or alarm is published at once"""
 MOST_WAITING = 10_000
@@ -61,13 +59,12 @@ class MqttCore(SiteCore):
         super().__init__(model)
         self._desk = desk
         self._config, self._topics, self._link = config, topics, link
-        self._is_whole = context.instance == ALL_TRAYS
         self._states = FanStates(model)
         self._outbox = Outbox()
         self._history, self._queue = alarms, TransitionQueue(alarms, MOST_WAITING)
         self._requests = Requests(topics, model.trays, config.accept, config.operator_name, desk)
         self._home_assistant = HomeAssistant(config, topics, model.trays)
-        self._devices = self._home_assistant.messages() if config.home_assistant == "publish" else {}
+        self._devices = self._home_assistant.messages() if config.home_assistant != "off" else {}
         self._numbers: dict[int, int] = {}
         """transitions under way: by the number of the message, that of the transition"""
         self._changed_alarms: set[Fan] = set()
@@ -77,7 +74,6 @@ class MqttCore(SiteCore):
         self._session = 0
         self._began_ns: int | None = None
         self._full_ns = self._changes_ns = self._site_ns = -(1 << 62)
-        self._forget_ns: int | None = None
 
     def add_score(self, envelope: Envelope) -> None:
         """Keep it."""
@@ -96,9 +92,8 @@ class MqttCore(SiteCore):
             self._began_ns = now_ns
         if self._link.sessions != self._session:
             self._session = self._link.sessions
-            self._forget_ns = now_ns + FOUND_WITHIN_NS
             self._outbox.renew()
-        self._receive(now_ns)
+        self._receive()
         if now_ns - self._began_ns >= SETTLED_AFTER_NS:
             self._update(now_ns, now_ns - self._began_ns >= KNOWN_AFTER_NS)
         self._send()
@@ -147,28 +142,12 @@ class MqttCore(SiteCore):
             broker += f"; more than {MOST_WAITING} transitions of alarms wait, the oldest are lost"
         return "; ".join(filter(None, (broker, self._model.problem())))
 
-    def _receive(self, now_ns: int) -> None:
+    def _receive(self) -> None:
         for topic, payload, is_retained in self._link.received():
             if answer := self._requests.take(topic, payload, is_retained=is_retained):
                 self._outbox.answer(*answer)
-            elif is_retained and self._is_left_over(topic):
-                self._counts["removed_topics"] += 1
-                self._outbox.remove(topic)
         for answer in self._requests.answers():
             self._outbox.answer(*answer)
-        if self._forget_ns is not None and now_ns >= self._forget_ns:
-            self._forget_ns = None
-            self._link.forget(patterns_of_retained(self._config, self._topics, self._home_assistant))
-
-    def _is_left_over(self, topic: str) -> bool:
-        """Return whether a retained topic is of a device or fan that is not configured any more."""
-        if self._home_assistant.is_own(topic):
-            return topic not in self._devices
-        parts = self._topics.parts(topic)
-        if parts is None or topic not in topics_of(self._topics, Fan(parts[0], _number_of(parts[1]))):
-            return False
-        tray = self._model.tray(parts[0])
-        return self._is_whole if tray is None else _number_of(parts[1]) >= tray.fans
 
     def _update(self, now_ns: int, knows_all: bool) -> None:
         """Put what has changed into the outbox. knows_all: what was not heard so far is not there."""
@@ -202,8 +181,9 @@ class MqttCore(SiteCore):
         self._outbox.retain(self._topics.stages, json_text(stages_json(self._model.stages())))
         if not self._has_devices:
             self._has_devices = True
+            is_removing = self._config.home_assistant == "remove"
             for topic, text in self._devices.items():
-                self._outbox.retain(topic, text)
+                self._outbox.retain(topic, REMOVED if is_removing else text)
             self._outbox.retain(self._topics.status, ONLINE, is_urgent=True)
 
     def _send(self) -> None:
@@ -220,16 +200,6 @@ class MqttCore(SiteCore):
         for message in self._outbox.take(room):
             self._link.publish(message)
             self._counts["published_messages"] += 1
-
-
-def patterns_of_retained(config: MqttConfig, topics: Topics, home_assistant: HomeAssistant) -> tuple[str, ...]:
-    """Patterns of the topics that are read after connecting, for topics of fans that are not configured any more."""
-    devices = () if config.home_assistant == "off" else (home_assistant.pattern,)
-    return (*topics.of_fans(), *devices)
-
-
-def _number_of(text: str) -> int:
-    return int(text) if text.isascii() and text.isdigit() and len(text) < 6 else -1
 
 
 def build(context: Context) -> BuiltStage:
@@ -251,7 +221,6 @@ def build(context: Context) -> BuiltStage:
         topics.client_id,
         Outgoing(topics.status, OFFLINE, is_retained=True),
         [topics.requests(tray.name) for tray in context.trays] if config.accept else [],
-        patterns_of_retained(config, topics, HomeAssistant(config, topics, context.trays)),
     )
     core = MqttCore(context, model, alarms, RequestDesk(context.producer), topics, link)
     link.start()

@@ -200,8 +200,6 @@ class FakeLink:
         taken, self._received = self._received, []
         return taken
 
-    def forget(self, patterns: Any) -> None: ...
-
     def problem(self) -> str:
         return ""
 

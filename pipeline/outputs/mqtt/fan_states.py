@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from fantwin.pipeline.outputs.mqtt.topics import Topics
 from fantwin.pipeline.recordings.dates import format_utc
 from fantwin.pipeline.site.fleet import Fan, FanNow
 from fantwin.pipeline.site.shown import alarm_json
@@ -66,11 +65,6 @@ class FanStates:
 def shown_alarm(current: CurrentAlarm) -> dict[str, Any] | None:
     """A current alarm; None: it is over and nothing is left to do about it."""
     return alarm_json(current) if is_listed(current.newest) else None
-
-
-def topics_of(topics: Topics, fan: Fan) -> tuple[str, str]:
-    """The retained topics of a fan."""
-    return topics.state(fan), topics.alarm(fan)
 
 
 def _number(value: float) -> float | None:

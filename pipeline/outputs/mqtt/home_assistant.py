@@ -45,15 +45,6 @@ class HomeAssistant:
         self._fans = fans[: config.home_assistant_fans]
         self.left_out = len(fans) - len(self._fans)
 
-    @property
-    def pattern(self) -> str:
-        """Pattern of the topics of all its devices, including those of earlier configurations."""
-        return f"{self._path}/+/config"
-
-    def is_own(self, topic: str) -> bool:
-        """Whether a topic is that of one of its devices, or of a device of an earlier configuration."""
-        return topic.startswith(f"{self._path}/") and topic.endswith("/config")
-
     def messages(self) -> Mapping[str, str]:
         """The text of each device by its topic."""
         devices = {SITE_DEVICE: self._site()}

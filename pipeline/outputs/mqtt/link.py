@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import threading
 import time
-from collections import deque
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -16,7 +15,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 from fantwin.pipeline.outputs.mqtt.config import MqttConfig
 from fantwin.pipeline.outputs.mqtt.outbox import Outgoing
-from fantwin.pipeline.outputs.mqtt.topics import REQUEST
 from fantwin.pipeline.sources.mqtt.client import new_client, refusal
 from fantwin.pipeline.sources.mqtt.settings import KEEPALIVE_S
 
@@ -24,8 +22,8 @@ if TYPE_CHECKING:
     from paho.mqtt.client import Client, MQTTMessage
 
 WINDOW = 200
-MOST_RETAINED, MOST_REQUESTS = 100_000, 256
-"""that wait for the core; of more retained ones, the oldest are forgotten, and of more requests the newest"""
+MOST_REQUESTS = 256
+"""that wait for the core; of more, the newest are dropped"""
 SILENT_AFTER_S = 10.0
 STOPPED_WITHIN_S = 3.0
 CONNECT_TIMEOUT_S = 3.0
@@ -33,7 +31,7 @@ QOS = 1
 
 
 class Received(NamedTuple):
-    """A message from the broker. is_retained: it had kept it; the payload is then left out but for requests."""
+    """A request from the broker. is_retained: it had kept it."""
 
     topic: str
     payload: bytes
@@ -67,10 +65,6 @@ class Link(Protocol):
         """What has come since the last call."""
         ...
 
-    def forget(self, patterns: Sequence[str]) -> None:
-        """End subscriptions."""
-        ...
-
     def problem(self) -> str:
         """What is wrong now; empty if nothing is."""
         ...
@@ -90,33 +84,29 @@ class BrokerLink:
         client_id: str,
         will: Outgoing,
         requests: Sequence[str],
-        retained: Sequence[str],
     ) -> None:
         """Nothing is connected yet.
 
-        will: what the broker publishes if this process dies. requests, retained: patterns that are subscribed to; what
-        the second ones match is only looked at after connecting.
+        will: what the broker publishes if this process dies. requests: patterns that are subscribed to.
 
         Raises:
             UserError: a password or certificate cannot be read.
         """
         self._address = f"{config.host}:{config.port}"
         self._config = config
-        self._requests, self._retained = tuple(requests), tuple(retained)
+        self._requests = tuple(requests)
         self._lock = threading.Lock()
         self._under_way: dict[int, float] = {}
         """by number, since when, on the monotonic clock"""
         self._acknowledged: list[int] = []
         self._early: set[int] = set()
         """acknowledged before `publish` returned"""
-        self._found: deque[Received] = deque(maxlen=MOST_RETAINED)
         self._asked: list[Received] = []
         self.dropped_requests = 0
         self._is_up = False
         self._sessions = 0
         self._refused = ""
         self._refused_subscription = ""
-        self._request_mid: int | None = None
         client = self._client = new_client(config, folder, "mqtt", client_id)
         client.will_set(will.topic, will.text, QOS, will.is_retained)
         client.max_inflight_messages_set(WINDOW)
@@ -163,15 +153,8 @@ class BrokerLink:
     def received(self) -> Sequence[Received]:
         """What has come since the last call."""
         with self._lock:
-            found = [*self._found, *self._asked]
-            self._found.clear()
-            self._asked.clear()
+            found, self._asked = self._asked, []
         return found
-
-    def forget(self, patterns: Sequence[str]) -> None:
-        """End subscriptions."""
-        if self._is_up and patterns:
-            self._client.unsubscribe(list(patterns))
 
     def problem(self) -> str:
         """What is wrong now; empty if nothing is."""
@@ -206,15 +189,13 @@ class BrokerLink:
             return
         self._refused = self._refused_subscription = ""
         if self._requests:
-            _, self._request_mid = client.subscribe([(pattern, QOS) for pattern in self._requests])
-        if self._retained:
-            client.subscribe([(pattern, 0) for pattern in self._retained])
+            client.subscribe([(pattern, QOS) for pattern in self._requests])
         self._sessions += 1
         self._is_up = True
 
-    def _on_subscribe(self, _client: Any, _data: Any, mid: int, reasons: Any, _properties: Any) -> None:
+    def _on_subscribe(self, _client: Any, _data: Any, _mid: int, reasons: Any, _properties: Any) -> None:
         failures = [str(reason) for reason in reasons if reason.is_failure]
-        if failures and mid == self._request_mid:
+        if failures:
             self._refused_subscription = (
                 f"the broker refuses the subscription to requests: {failures[0]}; check the rights of this user"
             )
@@ -233,10 +214,7 @@ class BrokerLink:
         except UnicodeDecodeError:  # it would end the thread
             return
         with self._lock:
-            if not topic.endswith(f"/{REQUEST}"):
-                if message.retain:  # else it is what was published here
-                    self._found.append(Received(topic, b"", is_retained=True))
-            elif len(self._asked) < MOST_REQUESTS:
+            if len(self._asked) < MOST_REQUESTS:
                 self._asked.append(Received(topic, bytes(message.payload), message.retain))
             else:
                 self.dropped_requests += 1

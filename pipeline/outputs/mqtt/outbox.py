@@ -47,11 +47,6 @@ class Outbox:
         elif topic not in self._urgent:
             self._ordinary[topic] = None
 
-    def remove(self, topic: str) -> None:
-        """Have the broker delete a retained topic."""
-        self._texts[topic] = REMOVED
-        self._ordinary[topic] = None
-
     def answer(self, topic: str, text: str) -> None:
         """Send a text once, which nobody keeps."""
         self._answers.append((topic, text))
@@ -76,7 +71,4 @@ class Outbox:
     def _retained(self, waiting: dict[str, None]) -> Outgoing:
         topic = next(iter(waiting))
         del waiting[topic]
-        text = self._texts[topic]
-        if text == REMOVED:
-            del self._texts[topic]
-        return Outgoing(topic, text, is_retained=True)
+        return Outgoing(topic, self._texts[topic], is_retained=True)

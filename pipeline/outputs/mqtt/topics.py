@@ -72,10 +72,6 @@ class Topics:
         """Pattern of the topics of requests about a tray."""
         return self.request(tray, "+")
 
-    def of_fans(self) -> tuple[str, ...]:
-        """Patterns of the retained topics of all fans, including those of earlier configurations."""
-        return f"{self.root}/+/+/{STATE}", f"{self.root}/+/+/{ALARM}"
-
     def parts(self, topic: str) -> tuple[str, str, str] | None:
         """Tray, fan and the rest of the topic of a fan; None: it is not one."""
         if not topic.startswith(f"{self.root}/"):
