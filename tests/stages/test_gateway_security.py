@@ -150,7 +150,7 @@ def test_while_the_file_of_users_cannot_be_used_nobody_acts_or_logs_in(gateway, 
 
 
 def test_live_events_end_for_who_may_not_read_any_more(gateway, users, monkeypatch):
-    monkeypatch.setattr("fantwin.pipeline.outputs.web.api.CHECKED_EVERY_S", 0.0)
+    monkeypatch.setattr("fantwin.pipeline.outputs.web.live_feed.CHECKED_EVERY_S", 0.0)
     monkeypatch.setattr("fantwin.pipeline.outputs.web.config.GatewayConfig.is_loopback", False)
     gateway.feed(score())
     assert events(gateway).status == 401

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import AsyncGenerator, AsyncIterator, Callable, Mapping, Sequence
-from contextlib import aclosing
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -13,14 +12,13 @@ from typing import Annotated, Any, Literal
 from fastapi import APIRouter, Depends, HTTPException, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import FileResponse, JSONResponse
-from sse_starlette import EventSourceResponse
 
 from fantwin.pipeline.config.models import TrayConfig
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.outputs.web import answers as typed
 from fantwin.pipeline.outputs.web.access import Access, address_of, require_own_page, require_token
 from fantwin.pipeline.outputs.web.answers import JSON, LoginForm
-from fantwin.pipeline.outputs.web.live_feed import LiveFeed, encoded, keep_alive
+from fantwin.pipeline.outputs.web.live_feed import EventStream, LiveFeed, encoded
 from fantwin.pipeline.outputs.web.metrics import metrics_text
 from fantwin.pipeline.outputs.web.shared_answer import SharedAnswer
 from fantwin.pipeline.recordings.clips.clip import Clip, kept_clips
@@ -46,10 +44,6 @@ from fantwin.schemas.messages import Request as OperatorRequest
 from fantwin.schemas.units import NS_PER_S
 
 MOST_LISTED = 500
-CHECKED_EVERY_S = 5.0
-"""so often it is looked whether a reader of live events may still read"""
-KEEP_ALIVE_S, NOT_READING_S = 10, 30.0
-"""A reader without events is sent a comment, so that a dead connection shows. One that takes nothing is cut off."""
 CLIP_TYPE = "application/octet-stream"
 METRICS_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 ALL_FANS = "all"
@@ -100,7 +94,7 @@ class Api:
         get("/clips", self.clips, response_model=typed.Clips)
         get("/clips/{name}", self.clip, response_class=FileResponse, responses=_FILE)
         get("/stages", self.stages, response_model=typed.Stages)
-        get("/events", self.events, response_class=EventSourceResponse, responses=_EVENTS)
+        get("/events", self.events, response_class=EventStream, responses=_EVENTS)
         router.add_api_route("/me", self.me, response_model=typed.Me)
         post = partial(router.add_api_route, methods=["POST"])
         own = [Depends(require_own_page)]
@@ -182,11 +176,9 @@ class Api:
             tray, _, number = fan.rpartition("/")
             looked_at = self._fan(tray, int(number) if number.isdecimal() and len(number) < 6 else -1)
         first = encoded("fleet", fleet_json(self.model))
-        return EventSourceResponse(
-            self._while_allowed(request, self.feed.events(first, looked_at)),
-            ping=KEEP_ALIVE_S,
-            ping_message_factory=keep_alive,
-            send_timeout=NOT_READING_S,
+        return EventStream(
+            self.feed.events(first, looked_at, lambda: self.access.visitor(request).may_read),
+            headers={"X-Accel-Buffering": "no"},  # of a proxy
         )
 
     async def metrics(self, request: Request) -> Response:
@@ -245,17 +237,6 @@ class Api:
         if all(each.transition == Transition.REFUSED for each in said):
             return JSONResponse({"error": said[0].message, "answers": answers}, 409)
         return {"answers": answers}
-
-    async def _while_allowed(self, request: Request, events: AsyncIterator[bytes]) -> AsyncGenerator[bytes]:
-        """The events, until the reader may not read any more. A page that is open keeps its session from being idle."""
-        checked_s = time.monotonic()
-        async with aclosing(events):  # type: ignore[type-var]  it is a generator
-            async for event in events:
-                if time.monotonic() - checked_s >= CHECKED_EVERY_S:
-                    checked_s = time.monotonic()
-                    if not self.access.visitor(request).may_read:
-                        return
-                yield event
 
     def _answer(self, name: str, make: Callable[[], Any]) -> SharedAnswer:
         """The one for all who ask for this."""

@@ -9,15 +9,22 @@ from __future__ import annotations
 import asyncio
 import json
 import threading
-from collections.abc import AsyncIterator, Iterator, Sequence
-from contextlib import contextmanager
+import time
+from collections.abc import AsyncIterator, Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from typing import Any
 
-from sse_starlette import ServerSentEvent
+from starlette.responses import StreamingResponse
+from starlette.types import Message, Send
 
 MOST_WAITING = 64
 """events of one reader"""
+CHECKED_EVERY_S = 5.0
+"""so often it is looked whether a reader may still read"""
+KEEP_ALIVE_S, NOT_READING_S = 10.0, 30.0
+"""A reader without events is sent a comment, so that a dead connection shows. One that takes nothing is cut off."""
+_ALIVE = b": alive\n\n"
 
 FanName = tuple[str, int]
 
@@ -79,12 +86,27 @@ class LiveFeed:
             readers = list(self._readers)
         self._put(readers, b"")
 
-    async def events(self, first: bytes, fan: FanName | None) -> AsyncIterator[bytes]:
-        """The events of one reader as they are sent, `first` at once. fan: the one that it looks at."""
+    async def events(self, first: bytes, fan: FanName | None, may_read: Callable[[], bool]) -> AsyncIterator[bytes]:
+        """The events of one reader as they are sent, `first` at once.
+
+        Args:
+            first: the event that it begins with.
+            fan: the one that it looks at.
+            may_read: whether it may still read; asked now and then.
+        """
+        checked_s = time.monotonic()
         with self._joined(fan) as reader:
             yield first
             while not self._ended:
-                if events := reader.taken(await reader.waiting.get()):
+                events = _ALIVE
+                with suppress(TimeoutError):
+                    async with asyncio.timeout(KEEP_ALIVE_S):
+                        events = reader.taken(await reader.waiting.get())
+                if time.monotonic() - checked_s >= CHECKED_EVERY_S:
+                    checked_s = time.monotonic()
+                    if not may_read():
+                        return
+                if events:
                     yield events
                 if reader.has_missed and reader.waiting.empty():
                     reader.has_missed = False
@@ -113,12 +135,23 @@ class LiveFeed:
                 self._readers.remove(reader)
 
 
+class EventStream(StreamingResponse):
+    """The answer that events are. It ends if its reader takes nothing for long."""
+
+    media_type = "text/event-stream"
+
+    async def stream_response(self, send: Send) -> None:
+        """Send all of it."""
+
+        async def send_in_time(message: Message) -> None:
+            async with asyncio.timeout(NOT_READING_S):
+                await send(message)
+
+        with suppress(TimeoutError):
+            await super().stream_response(send_in_time)
+
+
 def encoded(name: str, data: Any) -> bytes:
     """An event of a text/event-stream."""
     text = json.dumps(data, separators=(",", ":"), allow_nan=False)
-    return ServerSentEvent(text, event=name, sep="\n").encode()
-
-
-def keep_alive() -> ServerSentEvent:
-    """What a reader without events is sent."""
-    return ServerSentEvent(comment="alive", sep="\n")
+    return f"event: {name}\ndata: {text}\n\n".encode()
