@@ -118,17 +118,8 @@ class GatewayCore(SiteCore):
 
 
 class Server:
-    """Web server, as far as the core needs it."""
+    """The web server of a gateway."""
 
-    def stop(self) -> None:
-        """End it."""
-
-    def problem(self) -> str:
-        """Problem of the server; empty for none."""
-        return ""
-
-
-class _Running(Server):
     def __init__(
         self,
         context: Context,
@@ -156,9 +147,11 @@ class _Running(Server):
         self._server = HttpServer(app, listening, tls, MOST_CONNECTIONS, feed.end)
 
     def stop(self) -> None:
+        """End it."""
         self._server.stop()
 
     def problem(self) -> str:
+        """Problem of the server, its certificate and its users; empty for none."""
         ended = "" if self._server.is_running else "the web server has ended"
         expired = self._certificate.time_problem(datetime.now(UTC)) if self._certificate else ""
         wrong = "; ".join(filter(None, (ended, expired)))
@@ -178,7 +171,7 @@ def build(context: Context) -> BuiltStage:
     feed, desk = LiveFeed(), RequestDesk(context.producer)
     site = configured(context, RECORDER)
     clip_folders = tuple(dict.fromkeys(map(clip_folder, recordings_of(site) if site else ())))
-    return BuiltStage(GatewayCore(model, feed, desk, _Running(context, model, feed, desk, clip_folders)))
+    return BuiltStage(GatewayCore(model, feed, desk, Server(context, model, feed, desk, clip_folders)))
 
 
 def check(context: Context) -> list[str]:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import socket
 from collections.abc import Callable, Mapping, Sequence, Set
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from fantwin.pipeline.errors import refusals
 from fantwin.pipeline.extras import missing_extra, require
@@ -27,32 +28,17 @@ from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.messages import Alarm, Message
 from fantwin.schemas.units import NS_PER_S
 
+if TYPE_CHECKING:
+    from fantwin.pipeline.outputs.opcua.server import OpcuaServer
+
 SILENCE_PERIOD_NS = NS_PER_S
 CERTIFICATE, KEY = Path("opcua-certificate.der"), Path("opcua-key.pem")
-
-
-class Server:
-    """OPC UA server, as far as the core needs it."""
-
-    def publish(self, condition: Condition) -> None:
-        """Send the event of a transition; never waits."""
-
-    def stop(self) -> None:
-        """End it."""
-
-    def problem(self) -> str:
-        """Problem of the server; empty for none."""
-        return ""
-
-    def counters(self) -> Mapping[str, int]:
-        """Counters of the server."""
-        return {}
 
 
 class OpcuaCore(SiteCore):
     """Collects what the server shows, and sends what operators ask."""
 
-    def __init__(self, model: SiteModel, desk: RequestDesk, server: Server) -> None:
+    def __init__(self, model: SiteModel, desk: RequestDesk, server: OpcuaServer) -> None:
         super().__init__(model)
         self._desk = desk
         self._server = server
@@ -100,57 +86,34 @@ class OpcuaCore(SiteCore):
 
     def problem(self) -> str:
         """Problem of the server, the users and the history."""
-        return "; ".join(filter(None, (self._server.problem(), self._model.problem())))
+        return "; ".join(filter(None, (self._server.problem, self._model.problem())))
 
 
-class _Running(Server):
-    def __init__(self, context: Context, model: SiteModel, desk: RequestDesk) -> None:
-        from fantwin.pipeline.certificates import check_pair, make_self_signed, require_valid  # noqa: PLC0415  slow to import
-        from fantwin.pipeline.outputs.opcua.log_in import LogIn, TrustedClients  # noqa: PLC0415
-        from fantwin.pipeline.outputs.opcua.server import Listening, OpcuaServer, application_uri  # noqa: PLC0415
-        from fantwin.pipeline.site.users import Users  # noqa: PLC0415
+def _serve(context: Context, model: SiteModel, desk: RequestDesk) -> OpcuaServer:
+    from fantwin.pipeline.certificates import check_pair, make_self_signed, require_valid  # noqa: PLC0415  slow to import
+    from fantwin.pipeline.outputs.opcua.log_in import LogIn, TrustedClients  # noqa: PLC0415
+    from fantwin.pipeline.outputs.opcua.server import Listening, OpcuaServer, application_uri  # noqa: PLC0415
+    from fantwin.pipeline.site.users import Users  # noqa: PLC0415
 
-        config: OpcuaConfig = context.config
-        if config.certificate and config.key:
-            certificate, key = context.resolve(config.certificate), context.resolve(config.key)
-        else:
-            hosts = (socket.gethostname(), *config.names, "localhost", *([config.host] if config.is_loopback else []))
-            certificate, key = context.own_file(CERTIFICATE), context.own_file(KEY)
-            make_self_signed(certificate, key, "fantwin OPC UA server", application_uri(context.site), hosts)
-        shown = check_pair(certificate, key, needs_rsa=True)
-        require_valid(shown)
-        users = Users(context.resolve(config.users)) if config.users else None
-        self._server = OpcuaServer(
-            Listening(
-                config.host,
-                config.port + context.shard_number - 1,
-                certificate,
-                key,
-                next(iter(shown.uris), application_uri(context.site)),
-                config.is_loopback,
-            ),
-            model,
-            desk,
-            LogIn(users, is_open=config.is_loopback),
-            TrustedClients(context.resolve(config.trusted) if config.trusted else None),
-        )
-
-    def publish(self, condition: Condition) -> None:
-        self._server.publish(condition)
-
-    def stop(self) -> None:
-        self._server.stop()
-
-    def problem(self) -> str:
-        return self._server.problem
-
-    def counters(self) -> Mapping[str, int]:
-        server = self._server
-        return {
-            "clients": server.clients,
-            "events_sent": server.events_sent,
-            "events_left_out": server.events_lost,
-        }
+    config: OpcuaConfig = context.config
+    if config.certificate and config.key:
+        certificate, key = context.resolve(config.certificate), context.resolve(config.key)
+    else:
+        hosts = (socket.gethostname(), *config.names, "localhost", *([config.host] if config.is_loopback else []))
+        certificate, key = context.own_file(CERTIFICATE), context.own_file(KEY)
+        make_self_signed(certificate, key, "fantwin OPC UA server", application_uri(context.site), hosts)
+    shown = check_pair(certificate, key, needs_rsa=True)
+    require_valid(shown)
+    uri = next(iter(shown.uris), application_uri(context.site))
+    port = config.port + context.shard_number - 1
+    users = Users(context.resolve(config.users)) if config.users else None
+    return OpcuaServer(
+        Listening(config.host, port, certificate, key, uri, config.is_loopback),
+        model,
+        desk,
+        LogIn(users, is_open=config.is_loopback),
+        TrustedClients(context.resolve(config.trusted) if config.trusted else None),
+    )
 
 
 def build(context: Context) -> BuiltStage:
@@ -162,7 +125,7 @@ def build(context: Context) -> BuiltStage:
     require("stage opcua", "outputs", "asyncua")
     model = SiteModel(context.site, context.trays, AlarmHistory(context.own_file(FILE)))
     desk = RequestDesk(context.producer)
-    return BuiltStage(OpcuaCore(model, desk, _Running(context, model, desk)))
+    return BuiltStage(OpcuaCore(model, desk, _serve(context, model, desk)))
 
 
 def check(context: Context) -> list[str]:

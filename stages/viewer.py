@@ -1,15 +1,13 @@
 """Viewer: shows twin, measurement, states and alarms live in Rerun.
 
-Reads `score`, `alarm`, `twin`, `health` and `snapshot`; writes nothing. One core serves all trays. Speeds are shown in
+Reads `score`, `alarm` and `snapshot`; writes nothing. One core serves all trays. Speeds are shown in
 the unit of the tray. Samples are collected and drawn twice a second, because a call into Rerun is expensive and a row
 in it is cheap.
 
 With more than 64 fans, only some are drawn: those in alarm, as far as there is room, and those in `show`. Of the scores
 of other trays, a few a second are decoded.
 
-Only samples and alarms are on the time line, at the time of the sample; wear has a timeline of its own. Reports in host
-time go to a page without time; otherwise, in a replay of an old recording, these reports would be the newest data,
-which viewers follow.
+Samples and alarms are on the time line, at the time of the sample; wear has a timeline of its own.
 It may drop messages: the runner keeps a bounded queue in front of it and counts what it drops.
 """
 
@@ -33,7 +31,7 @@ FLEET_ABOVE = 64
 """with more fans than this on the site, only those in alarm and those in `show` are drawn"""
 ALARM_PLOT_HOLD_S = 60.0
 """how long the plot of a fan of a fleet stays after its alarm has cleared"""
-READS = ("score", "alarm", "twin", "health", "snapshot")
+READS = ("score", "alarm", "snapshot")
 
 
 class ViewerConfig(StageConfig):

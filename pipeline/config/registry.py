@@ -67,7 +67,7 @@ STAGES: dict[str, StageRow] = {
             extra="view",
             has_common_shards=False,
             may_drop=True,
-            reads=("score", "alarm", "twin", "health", "snapshot"),
+            reads=("score", "alarm", "snapshot"),
             writes=(),
         ),
         StageRow(

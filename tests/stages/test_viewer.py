@@ -16,7 +16,6 @@ from fantwin.pipeline.config.models import TrayConfig
 from fantwin.pipeline.outputs.rerun.alarm_log import LogLine
 from fantwin.pipeline.outputs.rerun.viewer_core import (
     FLUSH_PERIOD_NS,
-    PAGE_PERIOD_NS,
     REPEAT_STATES_NS,
     SAMPLES_HELD,
     ViewerCore,
@@ -26,11 +25,9 @@ from fantwin.pipeline.runtime.stage import Context, Core, StageError
 from fantwin.pipeline.site.fleet import Fan
 from fantwin.pipeline.site.trace import Trace
 from fantwin.schemas.codec import encode
-from fantwin.schemas.enums import FanState, InvalidReason, StageStatus
+from fantwin.schemas.enums import FanState, InvalidReason
 from fantwin.schemas.envelope import Envelope
-from fantwin.schemas.header import Header
-from fantwin.schemas.health import Health
-from fantwin.schemas.messages import Message, ModelCard, Score
+from fantwin.schemas.messages import Message, Score
 from fantwin.schemas.topics import tray_key
 from fantwin.schemas.units import RAD_S_PER_UNIT
 from fantwin.stages.viewer import ViewerConfig, build, check
@@ -47,7 +44,6 @@ class FakeSink:
     states: list[tuple[str, int, list[int], list[str]]] = field(default_factory=list)
     lines: list[LogLine] = field(default_factory=list)
     shown: list[tuple[Fan, ...]] = field(default_factory=list)
-    pages: list[str] = field(default_factory=list)
     wear: list[tuple[str, WearPoints]] = field(default_factory=list)
     tables: list[tuple[int, str]] = field(default_factory=list)
     flushed: int = 0
@@ -71,9 +67,6 @@ class FakeSink:
 
     def log(self, lines: Sequence[LogLine]) -> None:
         self.lines += lines
-
-    def show_stages(self, page: str) -> None:
-        self.pages.append(page)
 
     def flush(self) -> None:
         self.flushed = len(self.traces)
@@ -172,27 +165,6 @@ def test_a_sample_without_a_score_has_no_band_and_is_never_outside_it() -> None:
     assert not outside[gap, 1].any() and outside[gap, 0].all()
 
 
-def test_health_and_twins_are_a_page_that_is_replaced_when_it_changes() -> None:
-    sink = FakeSink()
-    core = core_of(sink)
-    core.step(health())
-    core.tick(LATER_NS)
-    core.step(health())
-    core.tick(LATER_NS + PAGE_PERIOD_NS)
-    assert len(sink.pages) == 1
-    core.step(card())
-    core.step(health(problem="the port is gone"))
-    core.tick(LATER_NS + 2 * PAGE_PERIOD_NS)
-    assert len(sink.pages) == 2 and sink.lines == []
-    assert "f40" not in sink.pages[0] and "f40" in sink.pages[1] and "the port is gone" in sink.pages[1]
-    for tenth in range(60):  # of a second
-        core.step(health(problem=f"problem {tenth}"))
-        core.tick(LATER_NS + 2 * PAGE_PERIOD_NS + tenth * 100_000_000)
-    assert len(sink.pages) == 3, "one that changes often is shown at intervals"
-    core.close()
-    assert len(sink.pages) == 4 and "problem 59" in sink.pages[-1]
-
-
 def test_the_file_holds_every_sample_with_its_unit_its_states_and_its_alarms(tmp_path: Path) -> None:
     scores, alarms = made_up_tray(seconds=20)
     half = len(scores) // 2
@@ -229,7 +201,7 @@ def test_the_file_holds_every_sample_with_its_unit_its_states_and_its_alarms(tmp
 def test_a_replay_of_an_old_recording_has_no_data_at_the_host_time(tmp_path: Path) -> None:
     scores, alarms = made_up_tray(seconds=2)
     core = build(context(tmp_path)).core
-    for number, item in enumerate((health(), card(), *scores, *alarms, health(lost=3, problem="two | *lines*"))):
+    for number, item in enumerate((*scores, *alarms)):
         core.step(sent(item))
         core.tick(LATER_NS + number * FLUSH_PERIOD_NS)
     core.close()
@@ -237,9 +209,6 @@ def test_a_replay_of_an_old_recording_has_no_data_at_the_host_time(tmp_path: Pat
     times = [t_ns for entity in rows.values() for t_ns, _ in entity]
     assert min(times) == int(scores[0].t_ns[0])
     assert max(times) == max(int(scores[-1].t_ns[-1]), *(alarm.t_ns for alarm in alarms))
-    page = pages_of(tmp_path / "view.rrd")[-1]
-    assert "| scorer | **degraded** | **3** |" in page
-    assert r"- **scorer**: two \| \*lines\*" in page and "f40" in page
 
 
 def test_in_an_alarm_the_area_between_twin_and_measured_speed_is_red_also_over_the_end_of_a_flush(
@@ -337,17 +306,6 @@ def changed(score: Score, **columns: Any) -> Score:
     return Score(**{**vars(score), **columns})
 
 
-def card() -> ModelCard:
-    return ModelCard(header=Header("x", 0, "tray1"), t_ns=LATER_NS, twin="f40", kind="hybrid", sha256="")
-
-
-def health(lost: int = 0, problem: str = "") -> Health:
-    status = StageStatus.DEGRADED if problem else StageStatus.OK
-    return Health(
-        stage="scorer", instance="all", status=status, t_ns=START_NS, uptime_s=1.0, lost=lost, problem=problem
-    )
-
-
 def free_port() -> int:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
@@ -374,13 +332,6 @@ def rows_of(path: Path) -> dict[str, list[tuple[int, dict[str, Any]]]]:
             row = {name: table.column(name)[index].as_py() for name in names}
             rows.setdefault(chunk.entity_path, []).append((t_ns, row))
     return {path: sorted(of, key=lambda row: row[0]) for path, of in rows.items()}
-
-
-def pages_of(path: Path) -> list[str]:
-    """The pages on the stages in the order in which they were shown."""
-    chunks = [chunk for chunk in chunks_of(path) if chunk.entity_path == "/stages"]
-    assert all(chunk.is_static for chunk in chunks)
-    return [text[0] for chunk in chunks for text in chunk.to_record_batch().column("TextDocument:text").to_pylist()]
 
 
 def styles_of(path: Path, entity: str, component: str) -> list[str]:

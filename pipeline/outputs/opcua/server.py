@@ -10,7 +10,7 @@ import logging
 import socket
 import threading
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -78,7 +78,7 @@ class OpcuaServer:
         self._lost_unsaid = False
         self._error = ""
         self._is_ready = threading.Event()
-        self.events_sent = self.events_lost = self.clients = 0
+        self._events_sent = self._events_lost = self._clients = 0
         self._loop: asyncio.AbstractEventLoop | None = None
         self._thread = threading.Thread(target=self._run, name="OPC UA server", daemon=True)
         self._thread.start()
@@ -93,12 +93,16 @@ class OpcuaServer:
         ended = "" if self._thread.is_alive() else "the OPC UA server has ended: restart the stage"
         return "; ".join(filter(None, (self._error, ended, self._log_in.problem)))
 
+    def counters(self) -> Mapping[str, int]:
+        """Clients, and events that were sent and left out."""
+        return {"clients": self._clients, "events_sent": self._events_sent, "events_left_out": self._events_lost}
+
     def publish(self, condition: Condition) -> None:
         """Send an event to whoever subscribes; never waits."""
         with self._lock:
             if len(self._pending) >= MOST_PENDING:
                 self._pending.popleft()
-                self.events_lost += 1
+                self._events_lost += 1
                 self._lost_unsaid = True
             self._pending.append(condition)
         self._wake()
@@ -190,7 +194,7 @@ class OpcuaServer:
                     await watched.publish(handle)
                 if number % _AT_ONCE == _AT_ONCE - 1:
                     await asyncio.sleep(0)
-            self.clients = len(server.iserver.asyncio_transports)
+            self._clients = len(server.iserver.asyncio_transports)
             due_s = max(due_s + UPDATE_PERIOD_S, loop.time())
             await asyncio.sleep(due_s - loop.time())
 
@@ -203,7 +207,7 @@ class OpcuaServer:
                 self._pending.clear()
                 self._lost_unsaid = False
             await delivery.to_all(taken)
-            self.events_sent += len(taken)
+            self._events_sent += len(taken)
             if lost:
                 await delivery.ask_for_refresh()
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 
 from fantwin.pipeline.outputs.rerun.alarm_log import clock_utc, cut, exceeded
-from fantwin.pipeline.outputs.rerun.stages_page import markdown_literal
 from fantwin.scoring.alarms.alarm_flags import is_listed, is_silenced
 from fantwin.scoring.alarms.current_alarms import CurrentAlarm
 from fantwin.scoring.diagnosis.shown_causes import most_probable
@@ -52,3 +52,8 @@ def _rank(each: CurrentAlarm) -> tuple[bool, bool, int, int]:
     """Active first, then those that are not silenced, the most severe, the newest."""
     alarm = each.newest
     return (not alarm.active, is_silenced(alarm), -int(alarm.severity), -alarm.onset_t_ns)
+
+
+def markdown_literal(text: str) -> str:
+    """Text escaped for Markdown, on one line."""
+    return re.sub(r"([\\`*_\[\]<>|#~])", r"\\\1", " ".join(text.split()))

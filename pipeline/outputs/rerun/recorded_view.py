@@ -17,7 +17,7 @@ from fantwin.schemas.codec import CodecError
 from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.units import SpeedUnit
 
-TOPICS = ("score", "alarm", "twin", "health", "snapshot")
+TOPICS = ("score", "alarm", "snapshot")
 """what the viewer reads"""
 
 

@@ -1,6 +1,6 @@
 """The layout of a view in Rerun. Live views and view files have the same: it comes from here alone.
 
-`all`: for each tray a tab with plots, state lanes, alarms and log, and a tab for the stages. `alarms`: the fans that
+`all`: for each tray a tab with plots, state lanes, alarms and log. `alarms`: the fans that
 are in alarm or were, and nothing else; of a fleet, the fans that are drawn, in both layouts. `wear`: how the speed of
 each fan has changed, on a timeline of days. All plots of a layout share one time axis. Only the modules whose names
 begin with `rerun_` import rerun. Measured with Rerun 0.41; see docs/how-to/viewing.md.
@@ -25,7 +25,6 @@ from fantwin.pipeline.outputs.rerun.rerun_paths import (
     FANS_ON_A_PAGE,
     FLEET_LOG,
     SCORE,
-    STAGES_PATH,
     TIMELINE,
     auxiliary_path,
     fan_path,
@@ -123,13 +122,13 @@ class _Linked(rrb.Blueprint):
 
 
 def _blueprint(tabs: Sequence[rrb.Container | rrb.View], window_s: float, margin: float) -> rrb.Blueprint:
-    """The whole layout of some tabs and one for the stages; it follows the newest data.
+    """The whole layout of some tabs; it follows the newest data.
 
     window_s: length of time shown. margin: the share of it that is kept free at the right.
     """
     cursor = rrb.TimeRangeBoundary.cursor_relative
     window = rr.TimeRange(start=cursor(seconds=-window_s), end=cursor(seconds=margin * window_s))
-    return _tabbed([*tabs, rrb.TextDocumentView(origin=f"/{STAGES_PATH}", name="stages")], TIMELINE, window)
+    return _tabbed(tabs, TIMELINE, window)
 
 
 def _tabbed(tabs: Sequence[rrb.Container | rrb.View], timeline: str, shown: rr.TimeRange) -> rrb.Blueprint:

@@ -21,7 +21,7 @@ from fantwin.pipeline.config.models import TrayConfig
 from fantwin.pipeline.outputs.rerun.alarm_log import LogLine
 from fantwin.pipeline.outputs.rerun.rerun_bands import RerunBands
 from fantwin.pipeline.outputs.rerun.rerun_layout import LayoutName, TrayLayout, log_styles, site_blueprint
-from fantwin.pipeline.outputs.rerun.rerun_paths import ALARMS_PATH, STAGES_PATH, TIMELINE
+from fantwin.pipeline.outputs.rerun.rerun_paths import ALARMS_PATH, TIMELINE
 from fantwin.pipeline.outputs.rerun.rerun_wear import RerunWear
 from fantwin.pipeline.outputs.rerun.view_file import ViewFile
 from fantwin.pipeline.outputs.rerun.wear_points import WearPoints
@@ -193,10 +193,6 @@ class RerunSink:
             texts = [f"{clock}  {tray}{line.text}" for clock, tray, line in zip(clocks, trays, of_log, strict=True)]
             columns = rr.TextLog.columns(text=texts, level=[line.level for line in of_log])
             self._recording.send_columns(path, [rr.TimeColumn(TIMELINE, timestamp=times)], columns)
-
-    def show_stages(self, page: str) -> None:
-        """Replace the page about the stages. It has no time and so does not move a cursor that follows the newest."""
-        self._recording.log(STAGES_PATH, rr.TextDocument(page, media_type=rr.MediaType.MARKDOWN), static=True)
 
     def flush(self) -> None:
         """Pass everything on, so that it survives a crash of this process. Waits some seconds at most."""

@@ -39,10 +39,6 @@ class ViewSink(Protocol):
         """Add lines to the alarm log."""
         ...
 
-    def show_stages(self, page: str) -> None:
-        """Replace the page about the stages with this Markdown text."""
-        ...
-
     def flush(self) -> None:
         """Write what has been sent, so that it survives a crash of this process. Returns within seconds."""
         ...

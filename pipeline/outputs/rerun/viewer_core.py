@@ -12,7 +12,6 @@ from fantwin.pipeline.config.models import TrayConfig
 from fantwin.pipeline.outputs.rerun.alarm_log import LogLine, log_line
 from fantwin.pipeline.outputs.rerun.alarm_table import alarm_table
 from fantwin.pipeline.outputs.rerun.fleet_view import FleetView
-from fantwin.pipeline.outputs.rerun.stages_page import StagesPage
 from fantwin.pipeline.outputs.rerun.view_sink import ViewSink
 from fantwin.pipeline.outputs.rerun.wear_points import WearPoints, wear_points
 from fantwin.pipeline.site.fleet import SILENT, Fan
@@ -20,13 +19,11 @@ from fantwin.pipeline.site.site_core import SiteCore
 from fantwin.pipeline.site.site_model import SiteModel
 from fantwin.pipeline.site.trace import MEASURED_COLUMNS, Trace, state_changes, state_name, trace_of, with_holes
 from fantwin.schemas.envelope import Envelope
-from fantwin.schemas.health import Health
 from fantwin.schemas.messages import Alarm, Message, Score, ScorerSnapshot
 from fantwin.schemas.units import NS_PER_S
 
 FLUSH_PERIOD_NS = 500_000_000
 REPEAT_STATES_NS = 5_000_000_000  # a viewer that joins late finds a state at most this old
-PAGE_PERIOD_NS = 5_000_000_000  # minimum between two pages: Rerun never drops data without a time, however old
 BEHIND_NS = 10 * NS_PER_S
 """trays may be so far behind the others; if all that comes is older still, it is a replay, at times of its own"""
 SAMPLES_HELD = 4096  # samples kept per tray, when a replay is faster than the ticks
@@ -73,9 +70,6 @@ class ViewerCore(SiteCore):
         self._shown_alarms = ""
         self._alarms_t_ns = 0
         self._flushed_t_ns = 0
-        self._page = StagesPage()
-        self._shown_page = ""
-        self._page_t_ns = 0
         self._samples_drawn = 0
         self._newest_t_ns = 0
         self._show_fans()
@@ -86,9 +80,7 @@ class ViewerCore(SiteCore):
 
     def step(self, item: Message | Envelope) -> Sequence[Message]:
         """Keep what is to be drawn, and what is known of the site."""
-        if isinstance(item, Health):
-            self._page.add_health(item)
-        elif isinstance(item, ScorerSnapshot) and item.header.tray in self._views:
+        if isinstance(item, ScorerSnapshot) and item.header.tray in self._views:
             if not self._fleet:
                 self._views[item.header.tray].wear = wear_points(item)
             return ()
@@ -121,15 +113,12 @@ class ViewerCore(SiteCore):
         self._now_ns = now_ns
         if now_ns - self._flushed_t_ns >= FLUSH_PERIOD_NS:
             self._flushed_t_ns = now_ns
-            if now_ns - self._page_t_ns >= PAGE_PERIOD_NS:
-                self._show_stages()
             self._model.notice_silence()
             self._flush_all()
         return ()
 
     def close(self) -> Sequence[Message]:
         """Draw the remaining samples and close the file."""
-        self._show_stages()
         self._flush_all()
         self._sink.close()
         return ()
@@ -153,14 +142,6 @@ class ViewerCore(SiteCore):
                 f"scores have {fans} fans, [[tray]] {name} has fans = {self._views[name].config.fans}: correct `fans`"
             )
         return self._sink.problem()
-
-    def _show_stages(self) -> None:
-        twins = {name: card for name in self._views if (card := self._model.twin(name))}
-        page = self._page.text(self._model.stages(), twins)
-        if page != self._shown_page:
-            self._shown_page = page
-            self._page_t_ns = self._now_ns or 0
-            self._sink.show_stages(page)
 
     def _flush_all(self) -> None:
         for view in self._views.values():

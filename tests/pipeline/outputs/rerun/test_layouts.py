@@ -9,10 +9,10 @@ from typing import Any
 
 import pytest
 
-from fantwin.pipeline.outputs.rerun.viewer_core import PAGE_PERIOD_NS
+from fantwin.pipeline.outputs.rerun.viewer_core import FLUSH_PERIOD_NS
 from fantwin.stages.viewer import build
 from tests.pipeline.outputs.rerun.test_recorded_view import live_view, recorded_view
-from tests.stages.test_viewer import LATER_NS, card, context, free_port, health, sent
+from tests.stages.test_viewer import LATER_NS, context, free_port, sent
 from tests.stages.test_viewer_fleet import context as fleet_context
 from tests.stages.test_viewer_fleet import messages_of, play
 from tests.support.running_chain import eventually
@@ -26,7 +26,7 @@ needs_a_driver = pytest.mark.skipif(
 
 def plots(*fans: str) -> set[str]:
     kinds = ("speed (rad/s)", "torque balance", "score")
-    lists = {"state of each fan", "alarms", "alarm log", "stages"}
+    lists = {"state of each fan", "alarms", "alarm log"}
     return lists | {f"{tray} / fan {fan} {kind}" for tray, fan in (each.split("/") for each in fans) for kind in kinds}
 
 
@@ -75,15 +75,15 @@ def test_each_layout_of_a_live_view_a_recording_and_a_fleet_opens_without_a_repo
 
 @pytest.mark.slow
 @needs_a_driver
-def test_a_live_viewer_follows_an_old_recording_while_health_is_of_today(tmp_path: Path) -> None:
+def test_a_live_viewer_follows_an_old_recording(tmp_path: Path) -> None:
     scores, _ = made_up_tray(seconds=5)
     port = free_port()
     core = build(context(tmp_path, serve=True, grpc_port=port, web_port=0)).core
     with headless_viewer() as viewer:
         viewer.open(f"rerun+http://127.0.0.1:{port}/proxy")
-        for number, item in enumerate((card(), health(), *scores, health(problem="something is wrong"))):
+        for number, item in enumerate(scores):
             core.step(sent(item))
-            core.tick(LATER_NS + number * PAGE_PERIOD_NS)
+            core.tick(LATER_NS + number * FLUSH_PERIOD_NS)
         last_ns = int(scores[-1].t_ns[-1])
         eventually(lambda: abs(shown_ns(viewer) - last_ns) < 1000, "the last sample is under the cursor")
         assert not any(reports(viewer).values())

@@ -16,26 +16,26 @@ from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.outputs.rerun.view_of_site import ViewOptions
 from fantwin.pipeline.recordings.writing import RecordingWriter
 from fantwin.schemas.messages import Alarm, Message, Score
-from fantwin.schemas.topics import health_key, tray_key
+from fantwin.schemas.topics import tray_key
 from fantwin.stages.viewer import build
-from tests.stages.test_viewer import card, chunks_of, context, health, rows_of, sent
+from tests.stages.test_viewer import chunks_of, context, rows_of, sent
 from tests.stages.test_viewer_fleet import TRAYS, messages_of
 from tests.support.score_data import START_NS, made_up_tray
 from tests.support.wear_data import worn_snapshot
 
 pytest.importorskip("rerun")
 recorded = pytest.importorskip("fantwin.pipeline.outputs.rerun.recorded_view")
-TOPICS = {"Score": "score", "Alarm": "alarm", "ModelCard": "twin", "Health": "health", "ScorerSnapshot": "snapshot"}
+TOPICS = {"Score": "score", "Alarm": "alarm", "ScorerSnapshot": "snapshot"}
 HOLE_S = (4.0, 6.0)
 
 
 def messages() -> list[Message]:
-    """Ten seconds of three fans with all that a view shows: an alarm, a hole, temperatures, wear, twin and health."""
+    """Ten seconds of three fans with all that a view shows: an alarm, a hole, temperatures and wear."""
     scores, alarms = made_up_tray(seconds=10, fault_s=(6.5, 8.0))
     seen = [s for s in scores if not HOLE_S[0] <= (s.t_ns[0] - START_NS) / 1e9 < HOLE_S[1]]
     warm = [replace(s, temperature_c=np.full(s.score.shape, 21.0, np.float32)) for s in seen]
     alarms = [replace(alarm, header=replace(alarm.header, sequence=n)) for n, alarm in enumerate(alarms)]
-    return [card(), health(), worn_snapshot("tray1", 3, 2, START_NS), *sorted([*warm, *alarms], key=last_t_ns)]
+    return [worn_snapshot("tray1", 3, 2, START_NS), *sorted([*warm, *alarms], key=last_t_ns)]
 
 
 def last_t_ns(message: Score | Alarm) -> int:
@@ -57,8 +57,7 @@ def recording(folder: Path) -> Path:
     with RecordingWriter(folder / "rec.mcap", metadata, {}) as writer:
         for number, message in enumerate(messages()):
             topic = TOPICS[type(message).__name__]
-            key = health_key("site", "scorer", "all") if topic == "health" else tray_key("site", "tray1", topic)
-            writer.add_message(key, message, START_NS + number * 100_000_000)
+            writer.add_message(tray_key("site", "tray1", topic), message, START_NS + number * 100_000_000)
     return writer.path
 
 
@@ -90,7 +89,6 @@ def test_a_recording_has_the_entities_and_components_of_the_live_view_and_the_sa
     assert parts["/wear/tray1/fan_2"] == {"day", "Measurements:values", "Measurements:variances"} | {
         f"Measurements:{name}" for name in ("names", "colors", "widths")
     }
-    assert "TextDocument:text" in parts["/stages"]
     for entity in shown:
         np.testing.assert_array_equal(samples(recorded, entity), samples(live, entity))
 
@@ -111,7 +109,7 @@ def test_an_existing_view_is_kept_and_a_recording_without_scores_is_one_line(tmp
         view([path], tmp_path / "kept.rrd")
     assert (tmp_path / "kept.rrd").read_bytes() == b"kept"
     with RecordingWriter(tmp_path / "none.mcap", {"site": "site"}, {}) as writer:
-        writer.add_message(tray_key("site", "tray1", "twin"), card(), START_NS)
+        writer.add_message(tray_key("site", "tray1", "alarm"), made_up_tray(seconds=10)[1][0], START_NS)
     with pytest.raises(UserError, match="holds no scores to show"):
         view([writer.path], tmp_path / "new.rrd")
     assert not (tmp_path / "new.rrd").exists()
