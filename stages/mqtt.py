@@ -17,7 +17,7 @@ from fantwin.pipeline.outputs.mqtt.config import MqttConfig
 from fantwin.pipeline.outputs.mqtt.fan_states import FanStates, shown_alarm
 from fantwin.pipeline.outputs.mqtt.home_assistant import OFFLINE, ONLINE, HomeAssistant
 from fantwin.pipeline.outputs.mqtt.json_text import json_text
-from fantwin.pipeline.outputs.mqtt.link import BrokerLink, Link
+from fantwin.pipeline.outputs.mqtt.link import BrokerLink
 from fantwin.pipeline.outputs.mqtt.outbox import REMOVED, Outbox, Outgoing
 from fantwin.pipeline.outputs.mqtt.requests import Requests
 from fantwin.pipeline.outputs.mqtt.topics import Topics, do_overlap
@@ -53,7 +53,13 @@ class MqttCore(SiteCore):
     """Knows what the broker should have, and what it has."""
 
     def __init__(
-        self, context: Context, model: SiteModel, alarms: AlarmHistory, desk: RequestDesk, topics: Topics, link: Link
+        self,
+        context: Context,
+        model: SiteModel,
+        alarms: AlarmHistory,
+        desk: RequestDesk,
+        topics: Topics,
+        link: BrokerLink,
     ) -> None:
         config: MqttConfig = context.config
         super().__init__(model)

@@ -218,7 +218,7 @@ def test_the_mqtt_stage_survives_any_message_and_request_and_publishes_only_json
 ) -> None:
     config = MqttConfig(host="broker", accept=("acknowledge",), operator_name="desk", home_assistant="publish")
     received = [Received(f"fantwin/site/tray1/{fan}/request", payload, is_retained=False) for fan, payload in asked]
-    link = FakeLink(received)
+    link: Any = FakeLink(received)
     with TemporaryDirectory() as folder:
         store = AlarmHistory(Path(folder) / "alarms.sqlite")
         model = SiteModel("site", TRAYS, store)

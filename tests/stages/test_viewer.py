@@ -150,21 +150,6 @@ def test_a_change_of_reason_is_a_change_of_state_and_what_is_not_known_is_shown_
     assert sink.lane(0) == [*unknowns, (0.04, "normal"), (0.07, "unknown (99)")]
 
 
-def test_a_sample_without_a_score_has_no_band_and_is_never_outside_it() -> None:
-    sink = FakeSink()
-    scores, _ = made_up_tray(seconds=4, fans=2, faulty_fan=None, gap_fan=1, gap_s=(1.0, 2.0))
-    lying = [changed(score, band_variance=np.zeros_like(score.band_variance)) for score in scores]
-    core = core_of(sink, fans=2)
-    play(core, lying)
-    core.close()
-    predicted = np.concatenate([trace.predicted for trace in sink.traces])
-    outside = np.concatenate([trace.outside for trace in sink.traces])
-    gap = slice(100, 200)
-    assert np.isnan(predicted[gap, 1]).all() and np.isfinite(predicted[gap, 0]).all()
-    assert np.isfinite(np.delete(predicted[:, 1], np.arange(100, 200))).all()
-    assert not outside[gap, 1].any() and outside[gap, 0].all()
-
-
 def test_the_file_holds_every_sample_with_its_unit_its_states_and_its_alarms(tmp_path: Path) -> None:
     scores, alarms = made_up_tray(seconds=20)
     half = len(scores) // 2

@@ -11,7 +11,7 @@ import time
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from fantwin.pipeline.outputs.mqtt.config import MqttConfig
 from fantwin.pipeline.outputs.mqtt.outbox import Outgoing
@@ -38,44 +38,12 @@ class Received(NamedTuple):
     is_retained: bool
 
 
-class Link(Protocol):
-    """What the core needs of the connection. All but `stop` return at once."""
-
-    dropped_requests: int
-    """because too many came at once"""
-
-    @property
-    def sessions(self) -> int:
-        """How often a connection was made: a new one may have a broker that has forgotten everything."""
-        ...
-
-    def room(self) -> int:
-        """How many messages may be published now."""
-        ...
-
-    def publish(self, message: Outgoing) -> int:
-        """Hand over a message; returns its number."""
-        ...
-
-    def acknowledged(self) -> Sequence[int]:
-        """The numbers of messages that the broker has, since the last call."""
-        ...
-
-    def received(self) -> Sequence[Received]:
-        """What has come since the last call."""
-        ...
-
-    def problem(self) -> str:
-        """What is wrong now; empty if nothing is."""
-        ...
-
-    def stop(self, last: Outgoing) -> None:
-        """Publish a last message, if the broker is there, and leave it."""
-        ...
-
-
 class BrokerLink:
-    """A `Link` by paho."""
+    """The connection by paho. All but `stop` return at once.
+
+    Attributes:
+        dropped_requests: because too many came at once.
+    """
 
     def __init__(
         self,
@@ -125,7 +93,7 @@ class BrokerLink:
 
     @property
     def sessions(self) -> int:
-        """How often a connection was made."""
+        """How often a connection was made: a new one may have a broker that has forgotten everything."""
         return self._sessions
 
     def room(self) -> int:

@@ -18,36 +18,13 @@ from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.outputs.rerun import band_plot
 from fantwin.pipeline.outputs.rerun.band_plot import Fault, plot_bands, plot_recording, read_trace
 from fantwin.pipeline.recordings.writing import RecordingWriter
-from fantwin.pipeline.site.trace import SILENT, trace_of
+from fantwin.pipeline.site.trace import trace_of
 from fantwin.schemas.enums import FanState
 from fantwin.schemas.messages import Alarm, Score
 from fantwin.schemas.topics import tray_key
 from tests.support.score_data import START_NS, made_up_tray
 
 FAULT = Fault("covered-inlet", 2, START_NS + 8_000_000_000, START_NS + 14_000_000_000)
-
-
-def test_every_state_has_a_colour_of_its_own() -> None:
-    names = {state.words for state in FanState} - {FanState.UNKNOWN.words}
-    assert set(band_plot.STATE_COLORS) == names
-    assert len({*band_plot.STATE_COLORS.values(), band_plot.UNKNOWN_COLOR}) == len(names) + 1
-    styles = pytest.importorskip("fantwin.pipeline.outputs.rerun.rerun_styles", exc_type=ModuleNotFoundError)
-    assert set(styles.STATE_COLORS) == {*names, SILENT}
-    assert len({*styles.STATE_COLORS.values(), styles.UNKNOWN_COLOR}) == len(names) + 2
-
-
-def luminance(color: tuple[int, int, int]) -> float:
-    """Relative luminance of an sRGB colour (WCAG 2)."""
-    linear = [c / 3294.6 if c <= 10 else ((c / 255 + 0.055) / 1.055) ** 2.4 for c in color]
-    return float(np.dot(linear, [0.2126, 0.7152, 0.0722]))
-
-
-@pytest.mark.parametrize("background", [(13, 16, 17), (255, 255, 255)], ids=["dark", "light"])
-def test_every_line_is_legible_on_the_dark_and_on_the_light_background(background: tuple[int, int, int]) -> None:
-    styles = pytest.importorskip("fantwin.pipeline.outputs.rerun.rerun_styles", exc_type=ModuleNotFoundError)
-    for color in (styles.RED, *styles.FAN_COLORS):
-        lighter, darker = sorted((luminance(color), luminance(background)), reverse=True)
-        assert (lighter + 0.05) / (darker + 0.05) > 3.0, f"contrast of {color}, as WCAG asks of graphics"
 
 
 def test_the_band_is_green_and_red_zones_appear_only_during_an_alarm(tmp_path: Path) -> None:
