@@ -1,15 +1,14 @@
 """Gateway: the web server of a site: operators' page, API, live events and metrics (docs/how-to/gateway.md).
 
 Reads `score`, `alarm`, `twin`, `health`, and `snapshot` for the wear, and writes `request`. One core serves all trays.
-With many fans, the newest score of each tray is asked for once a second; all samples arrive only of those trays that
-somebody looks at.
+With many fans, a few samples a second of each tray are decoded, and all samples of those trays that somebody looks at.
 
 The server runs in a thread of its own: it reads what the core has collected, and leaves requests for the core to send.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence, Set
+from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
@@ -35,10 +34,6 @@ from fantwin.schemas.units import NS_PER_S
 
 FLEET_PERIOD_NS = NS_PER_S
 STAGES_PERIOD_NS = 2 * NS_PER_S
-ALL_FOLLOWED = 64
-"""number of fans up to which all samples of all trays arrive"""
-MOST_FOLLOWED = 32
-"""trays that somebody looks at; of more, the samples come once a second"""
 
 
 class GatewayCore(SiteCore):
@@ -49,7 +44,6 @@ class GatewayCore(SiteCore):
         self._desk = desk
         self._feed = feed
         self._server = serve
-        self._is_small = sum(tray.fans for tray in model.trays) <= ALL_FOLLOWED
         self._fleet_ns = self._stages_ns = 0
         self._requests = 0
 
@@ -106,11 +100,9 @@ class GatewayCore(SiteCore):
             **self._counts,
         }
 
-    def followed(self) -> Set[str] | None:
-        """The trays that somebody looks at; None: all."""
-        if self._is_small:
-            return None
-        return set(sorted({tray for tray, _ in self._feed.looked_at()})[:MOST_FOLLOWED])
+    def needs_score(self, tray: str) -> bool:
+        """Whether the score of a tray that has arrived is to be decoded: all, of a tray that somebody looks at."""
+        return super().needs_score(tray) or any(name == tray for name, _ in self._feed.looked_at())
 
     def problem(self) -> str:
         """Problem of the server, the users and the history."""

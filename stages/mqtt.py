@@ -1,7 +1,6 @@
 """MQTT: publishes states and alarms to a broker, and passes on requests that come from there (docs/how-to/mqtt.md).
 
-Reads `score`, `alarm` and `health`, and writes `request`. One core serves all trays; the newest score of each tray is
-asked for once a second.
+Reads `score`, `alarm` and `health`, and writes `request`. One core serves all trays.
 
 The broker is never waited for: what is retained has one text a topic, transitions of alarms wait on disk, and both are
 sent when the broker has room. After each connection all retained topics are published again.
@@ -9,7 +8,7 @@ sent when the broker has room. After each connection all retained topics are pub
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Mapping, Sequence
 
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.extras import require
@@ -129,10 +128,6 @@ class MqttCore(SiteCore):
             **self._counts,
             **self._requests.counts,
         }
-
-    def followed(self) -> Set[str]:
-        """None: the newest score of each tray is enough."""
-        return set()
 
     def notes(self) -> Sequence[str]:
         """Fans that are left out of Home Assistant."""

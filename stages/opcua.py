@@ -1,7 +1,6 @@
 """OPC UA: a server with each fan as an object and each alarm as a condition of Part 9 (docs/how-to/opcua.md).
 
-Reads `score`, `alarm` and `twin`, and writes `request`. One core serves all trays, and asks for the newest
-score of each tray once a second.
+Reads `score`, `alarm` and `twin`, and writes `request`. One core serves all trays.
 
 The server runs in a thread of its own: it reads what the core has collected, and leaves requests for the core to send.
 """
@@ -9,7 +8,7 @@ The server runs in a thread of its own: it reads what the core has collected, an
 from __future__ import annotations
 
 import socket
-from collections.abc import Callable, Mapping, Sequence, Set
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -79,10 +78,6 @@ class OpcuaCore(SiteCore):
     def counters(self) -> Mapping[str, int]:
         """Requests and events sent, clients, and what could not be shown."""
         return {"refused_scores": self._model.refused_scores, **self._counts, **self._server.counters()}
-
-    def followed(self) -> Set[str] | None:
-        """Return that no tray is followed in full: the newest score of each, once a second, is enough."""
-        return set()
 
     def problem(self) -> str:
         """Problem of the server, the users and the history."""

@@ -13,6 +13,9 @@ from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.health import Health
 from fantwin.schemas.messages import Alarm, Message, ModelCard, ScorerSnapshot
 
+ALL_SAMPLES = 64
+"""number of fans up to which all samples are kept; of a larger site, a few a second of each tray"""
+
 
 class SiteCore(Core):
     """Keeps in a model what arrives. Scores arrive as envelopes."""
@@ -20,6 +23,7 @@ class SiteCore(Core):
     def __init__(self, model: SiteModel) -> None:
         self._model = model
         self._counts: Counter[str] = Counter()
+        self._is_small = sum(tray.fans for tray in model.trays) <= ALL_SAMPLES
 
     def step(self, item: Message | Envelope) -> Sequence[Message]:
         """Keep what has arrived, if it is about a fan of the site or about a stage."""
@@ -30,7 +34,8 @@ class SiteCore(Core):
         if tray is None:
             self._counts["unknown_tray"] += 1
         elif isinstance(item, Envelope):
-            self.add_score(item)
+            if self.needs_score(tray.name):
+                self.add_score(item)
         elif isinstance(item, ModelCard):
             self._model.add_twin(item)
         elif isinstance(item, ScorerSnapshot):
@@ -41,6 +46,10 @@ class SiteCore(Core):
             else:
                 self._counts["unknown_fan"] += 1
         return ()
+
+    def needs_score(self, tray: str) -> bool:
+        """Whether the score of a tray that has arrived is to be decoded."""
+        return self._is_small or self._model.wants_score(tray)
 
     @abstractmethod
     def add_score(self, envelope: Envelope) -> None:

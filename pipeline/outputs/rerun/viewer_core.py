@@ -91,11 +91,12 @@ class ViewerCore(SiteCore):
         self._lines.append(log_line(alarm))
         self._model.add_alarm(alarm)
 
+    def needs_score(self, tray: str) -> bool:
+        """Whether the score of a tray that has arrived is to be decoded: all, where fans of the tray are drawn."""
+        return not self._fleet or bool(self._views[tray].fans) or self._model.wants_score(tray)
+
     def add_score(self, envelope: Envelope) -> None:
-        """Keep it for the next flush; where no fan of the tray is drawn, a few a second are enough."""
-        name = envelope.header.tray
-        if self._fleet and not self._views[name].fans and not self._model.wants_score(name):
-            return
+        """Keep it for the next flush."""
         score = self._model.add_score(envelope, MEASURED_COLUMNS)
         if score is None:
             return
