@@ -22,7 +22,7 @@ from pydantic import Field
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.learning.fan_alarms import FanAlarms
 from fantwin.pipeline.learning.healthy_history import HealthyHistory, recorded_raws
-from fantwin.pipeline.learning.learning_process import Learning, LearningProcess
+from fantwin.pipeline.learning.learning_process import LearningProcess
 from fantwin.pipeline.learning.learning_schedule import LearningSchedule, Work
 from fantwin.pipeline.learning.ordinary_operation import OrdinaryOperation
 from fantwin.pipeline.learning.versions import TwinVersions, Version, VersionList, learning_folder, overlap
@@ -68,7 +68,7 @@ class LearnerCore(Core):
         history: HealthyHistory,
         versions: TwinVersions,
         operation: OrdinaryOperation,
-        learning: Learning,
+        learning: LearningProcess,
     ) -> None:
         """operation: what the fans have done in the history. learning: makes versions."""
         self._fans = fans

@@ -9,7 +9,6 @@ import threading
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Protocol
 
 _TURN = threading.Lock()
 """one tray learns at a time, to limit memory and processor use"""
@@ -17,32 +16,6 @@ STOP_S = 2.0
 VARIABLE = "FANTWIN_LEARNS_FOR_A_STAGE"
 """environment variable of the child: it gives way to all else, and ends with its parent, which holds its standard
 input open"""
-
-
-class Learning(Protocol):
-    """Makes the next version of a tray's twin, beside all else."""
-
-    @property
-    def is_free(self) -> bool:
-        """Whether no tray of this process is learning."""
-        ...
-
-    def start(self, *, only_if_changed: bool) -> str:
-        """Begin, if it is free; returns what went wrong, or nothing. only_if_changed: see make_next_version."""
-        ...
-
-    def poll(self) -> str | None:
-        """None while it works; then, once, what went wrong, or an empty string."""
-        ...
-
-    @property
-    def seconds(self) -> float | None:
-        """How long it has been working; None: it is not."""
-        ...
-
-    def stop(self) -> None:
-        """End it; no version is made."""
-        ...
 
 
 class LearningProcess:

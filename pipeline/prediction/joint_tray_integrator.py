@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 
 from fantwin.pipeline.prediction.joint_states import JointStates
-from fantwin.pipeline.prediction.latest_kept import LatestKept
 from fantwin.pipeline.prediction.tray_integrator import TrayIntegrator
 from fantwin.schemas.messages import Grid, Prediction
 from fantwin.schemas.side_by_side import apart, side_by_side
@@ -18,8 +17,8 @@ class JointTrayIntegrator:
     """Predicts the trays of one process together, for any twins."""
 
     def __init__(self) -> None:
-        self._kept = LatestKept[TrayIntegrator](MOST_KEPT)
-        """joint integrators, by twin, fans of a tray, and number of trays"""
+        self._kept: dict[Hashable, TrayIntegrator] = {}
+        """joint integrators, by twin, fans of a tray, and number of trays; the one that was used last is the last"""
 
     def predict(self, integrators: Sequence[TrayIntegrator], grids: Sequence[Grid]) -> list[Prediction]:
         """Predict as TrayIntegrator.predict of each; the keys of their blocks are equal (`joint_key`)."""
@@ -38,8 +37,9 @@ class JointTrayIntegrator:
 
     def _of_trays(self, integrators: Sequence[TrayIntegrator]) -> TrayIntegrator:
         first, count = integrators[0], len(integrators)
-
-        def build() -> TrayIntegrator:
-            return TrayIntegrator(first.twin.of_trays(count), first.config)
-
-        return self._kept.get((first.twin.sha256, first.twin.fans, count), build)
+        key = (first.twin.sha256, first.twin.fans, count)
+        found = self._kept.pop(key, None) or TrayIntegrator(first.twin.of_trays(count), first.config)
+        self._kept[key] = found
+        if len(self._kept) > MOST_KEPT:
+            del self._kept[next(iter(self._kept))]
+        return found

@@ -16,12 +16,7 @@ def read_onnx_metadata(content: bytes) -> dict[str, str]:
     Raises:
         ValueError: it is not an ONNX file.
     """
-    model = _MODEL()
-    try:
-        model.ParseFromString(content)
-    except DecodeError as error:
-        raise ValueError("not an ONNX file") from error
-    return {entry.key: entry.value for entry in model.metadata_props}
+    return {entry.key: entry.value for entry in _parsed(content).metadata_props}
 
 
 def without_metadata(content: bytes) -> bytes:
@@ -30,13 +25,16 @@ def without_metadata(content: bytes) -> bytes:
     Raises:
         ValueError: it is not an ONNX file.
     """
-    model = _MODEL()
-    try:
-        model.ParseFromString(content)
-    except DecodeError as error:
-        raise ValueError("not an ONNX file") from error
+    model = _parsed(content)
     model.ClearField("metadata_props")
     return model.SerializeToString()
+
+
+def _parsed(content: bytes) -> Any:
+    try:
+        return _MODEL.FromString(content)
+    except DecodeError as error:
+        raise ValueError("not an ONNX file") from error
 
 
 def _model_message() -> Any:

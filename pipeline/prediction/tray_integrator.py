@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Hashable
 from itertools import pairwise
+from types import SimpleNamespace
 
 import numpy as np
 from pydantic import Field
@@ -30,34 +31,8 @@ LONGEST_BRIDGE = (
     1 << 16
 )  # grid samples; above half a second at 100 kHz a new start is faster than running through the loss
 LARGEST_MOVE_S = 0.01  # times the width of the training range: a move of the command times the gap in which it was held
-(
-    NONE,
-    GAP,
-    STALE,
-    WARMING_UP,
-    OUT_OF_RANGE,
-    NO_SPEED,
-    NO_TWIN,
-    CLOCK_RESTARTED,
-    STOPPED,
-    STARTING,
-    CONDITIONS_UNKNOWN,
-) = map(
-    np.uint8,
-    (
-        InvalidReason.NONE,
-        InvalidReason.GAP,
-        InvalidReason.STALE,
-        InvalidReason.WARMING_UP,
-        InvalidReason.OUT_OF_RANGE,
-        InvalidReason.NO_SPEED,
-        InvalidReason.NO_TWIN,
-        InvalidReason.CLOCK_RESTARTED,
-        InvalidReason.STOPPED,
-        InvalidReason.STARTING,
-        InvalidReason.CONDITIONS_UNKNOWN,
-    ),
-)
+REASON = SimpleNamespace(**{each.name: np.uint8(each) for each in InvalidReason})
+"""as blocks have them: an enum would make their arrays eight times as large"""
 OUT_OF_RANGE_COUNT = "not_predicted_out_of_range"
 HIGHEST_SPEED = 1.5  # times the top training speed: the balance is used up to there
 
@@ -135,7 +110,7 @@ class TrayIntegrator:
         """Blocks of trays with equal keys can be predicted in one pass (pipeline.prediction.joint_tray_integrator).
         None: this one alone, because samples are missing, or the clock has restarted."""
         steps = np.diff(grid.t_ns, prepend=self._last_t_ns or 0)
-        if (steps != grid.period_ns).any() or (grid.invalid_reason == CLOCK_RESTARTED).any():
+        if (steps != grid.period_ns).any() or (grid.invalid_reason == REASON.CLOCK_RESTARTED).any():
             return None
         return self.twin.sha256, self.twin.fans, grid.period_ns, len(grid.t_ns), *present_columns(grid)
 
@@ -200,16 +175,16 @@ class TrayIntegrator:
         settled = warm | (running & ~in_range)
         in_range &= np.isfinite(predicted) | ~running
         self._counts.add(OUT_OF_RANGE_COUNT, settled & ~in_range)
-        invalid_reason = np.where(settled, OUT_OF_RANGE, WARMING_UP)
-        invalid_reason = np.where(settled & in_range, NONE, invalid_reason)
+        invalid_reason = np.where(settled, REASON.OUT_OF_RANGE, REASON.WARMING_UP)
+        invalid_reason = np.where(settled & in_range, REASON.NONE, invalid_reason)
         if ratios is not None:
-            invalid_reason = np.where(ratios.known, invalid_reason, CONDITIONS_UNKNOWN)
+            invalid_reason = np.where(ratios.known, invalid_reason, REASON.CONDITIONS_UNKNOWN)
         judged = grid.valid
         if self._starting is not None:
             starting = self._starting.is_starting(inputs.stopped, warm)
-            invalid_reason = np.where(starting, STARTING, invalid_reason)
-            invalid_reason = np.where(inputs.stopped, STOPPED, invalid_reason)
-            judged = judged | ((inputs.stopped | starting) & (grid.invalid_reason == NO_SPEED))
+            invalid_reason = np.where(starting, REASON.STARTING, invalid_reason)
+            invalid_reason = np.where(inputs.stopped, REASON.STOPPED, invalid_reason)
+            judged = judged | ((inputs.stopped | starting) & (grid.invalid_reason == REASON.NO_SPEED))
         invalid_reason = np.where(judged, invalid_reason, grid.invalid_reason).astype(np.uint8)
         return self._prediction(grid, predicted, reading_range, invalid_reason, ratios)
 
@@ -221,7 +196,7 @@ class TrayIntegrator:
 
     def without_twin(self, grid: Grid) -> Prediction:
         """Prediction for a block for which the twin is not valid."""
-        invalid_reason = np.where(grid.valid, NO_TWIN, grid.invalid_reason).astype(np.uint8)
+        invalid_reason = np.where(grid.valid, REASON.NO_TWIN, grid.invalid_reason).astype(np.uint8)
         nothing = np.full(grid.command.shape, np.nan)
         return self._prediction(grid, nothing, nothing, invalid_reason, self._ratios(grid))
 
@@ -244,7 +219,7 @@ class TrayIntegrator:
         overdue = gap_ns > self._hold_limit_ns
         moved = np.diff(command, axis=0, prepend=held_before[np.newaxis])
         overdue |= known & (np.abs(moved) * gap_ns > self._largest_move * NS_PER_S)
-        overdue |= grid.invalid_reason == CLOCK_RESTARTED
+        overdue |= grid.invalid_reason == REASON.CLOCK_RESTARTED
         usable = known & grid.valid & np.isfinite(grid.speed_rad_s)
         stopped = np.zeros(usable.shape, np.bool_)
         if self._standstill is not None:
@@ -305,7 +280,7 @@ class TrayIntegrator:
 
         They start again after missing samples.
         """
-        restarted = (grid.invalid_reason == CLOCK_RESTARTED).any(axis=1)
+        restarted = (grid.invalid_reason == REASON.CLOCK_RESTARTED).any(axis=1)
         last_t_ns = grid.t_ns[0] if self._last_t_ns is None else self._last_t_ns
         breaks = (np.diff(grid.t_ns, prepend=last_t_ns) > self._longest_step_ns) | restarted
         known = grid.valid & np.isfinite(grid.speed_rad_s) & np.isfinite(grid.command)
@@ -353,7 +328,7 @@ class TrayIntegrator:
             measured_speed_rad_s=grid.speed_rad_s,
             predicted_speed_rad_s=predicted,
             sigma_rad_s=self.twin.sigma_rad_s,
-            valid=invalid_reason == NONE,
+            valid=invalid_reason == REASON.NONE,
             invalid_reason=invalid_reason,
             twin=self.twin.card.name,
             torque_balance_command=balance,
@@ -369,7 +344,7 @@ class TrayIntegrator:
 
 def _is_silent(grid: Grid) -> Array:
     """Return where the line was silent, (n, fans)."""
-    return (grid.invalid_reason == GAP) | (grid.invalid_reason == STALE)
+    return (grid.invalid_reason == REASON.GAP) | (grid.invalid_reason == REASON.STALE)
 
 
 def _off_below(twin: TwinFile, standstill: Standstill) -> Array:
@@ -378,17 +353,6 @@ def _off_below(twin: TwinFile, standstill: Standstill) -> Array:
 
 
 def _balance_of(twin: TwinFile, off_below: Array) -> TorqueBalance:
-    balance = twin.balance
-    return TorqueBalance(
-        BalanceModel(
-            inertia=balance.inertia,
-            viscous=balance.viscous,
-            drag=balance.drag,
-            friction=balance.friction,
-            lag_s=balance.lag_s,
-            filter_rate_per_s=balance.filter_rate_per_s,
-            lowest_speed_rad_s=balance.lowest_speed_rad_s,
-            highest_speed_rad_s=HIGHEST_SPEED * twin.card.top_speed_rad_s,
-            off_below=off_below,
-        )
-    )
+    coefficients = {name: value for name, value in vars(twin.balance).items() if name != "sigma_command"}
+    highest_rad_s = HIGHEST_SPEED * twin.card.top_speed_rad_s
+    return TorqueBalance(BalanceModel(**coefficients, highest_speed_rad_s=highest_rad_s, off_below=off_below))

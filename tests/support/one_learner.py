@@ -8,6 +8,7 @@ import numpy as np
 
 from fantwin.pipeline.config.models import TrayConfig
 from fantwin.pipeline.learning.healthy_history import HealthyHistory, healthy_recordings, recordings_near_alarms
+from fantwin.pipeline.learning.learning_process import LearningProcess
 from fantwin.pipeline.learning.ordinary_operation import OrdinaryOperation
 from fantwin.pipeline.learning.versions import Check, TwinVersions
 from fantwin.schemas.enums import FanState
@@ -20,7 +21,7 @@ START_NS = 1_800_000_000 * NS_PER_S
 TRAY = TrayConfig.model_validate({"name": "tray1", "fans": 1})
 
 
-class FakeLearning:
+class FakeLearning(LearningProcess):
     """Makes a version at the next poll, or fails."""
 
     def __init__(self, versions: TwinVersions) -> None:
