@@ -210,7 +210,7 @@ class TwinCard:
     kind: name of the kind of model, for people; programs ask the other fields. fixed_rate: whether the model holds at
     rate_hz only. parameters: those in force, per fan, in the order of parameter_names; used_parameters:
     the names of those that the model uses. identified_parameters,
-    parameter_std_errors, parameter_interval_95: of the physical model alone; a hybrid's parameters in force differ
+    parameter_interval_95: of the physical model alone; a hybrid's parameters in force differ
     where its network has taken a share. sigma_rad_s: per fan, the healthy root mean square free-run error.
     speed_range_rad_s, command_range, rate_hz: of the training data; outside them the twin extrapolates. calibration:
     of the alarms (scoring.calibration), None before calibration. tacho: what the free run must pass before it is
@@ -235,7 +235,6 @@ class TwinCard:
     used_parameters: tuple[str, ...]
     parameters: tuple[tuple[float, ...], ...]
     identified_parameters: tuple[tuple[float, ...], ...]
-    parameter_std_errors: tuple[tuple[float, ...], ...]
     parameter_interval_95: tuple[tuple[Range, ...], ...]
     sigma_rad_s: tuple[Positive, ...]
     healthy: HealthyCard

@@ -14,11 +14,8 @@ from fantwin.schemas.reference_conditions import ReferenceConditions
 from fantwin.schemas.standstill import Standstill
 from fantwin.schemas.tacho import Tacho
 from fantwin.schemas.twin_card import (
-    BalanceCard,
     DataCard,
     DriveCard,
-    Four,
-    HealthyCard,
     TrainingCard,
     TwinCard,
     ValidationCard,
@@ -34,10 +31,9 @@ from fantwin.twin.evaluation.accuracy import (
     sums_of_readings,
 )
 from fantwin.twin.evaluation.reading_range import reading_sigma_rad_s
-from fantwin.twin.evaluation.residual_analysis import QUANTILES, HealthyResidual, healthy_residual
+from fantwin.twin.evaluation.residual_analysis import finite_or_none, healthy_residual
 from fantwin.twin.export.onnx_export import export_onnx
-from fantwin.twin.fitting.balance import FILTER_RATE_PER_S
-from fantwin.twin.fitting.balance_fit import BalanceFit, fit_balance
+from fantwin.twin.fitting.balance_fit import fit_balance
 from fantwin.twin.fitting.drive_fit import FoundDrive
 from fantwin.twin.fitting.identification import Identification
 from fantwin.twin.models.drive import DRIVE_PARAMETERS
@@ -95,8 +91,7 @@ def finish_twin(
     progress("evaluation", 0, 0, np.nan)
     pieces = evaluation_pieces(judged)
     expected = [free_run_readings(model, parameters, piece) for piece in pieces]
-    healthy = healthy_residual(residuals_of_readings(pieces, expected), pieces)
-    sigma_rad_s = np.array(healthy.sigma_rad_s)
+    sigma_rad_s, healthy = healthy_residual(residuals_of_readings(pieces, expected), pieces)
     unmeasured = np.flatnonzero(sigma_rad_s == 0.0)
     if unmeasured.size:
         where = "held-out" if validation_runs else "training"
@@ -130,14 +125,13 @@ def finish_twin(
         used_parameters=(*model.used_parameters, *(DRIVE_PARAMETERS if drive else ())),
         parameters=_rows(parameters),
         identified_parameters=_rows(np.hstack((identification.parameters, settings))),
-        parameter_std_errors=_rows(np.hstack((identification.standard_errors, np.zeros_like(settings)))),
         parameter_interval_95=tuple(
             tuple((float(low), float(high)) for low, high in fan)
             for fan in np.concatenate((identification.interval_95, np.stack((settings, settings), axis=-1)), axis=1)
         ),
-        sigma_rad_s=healthy.sigma_rad_s,
-        healthy=_healthy_card(healthy),
-        balance=_balance_card(balance),
+        sigma_rad_s=tuple(sigma_rad_s.tolist()),
+        healthy=healthy,
+        balance=balance,
         speed_range_rad_s=(float(np.nanmin(speeds)), float(np.nanmax(speeds))),
         command_range=(float(commands.min()), float(commands.max())),
         rate_hz=1.0 / float(np.median(np.concatenate([np.diff(run.t_s) for run in runs]))),
@@ -173,42 +167,6 @@ def _reading_sigma_rad_s(
     return tuple(reading_sigma_rad_s(model, parameters, sigma_rad_s, standstill, pieces).tolist())
 
 
-def _healthy_card(healthy: HealthyResidual) -> HealthyCard:
-    return HealthyCard(
-        autocorrelation_time_s=tuple(map(_finite, healthy.autocorrelation_time_s)),
-        independent_samples=tuple(map(_finite, healthy.independent_samples)),
-        probabilities=QUANTILES,
-        quantiles_sigma=tuple(tuple(map(_finite, fan)) for fan in healthy.quantiles_sigma),
-        max_sigma=tuple(map(_finite, healthy.max_sigma)),
-    )
-
-
-def _balance_card(balance: BalanceFit) -> BalanceCard:
-    inertia, viscous, drag, friction = (tuple(column) for column in balance.coefficients.T.tolist())
-    return BalanceCard(
-        inertia=inertia,
-        viscous=viscous,
-        drag=drag,
-        friction=friction,
-        covariance=tuple(map(_square, balance.covariance)),
-        lag_s=tuple(balance.lag_s.tolist()),
-        source=balance.sources,
-        sigma_command=tuple(balance.sigma_command.tolist()),
-        autocorrelation_time_s=tuple(balance.autocorrelation_time_s.tolist()),
-        lowest_speed_rad_s=tuple(balance.lowest_speed_rad_s.tolist()),
-        filter_rate_per_s=FILTER_RATE_PER_S,
-    )
-
-
-def _square(matrix: Array) -> tuple[Four, Four, Four, Four]:
-    first, second, third, fourth = _fours(matrix)
-    return first, second, third, fourth
-
-
-def _fours(rows: Array) -> tuple[tuple[float, float, float, float], ...]:
-    return tuple((row[0], row[1], row[2], row[3]) for row in rows.tolist())
-
-
 def _validation_card(
     figures: Figures, source: Literal["held-out", "training"], data: tuple[DataCard, ...]
 ) -> ValidationCard:
@@ -216,16 +174,12 @@ def _validation_card(
         source=source,
         data=data,
         samples=figures.samples,
-        rmse=_finite(figures.rmse_rad_s),
-        max_error=_finite(figures.max_error_rad_s),
-        r2=_finite(figures.r2),
-        one_step_rmse=_finite(figures.one_step_rmse_rad_s),
-        coverage_2_sigma=_finite(figures.coverage_2_sigma),
+        rmse=finite_or_none(figures.rmse_rad_s),
+        max_error=finite_or_none(figures.max_error_rad_s),
+        r2=finite_or_none(figures.r2),
+        one_step_rmse=finite_or_none(figures.one_step_rmse_rad_s),
+        coverage_2_sigma=finite_or_none(figures.coverage_2_sigma),
     )
-
-
-def _finite(value: float) -> float | None:
-    return value if np.isfinite(value) else None
 
 
 def _versions() -> dict[str, str]:

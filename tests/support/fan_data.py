@@ -6,9 +6,19 @@ import numpy as np
 from bench.training import published_fan
 from bench.training.published_fan import DRAG, INERTIA, NOISE_RAD_S, RATE_HZ, ROUGH_RANGE, VISCOUS
 from fantwin.schemas.tacho import Tacho
+from fantwin.twin.fitting.balance import balance_of, filtered_terms
 from fantwin.twin.runs import Array, Run
 
-__all__ = ["NOISE_RAD_S", "PUBLISHED_PARAMETERS", "RATE_HZ", "counted_run", "published_run", "rough_run", "stairs"]
+__all__ = [
+    "NOISE_RAD_S",
+    "PUBLISHED_PARAMETERS",
+    "RATE_HZ",
+    "counted_run",
+    "published_run",
+    "rough_run",
+    "stairs",
+    "torque_balance",
+]
 
 PUBLISHED_PARAMETERS = np.array([INERTIA, VISCOUS, DRAG])
 
@@ -56,3 +66,8 @@ def counted_run(seed: int, tacho: Tacho, duration_s: float = 120.0, rate_hz: flo
     latest = np.searchsorted(ends_s, sampled - tacho.delay_s, side="right") - 1
     readings = np.where(latest >= 0, counts[latest] * tacho.resolution_rad_s, np.nan)
     return Run(f"counted {seed}", sampled, command[::held], readings, (tacho,))
+
+
+def torque_balance(command: Array, speed_rad_s: Array, period_s: float, coefficients: Array, lag_s: Array) -> Array:
+    """(n, fans) balance by coefficients (fans, 4), see twin.fitting.balance."""
+    return balance_of(filtered_terms(command, speed_rad_s, period_s, lag_s)[0], coefficients)

@@ -62,7 +62,6 @@ def made_up_card(model: Model, fans: int) -> TwinCard:
         used_parameters=model.used_parameters,
         parameters=parameters,
         identified_parameters=parameters,
-        parameter_std_errors=tuple((0.0,) * len(PARAMETER_NAMES) for _ in scale),
         parameter_interval_95=tuple(tuple((value, value) for value in fan) for fan in parameters),
         sigma_rad_s=tuple((SIGMA_RAD_S * scale).tolist()),
         healthy=HealthyCard(unknown, unknown, (), ((),) * fans, unknown),

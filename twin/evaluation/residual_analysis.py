@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from scipy.fft import next_fast_len
 from scipy.special import chdtrc
 
+from fantwin.schemas.twin_card import HealthyCard
 from fantwin.twin.errors import TwinError
 from fantwin.twin.evaluation.accuracy import healthy_sigma_rad_s, sums_by_fan
 from fantwin.twin.runs import Array, Run
@@ -86,21 +87,6 @@ class ResidualAnalysis:
     def _causal_peak(self) -> int:
         causal = len(self.cross_lags_s) // 2
         return causal + int(np.argmax(np.nan_to_num(np.abs(self.cross_correlation[causal:]))))
-
-
-@dataclass(frozen=True)
-class HealthyResidual:
-    """The healthy free-run residual for a model card; each tuple has one entry a fan.
-
-    sigma_rad_s: root mean square. autocorrelation_time_s, independent_samples: as in ResidualAnalysis.
-    quantiles_sigma: |residual| / sigma at the probabilities QUANTILES (normal: 1.96, 2.58, 3.29); max_sigma: at most.
-    """
-
-    sigma_rad_s: tuple[float, ...]
-    autocorrelation_time_s: tuple[float, ...]
-    independent_samples: tuple[float, ...]
-    quantiles_sigma: tuple[tuple[float, ...], ...]
-    max_sigma: tuple[float, ...]
 
 
 @dataclass(frozen=True)
@@ -225,21 +211,29 @@ def analysis_of(sums: ResidualSums, grid: ResidualGrid) -> tuple[ResidualAnalysi
 
 def healthy_residual(
     residual_rad_s: Array, pieces: Sequence[Run], *, settling_s: float = SETTLING_S
-) -> HealthyResidual:
-    """The healthy residual for a card. Arguments and errors as of analyse_residual."""
+) -> tuple[Array, HealthyCard]:
+    """(fans,) healthy standard deviation, rad/s, and the healthy residual for a card.
+
+    Arguments and errors as of analyse_residual.
+    """
     settled = _settled(residual_rad_s, pieces, settling_s)
     sigma_rad_s = healthy_sigma_rad_s(settled)
     analyses = analyse_residual(residual_rad_s, pieces, settling_s=settling_s)
     with np.errstate(invalid="ignore", divide="ignore"):
         in_sigma = np.abs(settled) / sigma_rad_s
-    quantiles = [_quantiles(fan[np.isfinite(fan)]) for fan in in_sigma.T]
-    return HealthyResidual(
-        sigma_rad_s=tuple(sigma_rad_s.tolist()),
-        autocorrelation_time_s=tuple(fan.autocorrelation_time_s for fan in analyses),
-        independent_samples=tuple(fan.independent_samples for fan in analyses),
-        quantiles_sigma=tuple(tuple(fan[:-1].tolist()) for fan in quantiles),
-        max_sigma=tuple(float(fan[-1]) for fan in quantiles),
+    quantiles = [tuple(map(finite_or_none, _quantiles(fan[np.isfinite(fan)]).tolist())) for fan in in_sigma.T]
+    return sigma_rad_s, HealthyCard(
+        autocorrelation_time_s=tuple(finite_or_none(fan.autocorrelation_time_s) for fan in analyses),
+        independent_samples=tuple(finite_or_none(fan.independent_samples) for fan in analyses),
+        probabilities=QUANTILES,
+        quantiles_sigma=tuple(fan[:-1] for fan in quantiles),
+        max_sigma=tuple(fan[-1] for fan in quantiles),
     )
+
+
+def finite_or_none(value: float) -> float | None:
+    """The value as a card has it: None where it is undefined."""
+    return value if np.isfinite(value) else None
 
 
 def _quantiles(in_sigma: Array) -> Array:

@@ -31,24 +31,6 @@ FILTER_RATE_PER_S = 3.0
 COEFFICIENTS = ("inertia", "viscous", "drag", "friction")
 
 
-def torque_balance(
-    command: Array,
-    speed_rad_s: Array,
-    period_s: float,
-    coefficients: Array,
-    lag_s: Array,
-    tacho: Sequence[Tacho] = INSTANTANEOUS,
-) -> Array:
-    """(n, fans) balance in units of the command; NaN at first, and wherever the speed was not known.
-
-    command, speed_rad_s: (n, fans) on a grid of period_s; an unknown speed is NaN, and the filter restarts after it.
-    coefficients: (fans, 4) in the order of COEFFICIENTS. lag_s: (fans,); before the first sample the command is taken
-    as constant. tacho: one for all fans, or one for each.
-    """
-    terms, _ = filtered_terms(command, speed_rad_s, period_s, lag_s, tacho)
-    return balance_of(terms, coefficients)
-
-
 def balance_of(terms: Array, coefficients: Array) -> Array:
     """(...,) balance of filtered terms (..., 5) by coefficients (..., 4)."""
     return terms[..., 0] - np.sum(terms[..., 1:] * coefficients, axis=-1)
@@ -57,8 +39,10 @@ def balance_of(terms: Array, coefficients: Array) -> Array:
 def filtered_terms(
     command: Array, speed_rad_s: Array, period_s: float, lag_s: Array, tacho: Sequence[Tacho] = INSTANTANEOUS
 ) -> tuple[Array, Array]:
-    """The balance is linear: (n, fans, 5) filtered command and what each coefficient multiplies; arguments as above.
+    """The balance is linear: (n, fans, 5) filtered command and what each coefficient multiplies; NaN at first.
 
+    command, speed_rad_s: (n, fans) on a grid of period_s; an unknown speed is NaN, and the filter restarts after it.
+    lag_s: (fans,); before the first sample the command is taken as constant. tacho: one for all fans, or one for each.
     Beside it (n, fans) weight of measured samples in the filter, from 0 at a start to 1.
     """
     acting, _ = effective_command(command, np.full((len(command), 1), period_s), lag_s, command[0])

@@ -28,12 +28,13 @@ that are correlated within a group and for runs that differ.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.ndimage import maximum_filter1d
 from scipy.optimize import lsq_linear
 
-from fantwin.schemas.twin_card import BalanceSource
+from fantwin.schemas.twin_card import BalanceCard, BalanceSource
 from fantwin.twin.errors import TwinError
 from fantwin.twin.evaluation.resampling import resampled
 from fantwin.twin.evaluation.residual_analysis import analyse_residual
@@ -52,25 +53,6 @@ LOWER_BOUNDS = (0.0, 0.0, 0.0, -np.inf)
 
 
 @dataclass(frozen=True, eq=False)
-class BalanceFit:
-    """The torque balance of each fan, in units of the command.
-
-    coefficients: (fans, 4) in the order of balance.COEFFICIENTS. covariance: (fans, 4, 4) of their errors, zero where a
-    coefficient stays at its bound whatever is left out. The others are (fans,): lag_s, sigma_command (the healthy
-    standard deviation within a run), autocorrelation_time_s (as in residual_analysis; that of the filter where the runs
-    are too short), lowest_speed_rad_s (below it the balance does not hold), sources (which candidate).
-    """
-
-    coefficients: Array
-    covariance: Array
-    lag_s: Array
-    sigma_command: Array
-    autocorrelation_time_s: Array
-    lowest_speed_rad_s: Array
-    sources: tuple[BalanceSource, ...]
-
-
-@dataclass(frozen=True, eq=False)
 class _Stretch:
     """A gap-free part of a run on its grid, and the terms of its balance (n, fans, 5), NaN where they do not count."""
 
@@ -84,10 +66,11 @@ class _Stretch:
         return terms[np.isfinite(terms[:, 0])]
 
 
-def fit_balance(runs: Sequence[Run], held_out: Sequence[Run], identification: Identification) -> BalanceFit:
-    """Fit and choose on the runs; sigma comes from the held-out runs, or from the same ones where there are none.
+def fit_balance(runs: Sequence[Run], held_out: Sequence[Run], identification: Identification) -> BalanceCard:
+    """The balance of each fan in units of its command, fitted and chosen on the runs.
 
-    Raises TwinError where a fan never turns long enough, or its balance never moves.
+    Its sigma comes from the held-out runs, or from the same ones where there are none. Raises TwinError where a fan
+    never turns long enough, or its balance never moves.
     """
     lag_s = identification.parameters[:, LAG]
     lowest_speed_rad_s = LOWEST_SHARE_OF_TOP * identification.top_speed_rad_s
@@ -101,15 +84,15 @@ def fit_balance(runs: Sequence[Run], held_out: Sequence[Run], identification: Id
     )
     if not np.all(sigma > 0.0):
         raise TwinError(f"fan {np.argmin(sigma > 0.0)}: its torque balance never moves; check the speed column")
-    return BalanceFit(
-        coefficients=coefficients,
-        covariance=np.array([covariance for _, covariance, _ in chosen]),
-        lag_s=lag_s,
-        sigma_command=sigma,
-        autocorrelation_time_s=np.array([_autocorrelation_time_s(judged, coefficients[fan], fan) for fan in fans]),
-        lowest_speed_rad_s=lowest_speed_rad_s,
-        sources=tuple(source for _, _, source in chosen),
-    )
+    of_fans: dict[str, Any] = dict(zip(COEFFICIENTS, coefficients.T.tolist(), strict=True)) | {
+        "covariance": [covariance.tolist() for _, covariance, _ in chosen],
+        "lag_s": lag_s.tolist(),
+        "source": [source for _, _, source in chosen],
+        "sigma_command": sigma.tolist(),
+        "autocorrelation_time_s": [_autocorrelation_time_s(judged, coefficients[fan], fan) for fan in fans],
+        "lowest_speed_rad_s": lowest_speed_rad_s.tolist(),
+    }
+    return BalanceCard(**of_fans, filter_rate_per_s=FILTER_RATE_PER_S)
 
 
 def _stretches(runs: Sequence[Run], lag_s: Array, lowest_speed_rad_s: Array) -> list[_Stretch]:

@@ -45,13 +45,6 @@ class LeastSquaresProblem(Protocol[P]):
         """The new candidate for the groups that take it, the old one for the others."""
         ...
 
-    def narrowed(self, point: P, active: Flags, /) -> "tuple[LeastSquaresProblem[P], P, Callable[[P], P]] | None":
-        """The problem and the candidate of the active groups alone, and how a result of theirs becomes a whole one.
-
-        None while it does not pay.
-        """
-        ...
-
 
 def minimise(
     problem: LeastSquaresProblem[P],
@@ -61,35 +54,18 @@ def minimise(
     tolerance: float,
     accepted: Callable[[int, P], bool],
     iteration: int = 0,
-    damping: Array | None = None,
 ) -> tuple[P, int, bool]:
     """The next minimum, the iterations with those before, and whether the fit was stopped.
 
     It ends where a step lowers the cost by less than `tolerance`, relative, or where no step lowers it. accepted: is
     called with iteration and candidate after each step that lowers a cost; true stops the fit. iteration: those done
-    before, which count. damping: (groups,) to begin with.
+    before, which count.
     """
-    damping = np.full(problem.groups, FIRST_DAMPING) if damping is None else damping
+    damping = np.full(problem.groups, FIRST_DAMPING)
     cost = problem.total(point)
     active = np.isfinite(cost)
     normal: tuple[Array, Array] | None = None
     while iteration < max_iterations and np.any(active):
-        if normal is None and (narrowed := problem.narrowed(point, active)):
-            part, found, whole = narrowed
-
-            def accepted_by_part(count: int, found: P, whole: Callable[[P], P] = whole) -> bool:
-                return accepted(count, whole(found))
-
-            found, iteration, stopped = minimise(
-                part,
-                found,
-                max_iterations,
-                tolerance=tolerance,
-                accepted=accepted_by_part,
-                iteration=iteration,
-                damping=damping[active],
-            )
-            return whole(found), iteration, stopped
         iteration += 1
         normal = problem.normal_equations(point) if normal is None else normal
         trial = problem.trial(point, *normal, damping)

@@ -240,9 +240,6 @@ class _Problem(FreeRunProblem):
     def at_bounds(self, physics: Array, downhill: Array) -> Flags:
         return np.zeros(physics.shape, np.bool_)
 
-    def narrowed(self, point: Point, active: Flags) -> None:
-        return
-
 
 def _without_lag(physics: Array) -> Array:
     return np.column_stack((physics[:, :LAG], np.zeros(len(physics))))

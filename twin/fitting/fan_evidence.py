@@ -14,8 +14,8 @@ from fantwin.twin.evaluation.accuracy import evaluation_pieces
 from fantwin.twin.fitting.filtering import Basis, filtered_regression
 from fantwin.twin.fitting.trajectories import MAX_SAMPLES
 from fantwin.twin.measurement import with_measured_command
+from fantwin.twin.models.fan_ode import FanOde
 from fantwin.twin.models.lag import effective_command
-from fantwin.twin.models.model import OdeModel
 from fantwin.twin.models.physics import LAG
 from fantwin.twin.runs import Array, Run
 
@@ -36,7 +36,7 @@ class FanEvidence:
 
 
 def evidence_of_fans(
-    model: OdeModel,
+    model: FanOde,
     parameters: Array,
     runs: Sequence[Run],
     acting_runs: Sequence[Run],
@@ -88,7 +88,7 @@ def evidence_of_fans(
     return found
 
 
-def acceleration_of(model: OdeModel, parameters: Array) -> Basis:
+def acceleration_of(model: FanOde, parameters: Array) -> Basis:
     """The acceleration of one fan, rad/s^2. parameters: (4,)."""
     equation = model.equation(parameters[np.newaxis])
 

@@ -16,16 +16,19 @@ shared weights every fan is a group of its own.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+
+import numpy as np
 
 from fantwin.twin.fitting.damped_least_squares import minimise
 from fantwin.twin.fitting.free_run_problem import OF_STEADY_SPEEDS, Flags, FreeRunProblem, Point, Prior, Unknowns
 from fantwin.twin.fitting.reading_errors import counts
 from fantwin.twin.fitting.trajectories import Trajectories
-from fantwin.twin.models.model import OdeModel
+from fantwin.twin.models.fan_ode import FanOde
 from fantwin.twin.runs import Array
 
 SCALE_ROUNDS, ERROR_ROUNDS = 2, 4  # with a constant scale, or with what was learned of the errors of readings
+MOST_ITERATIONS_OF_PHYSICS = 60
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,13 +40,19 @@ class FreeRunFit:
     error_rad_s: Array
     iterations: int
 
+    def rmse_of_fans_rad_s(self, trajectories: Trajectories) -> Array:
+        """(fans,) the same of each fan of the trajectories."""
+        fans = len(trajectories.tacho)
+        squares = np.bincount(trajectories.fan, np.sum(self.error_rad_s**2, axis=0), fans)
+        return np.sqrt(squares / np.bincount(trajectories.fan, trajectories.compared.sum(axis=0), fans))
+
 
 IterationDone = Callable[[int, Unknowns, float], bool]
 """Called with iteration, unknowns and rmse in rad/s after each accepted step; true stops the fit."""
 
 
 def fit_free_run(
-    model: OdeModel,
+    model: FanOde,
     physics: Array,
     top_speed_rad_s: Array,
     trajectories: Trajectories,
@@ -91,3 +100,42 @@ def fit_free_run(
         if stopped:
             break
     return FreeRunFit(point, problem.rmse_rad_s(point), point.residual / problem.errors.weight, iteration)
+
+
+def fit_physics(
+    model: FanOde,
+    physics: Array,
+    top_speed_rad_s: Array,
+    trajectories: Trajectories,
+    *,
+    free: Flags,
+    prior: Prior,
+    iteration_done: IterationDone,
+) -> FreeRunFit:
+    """Fit the physics of each fan alone; where a tacho counts, then with what that fit says of the errors of readings.
+
+    Arguments as of fit_free_run.
+    """
+    fit = fit_free_run(
+        model,
+        physics,
+        top_speed_rad_s,
+        trajectories,
+        free=free,
+        prior=prior,
+        max_iterations=MOST_ITERATIONS_OF_PHYSICS,
+        iteration_done=iteration_done,
+    )
+    if not counts(trajectories):
+        return fit
+    weighted = fit_free_run(
+        model,
+        fit.point.unknowns.physics,
+        top_speed_rad_s,
+        trajectories,
+        free=free,
+        prior=prior,
+        max_iterations=MOST_ITERATIONS_OF_PHYSICS,
+        with_errors=True,
+    )
+    return replace(weighted, iterations=fit.iterations + weighted.iterations)

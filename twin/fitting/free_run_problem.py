@@ -1,6 +1,6 @@
 """The errors of a free run as a sum of losses, its normal equations and their damped steps: see free_run_fit."""
 
-from collections.abc import Callable
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from fantwin.twin.fitting.damped_least_squares import Flags, pseudo_huber, pseudo_huber_weight
 from fantwin.twin.fitting.reading_errors import ReadingErrors, counts, reading_errors, robust_scale
 from fantwin.twin.fitting.trajectories import Trajectories
-from fantwin.twin.models.integration import WIDE_BATCH, free_run, free_run_sensitivities
+from fantwin.twin.models.fan_ode import FanOde
+from fantwin.twin.models.integration import free_run, free_run_sensitivities
 from fantwin.twin.models.lag import effective_command, effective_command_by_lag
-from fantwin.twin.models.model import OdeModel
 from fantwin.twin.models.network import TanhNetwork
 from fantwin.twin.models.physical import parameters_by_unknowns, physical_parameters
 from fantwin.twin.models.physics import LAG, PARAMETER_NAMES
@@ -20,7 +20,6 @@ from fantwin.twin.models.right_hand_side import FanEquation
 from fantwin.twin.runs import Array
 
 FAST_CHUNK_NUMBERS, MAX_CHUNK_NUMBERS = 500_000, 4_000_000
-FEWER = 0.75  # share of the fans: with fewer left to fit than that, the others are left out
 ALIGNED_COLUMNS = 16  # of fast chunks: whole registers, so that all columns of a chunk are summed alike
 HELD = 1e12
 
@@ -100,7 +99,7 @@ class FreeRunProblem:
 
     def __init__(
         self,
-        model: OdeModel,
+        model: FanOde,
         trajectories: Trajectories,
         top_speed_rad_s: Array,
         free: Flags,
@@ -179,12 +178,9 @@ class FreeRunProblem:
         The unknowns are in the order weights, physics, initial speed.
         """
         data = self.trajectories
-        steps, batch = data.command.shape
-        size = self.weights + point.unknowns.physics.shape[1] + 1
+        batch, size = len(data.fan), self.weights + point.unknowns.physics.shape[1] + 1
         squares, gradient = np.empty((batch, size, size)), np.empty((batch, size))
-        width = _chunk_columns(steps * size)
-        for first in range(0, batch, width):
-            part = slice(first, first + width)
+        for part in self.parts():
             sensitivity = self.sensitivities(point, part).transpose(1, 0, 2)
             scale = self.scale_rad_s[data.fan[part]]
             weight = self.sample_weights(point.residual[:, part], part) / scale**2
@@ -192,6 +188,15 @@ class FreeRunProblem:
             squares[part] = weighted.transpose(0, 2, 1) @ sensitivity
             gradient[part] = np.einsum("bnp,nb->bp", weighted, point.residual[:, part])
         return squares, gradient
+
+    def parts(self) -> Iterator[slice]:
+        """The trajectories that are differentiated at once: with as many derivatives as a cache holds, or where these
+        are of few trajectories, as many as memory should."""
+        steps, batch = self.trajectories.command.shape
+        numbers = steps * (self.weights + self.prior.physics_mean.shape[1] + 1)
+        fast = FAST_CHUNK_NUMBERS // numbers // ALIGNED_COLUMNS * ALIGNED_COLUMNS
+        width = fast or max(1, MAX_CHUNK_NUMBERS // numbers)
+        return (slice(first, first + width) for first in range(0, batch, width))
 
     def sample_weights(self, residual: Array, part: slice) -> Array:
         """(n, batch) the pseudo-Huber loss's weights: 1 for small residuals, 0 where nothing is compared."""
@@ -248,8 +253,7 @@ class FreeRunProblem:
         # An initial speed that is not estimated gets infinite curvature, so that it does not change.
         known = 1.0 if self.estimate_initial_speed else np.inf
         by_initial = known * squares[:, -1, -1] * (1.0 + damping_of_fan[fan_of])
-        coupling = squares[:, :-1, -1] / by_initial[:, np.newaxis]
-        own = squares[:, :-1, :-1] - coupling[:, :, None] * squares[:, None, :-1, -1]
+        own, coupling = without_initial_speeds(squares, by_initial)
         reduced = sums_by_fan(own, fan_of, self.fans)
         downhill = sums_by_fan(gradient[:, :-1] - coupling * gradient[:, -1:], fan_of, self.fans)
         diagonal = sums_by_fan(np.diagonal(squares[:, :-1, :-1], axis1=1, axis2=2), fan_of, self.fans)
@@ -334,65 +338,21 @@ class FreeRunProblem:
             cost=np.where(fan, new.cost, old.cost),
         )
 
-    def narrowed(self, point: Point, active: Flags) -> tuple["FreeRunProblem", Point, Callable[[Point], Point]] | None:
-        """See damped_least_squares."""
-        if not self.pays_for_some(active):
-            return None
-        return self.of_fans(active), self.point_of_some(point, active), lambda found: self._whole(point, found, active)
-
-    def pays_for_some(self, fans: Flags) -> bool:
-        """Whether it pays to go on with these fans (fans,) alone. Their results are the same, for without shared
-        weights they are fitted each by itself, and they are still so many that they are stepped through.
-        """
-        if self.weights or np.count_nonzero(fans) > FEWER * self.fans:
-            return False
-        return bool(np.count_nonzero(fans[self.trajectories.fan]) >= WIDE_BATCH)
-
-    def of_fans(self, fans: Flags) -> "FreeRunProblem":
-        """The problem of some fans alone, without shared weights."""
-        columns = fans[self.trajectories.fan]
-        problem = FreeRunProblem(
-            self.model,
-            self.trajectories.of_fans(fans),
-            self.top_speed_rad_s[fans],
-            np.broadcast_to(self.free, (self.fans, len(PARAMETER_NAMES)))[fans],
-            replace(self.prior, physics_mean=self.prior.physics_mean[fans]),
-            self.estimate_initial_speed,
-        )
-        problem.scale_rad_s, problem.errors = self.scale_rad_s[fans], self.errors.of_columns(columns)
-        return problem
-
-    def point_of_some(self, point: Point, fans: Flags) -> Point:
-        """The candidate of some fans alone."""
-        columns = fans[self.trajectories.fan]
-        unknowns = replace(
-            point.unknowns,
-            physics=point.unknowns.physics[fans],
-            initial_speed_rad_s=point.unknowns.initial_speed_rad_s[columns],
-        )
-        return Point(unknowns, point.speed_rad_s[:, columns], point.residual[:, columns], point.cost[fans])
-
-    def _whole(self, point: Point, found: Point, fans: Flags) -> Point:
-        """The candidate with that of some fans in their places."""
-        columns = fans[self.trajectories.fan]
-        unknowns = replace(
-            point.unknowns,
-            physics=_with(point.unknowns.physics, fans, found.unknowns.physics),
-            initial_speed_rad_s=_with(point.unknowns.initial_speed_rad_s, columns, found.unknowns.initial_speed_rad_s),
-        )
-        return Point(
-            unknowns,
-            _with(point.speed_rad_s, (slice(None), columns), found.speed_rad_s),
-            _with(point.residual, (slice(None), columns), found.residual),
-            _with(point.cost, fans, found.cost),
-        )
-
     def rmse_rad_s(self, point: Point) -> float:
         """Root mean square of the errors of all samples that are compared, whatever their weight."""
         compared = self.trajectories.compared
         with np.errstate(over="ignore"):
             error_rad_s = np.where(compared, point.residual / self.errors.weight + self.errors.expected_rad_s, 0.0)
             return float(np.sqrt(np.sum(error_rad_s**2) / np.count_nonzero(compared)))
+
+
+def without_initial_speeds(squares: Array, by_initial: Array) -> tuple[Array, Array]:
+    """(batch, M - 1, M - 1) of squares (batch, M, M), with the initial speed of each, the last unknown, eliminated.
+
+    Beside it (batch, M - 1) how the initial speed follows the others. by_initial: (batch,) the curvature by it.
+    """
+    coupling = squares[:, :-1, -1] / by_initial[:, np.newaxis]
+    return squares[:, :-1, :-1] - coupling[:, :, None] * squares[:, None, :-1, -1], coupling
 
 
 def sums_by_fan(values: Array, fan: NDArray[np.intp], fans: int) -> Array:
@@ -405,17 +365,3 @@ def sums_by_fan(values: Array, fan: NDArray[np.intp], fans: int) -> Array:
         chosen = np.flatnonzero(number == count)
         total[fan[chosen]] += values[chosen]
     return total
-
-
-def _with(values: Array, chosen: Flags | tuple[slice, Flags], others: Array) -> Array:
-    """The values with the chosen ones replaced."""
-    replaced = values.copy("K")
-    replaced[chosen] = others
-    return replaced
-
-
-def _chunk_columns(numbers: int) -> int:
-    """How many trajectories are differentiated at once, each with so many derivatives: as many as a cache holds, or
-    where that is few, as many as memory should."""
-    fast = FAST_CHUNK_NUMBERS // numbers // ALIGNED_COLUMNS * ALIGNED_COLUMNS
-    return fast or max(1, MAX_CHUNK_NUMBERS // numbers)

@@ -21,7 +21,7 @@ Annals of Statistics 9 (1981).
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -30,7 +30,7 @@ from scipy.stats import t as student_t
 
 from fantwin.twin.errors import TwinError
 from fantwin.twin.fitting.filtering import filtered_regression
-from fantwin.twin.fitting.free_run_fit import FreeRunFit, fit_free_run
+from fantwin.twin.fitting.free_run_fit import MOST_ITERATIONS_OF_PHYSICS, FreeRunFit, fit_physics
 from fantwin.twin.fitting.free_run_problem import ALL_FREE, FreeRunProblem, Prior, Unknowns
 from fantwin.twin.fitting.identifiability import (
     TOP_SPEED_QUANTILE,
@@ -38,7 +38,7 @@ from fantwin.twin.fitting.identifiability import (
     misfit_warnings,
     short_warnings,
 )
-from fantwin.twin.fitting.reading_errors import counts, robust_scale
+from fantwin.twin.fitting.reading_errors import robust_scale
 from fantwin.twin.fitting.trajectories import Trajectories, cut_into_trajectories, stretch_samples
 from fantwin.twin.measurement import with_measured_command
 from fantwin.twin.models import physics
@@ -52,7 +52,6 @@ from fantwin.twin.runs import Array, Run, common_fans
 LAMBDA_LADDER = 9
 COLUMNS_AT_ONCE = 320  # fans times rungs: fewer cost as much as these, more need more memory
 STRETCH_TIME_CONSTANTS = 10.0
-MAX_ITERATIONS = 60
 BLOCKS = 40
 # A lag counts from this many standard errors on: one fan in a thousand without a lag then gets one.
 LAG_IN_STANDARD_ERRORS = 3.3
@@ -124,7 +123,7 @@ def identify(runs: Sequence[Run], *, with_lag: bool = True, progress: Progress =
         fit, covariance, freedom = _refine(without, free, top_speed, trajectories, part, progress, start)
         iterations += fit.iterations
     parameters = physical_parameters(fit.point.unknowns.physics, top_speed)
-    rmse_rad_s = _rmse_rad_s(fit, trajectories, fans)
+    rmse_rad_s = fit.rmse_of_fans_rad_s(trajectories)
     time_constant_s = _positive(physics.time_constant_s(speed, parameters), pieces)
     progress("identification: checks", 0, 0, np.nan)
     return Identification(
@@ -241,35 +240,22 @@ def _refine(
     """The fit of the free run from parameters (fans, 4), and what _covariance says of it. part: its name in reports."""
 
     def iteration_done(iteration: int, _unknowns: Unknowns, rmse_rad_s: float) -> bool:
-        progress(part, iteration, MAX_ITERATIONS, rmse_rad_s)
+        progress(part, iteration, MOST_ITERATIONS_OF_PHYSICS, rmse_rad_s)
         return False
 
     fans = len(start)
     start_physics = fitted_unknowns(start, top_speed_rad_s)
     pull = inertia_anchor(np.count_nonzero(trajectories.compared) / fans)
     prior = Prior(0.0, pull, start_physics if anchor is None else fitted_unknowns(anchor, top_speed_rad_s))
-    fit = fit_free_run(
+    fit = fit_physics(
         PhysicalModel(),
         start_physics,
         top_speed_rad_s,
         trajectories,
         free=free,
         prior=prior,
-        max_iterations=MAX_ITERATIONS,
         iteration_done=iteration_done,
     )
-    if counts(trajectories):
-        weighted = fit_free_run(
-            PhysicalModel(),
-            fit.point.unknowns.physics,
-            top_speed_rad_s,
-            trajectories,
-            free=free,
-            prior=prior,
-            max_iterations=MAX_ITERATIONS,
-            with_errors=True,
-        )
-        fit = replace(weighted, iterations=fit.iterations + weighted.iterations)
     return fit, *_covariance(fit, free, top_speed_rad_s, trajectories, prior)
 
 
@@ -326,12 +312,6 @@ def _covariance(
         known = fourth > 0.0
         freedom[fan, known] = np.clip(3.0 * np.sum(moves**2, axis=0)[known] ** 2 / fourth[known], 2.0, BLOCKS - 1)
     return covariance, freedom
-
-
-def _rmse_rad_s(fit: FreeRunFit, trajectories: Trajectories, fans: int) -> Array:
-    """(fans,) root mean square of the free-run residual."""
-    squares = np.bincount(trajectories.fan, np.sum(fit.error_rad_s**2, axis=0), fans)
-    return np.sqrt(squares / np.bincount(trajectories.fan, trajectories.compared.sum(axis=0), fans))
 
 
 def _floor_rad_s(fit: FreeRunFit, trajectories: Trajectories, fans: int) -> Array:

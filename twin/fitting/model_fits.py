@@ -13,8 +13,8 @@ from fantwin.twin.fitting.identification import Identification
 from fantwin.twin.fitting.initial_weights import initial_weights
 from fantwin.twin.fitting.narx_training import train_narx
 from fantwin.twin.fitting.training import GRID_PRIOR_STD, Physics, data_scaling, train_network
-from fantwin.twin.models.fan_ode import NetworkOde
-from fantwin.twin.models.model import Model, OdeModel
+from fantwin.twin.models.fan_ode import FanOde, NetworkOde
+from fantwin.twin.models.model import Model
 from fantwin.twin.models.network import TanhNetwork
 from fantwin.twin.models.physical import PhysicalModel
 from fantwin.twin.networks import ForEachNetwork, one_after_another
@@ -103,7 +103,7 @@ def fit_network_ode(request: FitRequest, units: int, make: Callable[[TanhNetwork
     )
 
 
-def _behind(drive: FoundDrive | None, model: OdeModel, parameters: Array) -> tuple[OdeModel, Array]:
+def _behind(drive: FoundDrive | None, model: FanOde, parameters: Array) -> tuple[FanOde, Array]:
     if drive is None:
         return model, parameters
     return model.with_drive(drive.drive), np.hstack((parameters, drive.settings))

@@ -25,7 +25,7 @@ from fantwin.twin.fitting.filtering import Basis
 from fantwin.twin.fitting.identification import Identification
 from fantwin.twin.fitting.thinning import coarser, thinning_factor
 from fantwin.twin.fitting.training import data_scaling
-from fantwin.twin.models.model import OdeModel
+from fantwin.twin.models.fan_ode import FanOde
 from fantwin.twin.models.network import Scaling
 from fantwin.twin.models.physics import acceleration, acceleration_by_speed
 from fantwin.twin.runs import Array, Run
@@ -58,7 +58,7 @@ SETTLING_SPEEDS = 2000
 
 
 def model_uncertainty(
-    model: OdeModel,
+    model: FanOde,
     parameters: Array,
     runs: Sequence[Run],
     acting_runs: Sequence[Run],
@@ -144,7 +144,7 @@ def _seen_std_rad_s(
 class Settling:
     """The speeds at which fans with one network settle under acting commands, between the given ones, which rise."""
 
-    def __init__(self, model: OdeModel, commands: Array, speeds_rad_s: Array) -> None:
+    def __init__(self, model: FanOde, commands: Array, speeds_rad_s: Array) -> None:
         self._model, self._commands, self._speeds_rad_s = model, len(commands), speeds_rad_s
         command, speed_rad_s = np.meshgrid(commands, speeds_rad_s, indexing="ij")
         self._command, self._speed_rad_s = command.ravel(), speed_rad_s.ravel()

@@ -101,10 +101,6 @@ class OutputErrorFit:
         """See damped_least_squares."""
         return new
 
-    def narrowed(self, _point: Candidate, _active: Flags) -> None:
-        """See damped_least_squares."""
-        return
-
     def _candidate(self, theta: Array) -> Candidate:
         speeds = self._free_run(theta)
         loss = float(np.sum(pseudo_huber(self._residual(speeds), self.scale_rad_s)))

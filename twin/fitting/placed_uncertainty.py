@@ -11,7 +11,7 @@ import numpy as np
 
 from fantwin.schemas.model_uncertainty import ModelUncertainty
 from fantwin.twin.fitting.model_uncertainty import SETTLING_SPEEDS, Settling, significant
-from fantwin.twin.models.model import OdeModel
+from fantwin.twin.models.fan_ode import FanOde
 from fantwin.twin.models.physical import fitted_unknowns, physical_parameters
 from fantwin.twin.runs import Array
 
@@ -21,7 +21,7 @@ REACH = 1.5
 
 def placed_uncertainty(
     of_type: ModelUncertainty,
-    model: OdeModel,
+    model: FanOde,
     parameters: Array,
     covariance: Array,
     top_speed_rad_s: float,

@@ -8,16 +8,23 @@ is taken as typical. The standard errors are those of the quadratic at the mode.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from fantwin.schemas.twin_card import TwinCard
 from fantwin.twin.errors import TwinError
-from fantwin.twin.fitting.free_run_fit import FreeRunFit, fit_free_run
-from fantwin.twin.fitting.free_run_problem import ALL_FREE, FreeRunProblem, Prior, Unknowns, sums_by_fan
+from fantwin.twin.fitting.free_run_fit import MOST_ITERATIONS_OF_PHYSICS, FreeRunFit, fit_physics
+from fantwin.twin.fitting.free_run_problem import (
+    ALL_FREE,
+    FreeRunProblem,
+    Prior,
+    Unknowns,
+    sums_by_fan,
+    without_initial_speeds,
+)
 from fantwin.twin.fitting.identification import Identification
-from fantwin.twin.fitting.reading_errors import counts, robust_scale
+from fantwin.twin.fitting.reading_errors import robust_scale
 from fantwin.twin.fitting.trajectories import Trajectories, cut_into_trajectories, stretch_samples
 from fantwin.twin.models import physics
 from fantwin.twin.models.network import TanhNetwork
@@ -28,7 +35,6 @@ from fantwin.twin.progress import Progress
 from fantwin.twin.runs import Array, Run, common_fans
 
 STRETCH_TIME_CONSTANTS = 10.0
-MAX_ITERATIONS = 60
 ASSUMED_SPREAD, ASSUMED_FANS = 0.1, 2.0
 """how far fans of a type are taken to be apart before any is known, relative, and the number of fans that this counts
 as: two or three fans of a type may be alike by chance"""
@@ -99,38 +105,23 @@ def place_fans(
     model = _FixedNetwork(fixed_network=network)
 
     def iteration_done(iteration: int, _unknowns: Unknowns, rmse_rad_s: float) -> bool:
-        progress("placing", iteration, MAX_ITERATIONS, rmse_rad_s)
+        progress("placing", iteration, MOST_ITERATIONS_OF_PHYSICS, rmse_rad_s)
         return False
 
-    def fit(start: Array, *, with_errors: bool) -> FreeRunFit:
-        return fit_free_run(
-            model,
-            start,
-            top_speed_rad_s,
-            stretches,
-            free=free,
-            prior=prior,
-            max_iterations=MAX_ITERATIONS,
-            with_errors=with_errors,
-            iteration_done=iteration_done,
-        )
-
-    found = fit(typical, with_errors=False)
-    if counts(stretches):
-        weighted = fit(found.point.unknowns.physics, with_errors=True)
-        found = replace(weighted, iterations=found.iterations + weighted.iterations)
+    found = fit_physics(
+        model, typical, top_speed_rad_s, stretches, free=free, prior=prior, iteration_done=iteration_done
+    )
     problem = FreeRunProblem(model, stretches, top_speed_rad_s, free, prior)
     of_unknowns = _covariance(problem, found, correlated_samples)
     unknowns = found.point.unknowns.physics
     chain = parameters_by_unknowns(unknowns, top_speed_rad_s)
     parameters = physical_parameters(unknowns, top_speed_rad_s)
-    squares = np.bincount(stretches.fan, np.sum(found.error_rad_s**2, axis=0), fans)
     identification = Identification(
         parameters=parameters,
         covariance=chain @ of_unknowns @ chain.transpose(0, 2, 1),
         degrees_of_freedom=np.full(parameters.shape, np.inf),
         lambda_per_s=np.full(fans, np.nan),
-        rmse_rad_s=np.sqrt(squares / np.bincount(stretches.fan, stretches.compared.sum(axis=0), fans)),
+        rmse_rad_s=found.rmse_of_fans_rad_s(stretches),
         time_constant_s=physics.time_constant_s(typical_speed, parameters),
         top_speed_rad_s=top_speed_rad_s,
         iterations=found.iterations,
@@ -145,9 +136,7 @@ def _covariance(problem: FreeRunProblem, fit: FreeRunFit, correlated_samples: fl
     data: Trajectories = problem.trajectories
     problem.scale_rad_s = robust_scale(fit.error_rad_s, data)
     squares, _ = problem.normal_equations(fit.point)
-    by_initial = squares[:, -1, -1]
-    coupling = squares[:, :-1, -1] / by_initial[:, np.newaxis]
-    own = squares[:, :-1, :-1] - coupling[:, :, None] * squares[:, None, :-1, -1]
+    own, _ = without_initial_speeds(squares, squares[:, -1, -1])
     curvature = sums_by_fan(own, data.fan, problem.fans)
     curvature = (curvature + np.diag(problem.prior.physics)) / correlated_samples
     free = np.flatnonzero(problem.free)

@@ -15,7 +15,6 @@ noise.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fantwin.twin.fitting.trajectories import Trajectories
 from fantwin.twin.runs import Array
@@ -37,10 +36,6 @@ class ReadingErrors:
     def unknown(cls, shape: tuple[int, ...]) -> "ReadingErrors":
         """None is expected, and all readings count alike."""
         return cls(np.zeros(shape), np.ones(shape))
-
-    def of_columns(self, chosen: NDArray[np.bool_]) -> "ReadingErrors":
-        """Of some trajectories."""
-        return ReadingErrors(self.expected_rad_s[:, chosen], self.weight[:, chosen])
 
 
 def robust_scale(residual: Array, trajectories: Trajectories) -> Array:

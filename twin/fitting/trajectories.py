@@ -76,13 +76,6 @@ class Trajectories:
             self.lead_in[chosen],
         )
 
-    def of_fans(self, chosen: NDArray[np.bool_]) -> "Trajectories":
-        """The stretches of some fans (fans,), which are counted from 0 again."""
-        columns = np.flatnonzero(chosen[self.fan])
-        number = np.cumsum(chosen) - 1
-        tacho = tuple(its for its, is_chosen in zip(self.tacho, chosen.tolist(), strict=True) if is_chosen)
-        return replace(self.of_columns(columns), fan=number[self.fan[columns]], tacho=tacho)
-
     def first_samples(self, count: int) -> "Trajectories":
         """The first samples of all stretches, so many of each."""
         return replace(

@@ -3,6 +3,8 @@
 from dataclasses import dataclass, field, replace
 from typing import ClassVar, Self
 
+import numpy as np
+
 from fantwin.schemas.twin_card import NetworkCard, StateLayout
 from fantwin.twin.models.drive import DRIVE_LAYOUT, Drive
 from fantwin.twin.models.network import TanhNetwork
@@ -33,6 +35,20 @@ class FanOde:
         """w' of a batch of fans with the physical parameters (batch, 4), which enter only if the model has physics."""
         return FanEquation(parameters if self.has_physics else None, self.network)
 
+    @property
+    def theta(self) -> Array:
+        """(P,) the weights of the network; empty without one."""
+        return np.zeros(0) if self.network is None else self.network.theta
+
+    @property
+    def network_card(self) -> NetworkCard:
+        """The size of the network."""
+        return NetworkCard(units=0, inputs=(), parameter_count=0) if self.network is None else self.network.card
+
+    def with_theta(self, theta: Array) -> Self:
+        """The same model with other weights, if it has any."""
+        return self if self.network is None else replace(self, network=self.network.with_theta(theta))
+
     def advance(self, state: Array, command: Array, step_s: Array, parameters: Array) -> tuple[Array, Array]:
         """Free run from state; see model.TwinModel."""
         return advance(self.equation(parameters), state, command, step_s, parameters, self.drive)
@@ -47,20 +63,6 @@ class NetworkOde(FanOde):
     """One network for all fans, beside the physics of each fan or alone."""
 
     network: TanhNetwork = field()
-
-    @property
-    def theta(self) -> Array:
-        """(P,) the weights of the network."""
-        return self.network.theta
-
-    @property
-    def network_card(self) -> NetworkCard:
-        """The size of the network."""
-        return self.network.card
-
-    def with_theta(self, theta: Array) -> Self:
-        """The same model with other weights."""
-        return self.with_network(self.network.with_theta(theta))
 
     def with_network(self, network: TanhNetwork) -> Self:
         """The same model with another network."""

@@ -43,10 +43,6 @@ class RightHandSide(Protocol):
         """The acceleration and its derivative by speed, both (..., batch)."""
         ...
 
-    def stepped(self, initial_speed_rad_s: Array, command: Array, step_s: Array) -> tuple[Array, Array]:
-        """What step_through returns for the acceleration, for many fans side by side. step_s: (n, batch)."""
-        ...
-
 
 class Linearised(RightHandSide, Protocol):
     """A right-hand side with the derivatives by its unknowns."""
@@ -85,7 +81,7 @@ def free_run(
     step_s = np.broadcast_to(step_s.reshape(samples, -1), command.shape)
     if batch >= WIDE_BATCH:
         with np.errstate(over="ignore", invalid="ignore"):
-            return rhs.stepped(initial_speed_rad_s, command, step_s)
+            return step_through(rhs.acceleration, initial_speed_rad_s, command, step_s)
     speed_rad_s = np.empty_like(command)
     current = np.array(initial_speed_rad_s, dtype=np.float64)
     window = largest = max(SHORTEST_WINDOW, MAX_WINDOW // batch)

@@ -3,13 +3,10 @@
 A kind of model is one class in a file of its own in this package. twin.kinds lists the kinds.
 """
 
-from typing import ClassVar, Protocol, Self
+from typing import ClassVar, Protocol
 
 from fantwin.schemas.twin_card import NetworkCard, StateLayout
-from fantwin.twin.models.drive import Drive
-from fantwin.twin.models.network import TanhNetwork
 from fantwin.twin.models.onnx_nodes import Nodes
-from fantwin.twin.models.right_hand_side import FanEquation
 from fantwin.twin.runs import Array
 
 
@@ -49,30 +46,4 @@ class Model(TwinModel, Protocol):
 
     def graph(self) -> Nodes:
         """`advance` as ONNX nodes, between the inputs and outputs that schemas.twin_card names."""
-        ...
-
-
-class OdeModel(Model, Protocol):
-    """A model w' = f(w, command) with weights theta (P,), none without a network. It is fitted on its free run."""
-
-    @property
-    def network(self) -> TanhNetwork | None:
-        """Its network, or None."""
-        ...
-
-    @property
-    def theta(self) -> Array:
-        """(P,) the weights of the network; empty without one."""
-        ...
-
-    def with_theta(self, theta: Array) -> Self:
-        """The same model with other weights."""
-        ...
-
-    def with_drive(self, drive: Drive) -> Self:
-        """The same model behind a drive; its parameters are then (fans, 7)."""
-        ...
-
-    def equation(self, parameters: Array) -> FanEquation:
-        """The right-hand side for a batch of fans with the physical parameters (batch, 4)."""
         ...

@@ -5,11 +5,10 @@ d torque / d speed is alpha + 2 C_D |w|. That it is positive at both ends makes 
 speed, which is all that physics demands: C_D may come out negative where friction or a dead zone bends the curve.
 """
 
-from typing import ClassVar, Self
+from typing import ClassVar
 
 import numpy as np
 
-from fantwin.schemas.twin_card import NetworkCard
 from fantwin.twin.models.fan_ode import FanOde
 from fantwin.twin.models.physics import LAG, PARAMETER_NAMES
 from fantwin.twin.runs import Array
@@ -21,20 +20,6 @@ class PhysicalModel(FanOde):
     kind: ClassVar[str] = "physical"
     has_physics: ClassVar[bool] = True
     used_parameters: ClassVar[tuple[str, ...]] = PARAMETER_NAMES
-
-    @property
-    def network_card(self) -> NetworkCard:
-        """The size of the network: none."""
-        return NetworkCard(units=0, inputs=(), parameter_count=0)
-
-    @property
-    def theta(self) -> Array:
-        """(0,): there is no network."""
-        return np.zeros(0)
-
-    def with_theta(self, theta: Array) -> Self:
-        """The same model: it has no weights."""
-        return self
 
 
 def physical_parameters(unknowns: Array, top_speed_rad_s: Array) -> Array:

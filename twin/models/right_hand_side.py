@@ -13,7 +13,6 @@ from fantwin.twin.models.drive import Drive, drive_settings
 from fantwin.twin.models.integration import free_run
 from fantwin.twin.models.lag import effective_command
 from fantwin.twin.models.network import TanhNetwork
-from fantwin.twin.models.stepping import step_fans
 from fantwin.twin.runs import Array
 
 ODE_LAYOUT = StateLayout(speed=1, command=1)
@@ -53,10 +52,6 @@ class FanEquation:
             learned + physics.acceleration(speed_rad_s, command, self.parameters),
             by_speed + physics.acceleration_by_speed(speed_rad_s, self.parameters),
         )
-
-    def stepped(self, initial_speed_rad_s: Array, command: Array, step_s: Array) -> tuple[Array, Array]:
-        """See integration.RightHandSide."""
-        return step_fans(self.network, self.parameters, initial_speed_rad_s, command, step_s)
 
     def linearise(
         self, speed_rad_s: Array, command: Array, by_theta: Array | None = None

@@ -10,15 +10,16 @@ import pytest
 from bench.training import published_fan
 from fantwin.pipeline.recordings.runs import read_runs
 from fantwin.schemas.tacho import Tacho
+from fantwin.schemas.twin_card import BalanceCard
 from fantwin.simulation.plant import FanParameters, advance, at_rest
 from fantwin.twin.errors import TwinError
 from fantwin.twin.evaluation.resampling import resampled
 from fantwin.twin.export.onnx_twin import OnnxTwin
-from fantwin.twin.fitting.balance import FILTER_RATE_PER_S, torque_balance
-from fantwin.twin.fitting.balance_fit import BalanceFit, fit_balance
+from fantwin.twin.fitting.balance import FILTER_RATE_PER_S
+from fantwin.twin.fitting.balance_fit import fit_balance
 from fantwin.twin.fitting.identification import Identification, identify
 from fantwin.twin.runs import Array, Run
-from tests.support.fan_data import NOISE_RAD_S
+from tests.support.fan_data import NOISE_RAD_S, torque_balance
 from tests.support.fantwin_command import fantwin
 
 PLANT = FanParameters(stribeck_rad_s=1.0)
@@ -62,14 +63,19 @@ def plants(without_noise) -> tuple[Run, Identification]:
     return run, replace(one, **many, top_speed_rad_s=np.repeat(one.top_speed_rad_s, fans))
 
 
-def std_errors(fit: BalanceFit) -> Array:
+def coefficients(fit: BalanceCard) -> Array:
+    """(fans, 4)"""
+    return np.column_stack((fit.inertia, fit.viscous, fit.drag, fit.friction))
+
+
+def std_errors(fit: BalanceCard) -> Array:
     """(fans, 4) of each coefficient by itself."""
-    return np.sqrt(np.diagonal(fit.covariance, axis1=1, axis2=2))
+    return np.sqrt(np.diagonal(np.array(fit.covariance), axis1=1, axis2=2))
 
 
-def within_run(run: Run, fit: BalanceFit) -> Array:
+def within_run(run: Run, fit: BalanceCard) -> Array:
     """(n, fans) balance of a run about its mean, without its first second."""
-    balance = torque_balance(run.command, run.speed_rad_s, run.median_period_s, fit.coefficients, fit.lag_s)
+    balance = torque_balance(run.command, run.speed_rad_s, run.median_period_s, coefficients(fit), np.array(fit.lag_s))
     settled = balance[round(1.0 / run.median_period_s) :]
     return settled - np.nanmean(settled, axis=0)
 
@@ -79,16 +85,16 @@ def test_exact_physics_are_kept(make) -> None:
     run = make(0).run
     identification = identify([run])
     fit = fit_balance([run], [], identification)
-    assert fit.sources == ("physics",)
-    np.testing.assert_array_equal(fit.coefficients[:, :3], identification.parameters[:, :3])
+    assert fit.source == ("physics",)
+    np.testing.assert_array_equal(coefficients(fit)[:, :3], identification.parameters[:, :3])
     np.testing.assert_array_equal(std_errors(fit)[:, :3], identification.standard_errors[:, :3])
-    assert abs(fit.coefficients[0, 3]) < 4.0 * std_errors(fit)[0, 3]
+    assert abs(coefficients(fit)[0, 3]) < 4.0 * std_errors(fit)[0, 3]
 
 
 def test_sigma_follows_from_the_noise_of_the_tacho(published) -> None:
     run, identification = published
     fit = fit_balance([run], [], identification)
-    assert fit.sigma_command[0] == pytest.approx(fit.coefficients[0, 0] * FILTER_RATE_PER_S * NOISE_RAD_S, rel=0.08)
+    assert fit.sigma_command[0] == pytest.approx(coefficients(fit)[0, 0] * FILTER_RATE_PER_S * NOISE_RAD_S, rel=0.08)
     assert 0.005 <= fit.autocorrelation_time_s[0] < 0.1
     assert fit.lowest_speed_rad_s[0] == pytest.approx(0.05 * np.quantile(run.speed_rad_s, 0.99))
 
@@ -96,8 +102,8 @@ def test_sigma_follows_from_the_noise_of_the_tacho(published) -> None:
 def test_with_friction_least_squares_find_it_and_the_other_coefficients(plants) -> None:
     run, identification = plants
     fit = fit_balance([run], [], identification)
-    assert fit.sources.count("least-squares") > 0.9 * run.fans
-    found = fit.coefficients.mean(axis=0)
+    assert fit.source.count("least-squares") > 0.9 * run.fans
+    found = coefficients(fit).mean(axis=0)
     np.testing.assert_allclose(found[:3], TRUTH[:3], rtol=0.03)
     assert found[3] == pytest.approx(TRUTH[3], abs=0.005), "half a per cent of the full command"
 
@@ -117,29 +123,20 @@ def test_with_a_tacho_that_counts_least_squares_have_to_explain_more_than_its_er
 ) -> None:
     run, (_, identification) = without_noise, plants
     coarse, fine = Tacho(kind="count", window_s=0.1), Tacho(kind="count", pulses=1000, window_s=0.01)
-    assert set(fit_balance([counted(run, coarse)], [], identification).sources) == {"physics"}
-    assert fit_balance([counted(run, fine)], [], identification).sources.count("least-squares") > 0.7 * run.fans
+    assert set(fit_balance([counted(run, coarse)], [], identification).source) == {"physics"}
+    assert fit_balance([counted(run, fine)], [], identification).source.count("least-squares") > 0.7 * run.fans
     wrong = replace(identification, parameters=identification.parameters * (4.0, 1.0, 1.0, 1.0))
-    assert set(fit_balance([counted(run, coarse)], [], wrong).sources) == {"least-squares"}
-
-
-def test_standard_errors_are_about_the_scatter_from_recording_to_recording(plants) -> None:
-    run, identification = plants
-    fit = fit_balance([run], [], identification)
-    chosen = np.array(fit.sources) == "least-squares"
-    scatter = fit.coefficients[chosen].std(axis=0, ddof=1)
-    ratio = np.sqrt(np.mean(std_errors(fit)[chosen] ** 2, axis=0)) / scatter
-    assert np.all((ratio > 0.6) & (ratio < 2.5)), ratio
+    assert set(fit_balance([counted(run, coarse)], [], wrong).source) == {"least-squares"}
 
 
 def test_the_command_a_fan_needs_is_known_better_than_any_one_coefficient(plants) -> None:
     run, identification = plants
     fit = fit_balance([run], [], identification)
-    chosen = np.array(fit.sources) == "least-squares"
+    chosen = np.array(fit.source) == "least-squares"
     speed_rad_s = float(np.median(run.speed_rad_s))
     terms = np.array([0.0, speed_rad_s, speed_rad_s**2, 1.0])
-    needed = fit.coefficients[chosen] @ terms
-    known = np.sqrt(np.mean(np.einsum("i,fij,j->f", terms, fit.covariance[chosen], terms)))
+    needed = coefficients(fit)[chosen] @ terms
+    known = np.sqrt(np.mean(np.einsum("i,fij,j->f", terms, np.array(fit.covariance)[chosen], terms)))
     one_by_one = np.sqrt(np.mean(np.square(std_errors(fit)[chosen] * terms).sum(axis=1)))
     assert 0.6 < known / needed.std(ddof=1) < 2.5
     assert one_by_one > 4.0 * known
@@ -149,7 +146,7 @@ def test_held_out_runs_judge_and_teach_nothing(published) -> None:
     run, identification = published
     other = published_fan.published_test(5).run
     alone, judged = fit_balance([run], [], identification), fit_balance([run], [other], identification)
-    np.testing.assert_array_equal(judged.coefficients, alone.coefficients)
+    np.testing.assert_array_equal(coefficients(judged), coefficients(alone))
     assert judged.sigma_command[0] != alone.sigma_command[0]
     assert judged.sigma_command[0] == pytest.approx(within_run(other, judged).std(), rel=0.02)
 
@@ -159,7 +156,7 @@ def test_a_fan_that_is_held_or_braked_to_a_stop_teaches_nothing_then(published) 
     speed = run.speed_rad_s.copy()
     speed[2000:2500] = 0.0
     stopped, free = (fit_balance([r], [], identification) for r in (replace(run, speed_rad_s=speed), run))
-    assert stopped.sources == free.sources
+    assert stopped.source == free.source
     np.testing.assert_allclose(stopped.sigma_command, free.sigma_command, rtol=0.05)
 
 
@@ -174,7 +171,7 @@ def test_a_few_missing_speeds_are_bridged(published) -> None:
 def test_damping_is_never_negative_where_runs_are_at_few_speeds() -> None:
     levels = [published_fan.rough_run(seed, 12.0, low=60.0).run for seed in range(5)]
     fit = fit_balance(levels, [], identify(levels))
-    assert np.all(fit.coefficients[:, :3] >= 0.0)
+    assert np.all(coefficients(fit)[:, :3] >= 0.0)
 
 
 def test_runs_too_short_are_refused_in_one_line(published) -> None:
@@ -200,7 +197,6 @@ def test_on_rosa_the_balance_is_small_in_healthy_runs_and_large_in_faults(measur
     of_card = OnnxTwin(tmp_path / "t.onnx").card.balance
     assert of_card.source == ("least-squares",)
     assert 0.1 < of_card.sigma_command[0] < 0.3
-    coefficients = np.column_stack((of_card.inertia, of_card.viscous, of_card.drag, of_card.friction))
     assert 4.0 < of_card.friction[0] < 8.0
 
     def seconds(name: str) -> tuple[Array, Array]:
@@ -208,7 +204,9 @@ def test_on_rosa_the_balance_is_small_in_healthy_runs_and_large_in_faults(measur
         (recorded,) = read_runs(imported(name)).runs
         run = Run(name, recorded.t_s, recorded.command, recorded.speed_rad_s)
         grid = resampled(run, 100.0)
-        balance = torque_balance(grid.command, grid.speed_rad_s, 0.01, coefficients, np.array(of_card.lag_s))[100:, 0]
+        balance = torque_balance(grid.command, grid.speed_rad_s, 0.01, coefficients(of_card), np.array(of_card.lag_s))[
+            100:, 0
+        ]
         return balance, balance[: len(balance) // 100 * 100].reshape(-1, 100).mean(axis=1)
 
     for name in ("healthy_105", "healthy_118"):

@@ -1,13 +1,10 @@
 """Parameters recovered, in any units, or refused."""
 
-from typing import Any
-
 import numpy as np
 import pytest
 
-from bench.training.published_fan import published_fan, rough_run
+from bench.training.published_fan import published_fan
 from fantwin.twin.errors import TwinError
-from fantwin.twin.fitting.free_run_problem import FreeRunProblem
 from fantwin.twin.fitting.identifiability import short_warnings
 from fantwin.twin.fitting.identification import Identification, identify
 from fantwin.twin.runs import Run
@@ -129,24 +126,3 @@ def test_a_slow_fan_is_to_be_recorded_for_longer() -> None:
     (line,) = short_warnings([run], np.array([0.01, 10.0]))
     assert "of the slowest fan (10 s)" in line
     assert "record 25 min or more" in line
-
-
-def test_fans_that_have_converged_are_left_out_and_all_end_as_if_they_were_not(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Leaving them out pays in large trays."""
-    tray, fitted = rough_run(11, 6.0, 5).run, []
-    normal_equations = FreeRunProblem.normal_equations
-
-    def noted(problem: FreeRunProblem, *arguments: Any) -> Any:
-        fitted.append(problem.fans)
-        return normal_equations(problem, *arguments)
-
-    monkeypatch.setattr(FreeRunProblem, "normal_equations", noted)
-    monkeypatch.setattr("fantwin.twin.fitting.free_run_problem.WIDE_BATCH", 1)
-    found, some_left = identify([tray]), min(fitted)
-    fitted.clear()
-    monkeypatch.setattr(FreeRunProblem, "pays_for_some", lambda *_: False)
-    together = identify([tray])
-    assert (some_left, min(fitted)) == (1, 5)
-    np.testing.assert_allclose(found.parameters, together.parameters, rtol=1e-9)
-    np.testing.assert_allclose(found.covariance, together.covariance, rtol=1e-6)
-    assert found.warnings == together.warnings

@@ -11,8 +11,8 @@ from fantwin.twin.build import train_twin
 from fantwin.twin.export.onnx_export import export_onnx
 from fantwin.twin.export.onnx_twin import OnnxTwin
 from fantwin.twin.models.drive import DRIVE_LAYOUT, DRIVE_PARAMETERS, Drive
+from fantwin.twin.models.fan_ode import FanOde
 from fantwin.twin.models.hybrid import Hybrid
-from fantwin.twin.models.model import OdeModel
 from fantwin.twin.models.physical import PhysicalModel
 from fantwin.twin.models.physics import PARAMETER_NAMES
 from tests.support import fan_data
@@ -60,7 +60,7 @@ def test_derivatives_by_the_settings_are_those_of_differences() -> None:
 
 
 @pytest.mark.parametrize("plain", [PhysicalModel(), Hybrid(random_network(10, ("speed", "command")))])
-def test_the_exported_graph_has_the_drive_however_a_run_is_cut(plain: OdeModel, tmp_path: Path) -> None:
+def test_the_exported_graph_has_the_drive_however_a_run_is_cut(plain: FanOde, tmp_path: Path) -> None:
     run = fan_data.published_run(1, 20.0, fans=2)
     card = train_twin([run], [], "physical", name="bench").card
     model = plain.with_drive(Drive(0.2, 0.3, 1.0))

@@ -3,10 +3,8 @@
 import numpy as np
 import pytest
 
-from fantwin.twin.models import integration
 from fantwin.twin.models.integration import free_run, free_run_sensitivities, step_through
 from fantwin.twin.models.lag import effective_command, effective_command_by_lag
-from fantwin.twin.models.network import Scaling, TanhNetwork
 from fantwin.twin.models.right_hand_side import FanEquation
 
 PARAMETERS = np.array([[0.15, 0.012, 0.0025, 0.0]])
@@ -49,26 +47,6 @@ def test_a_free_run_solved_at_once_is_the_one_stepped_through(guess: str) -> Non
     speed, final = free_run(equation, start, command, step_s, guesses[guess])
     np.testing.assert_allclose(speed, stepped, rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(final, end, rtol=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("inputs", "has_physics"),
-    [(None, True), (("speed", "command"), False), (("speed",), True)],
-)
-def test_many_fans_are_stepped_through_as_few_are(inputs: tuple[str, ...] | None, has_physics: bool) -> None:
-    rng, fans = np.random.default_rng(8), integration.WIDE_BATCH
-    parameters = PARAMETERS * rng.uniform(0.9, 1.1, (fans, 4))
-    scaling = Scaling(120.0, 130.0, 45.0, 50.0, 80.0)
-    network = None
-    if inputs is not None:
-        network = TanhNetwork(10, inputs, scaling, rng.normal(size=10 * (len(inputs) + 2) + 1))
-    equation = FanEquation(parameters if has_physics else None, network)
-    command, start = rng.uniform(0.0, 90.0, (60, fans)), rng.uniform(0.0, 150.0, fans)
-    step_s = rng.uniform(0.0, 0.03, command.shape)
-    stepped, end = step_through(equation.acceleration, start, command, step_s)
-    speed, final = free_run(equation, start, command, step_s)
-    np.testing.assert_allclose(speed, stepped, rtol=1e-11, err_msg="products of other memory layout: 1e-15 and more")
-    np.testing.assert_allclose(final, end, rtol=1e-11)
 
 
 def test_a_diverging_fan_does_not_affect_the_others() -> None:
