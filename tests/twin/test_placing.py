@@ -25,8 +25,8 @@ OWN_S, TEST_S = 20.0, 40.0
 @pytest.fixture(scope="module")
 def type_twin(tmp_path_factory: pytest.TempPathFactory, trained_once: TrainedOnce) -> Path:
     """Five rough fans, whose physics differ by up to 10 %."""
-    run = thinned(fan_data.rough_run(1, 60.0, 5), 2)
-    twin = trained_once([run], [], "hybrid", name="type", max_iterations=25)
+    run = thinned(fan_data.rough_run(1, 40.0, 5), 2)
+    twin = trained_once([run], [], "hybrid", name="type", max_iterations=10)
     return twin.save(tmp_path_factory.mktemp("type") / "type.onnx")
 
 
@@ -37,15 +37,23 @@ def others() -> tuple[Run, Run]:
     return whole.between(0.0, OWN_S), whole.between(OWN_S, OWN_S + TEST_S)
 
 
+@pytest.fixture(scope="module")
+def placed(type_twin: Path, others: tuple[Run, Run]) -> TrainedTwin:
+    return place_twin(type_twin, [others[0]], [], name="placed")
+
+
+@pytest.fixture(scope="module")
+def physical(others: tuple[Run, Run]) -> TrainedTwin:
+    return train_twin([others[0]], [], "physical", name="physical")
+
+
 def test_fans_that_were_never_trained_on_are_predicted_to_the_noise(
-    type_twin: Path, others: tuple[Run, Run], tmp_path: Path
+    type_twin: Path, others: tuple[Run, Run], placed: TrainedTwin, physical: TrainedTwin, tmp_path: Path
 ) -> None:
-    own, then = others
-    placed = place_twin(type_twin, [own], [], name="placed")
-    alone = train_twin([own], [], "physical", name="physical")
+    _, then = others
     error = evaluate(placed, [then]).pooled
     assert error.rmse_rad_s < 1.08 * fan_data.NOISE_RAD_S
-    assert evaluate(alone, [then]).pooled.rmse_rad_s > 1.3 * error.rmse_rad_s
+    assert evaluate(physical, [then]).pooled.rmse_rad_s > 1.3 * error.rmse_rad_s
     assert error.coverage_2_sigma > 0.93
     assert placed.card.training.of_type == "type"
     assert placed.card.network == OnnxTwin(type_twin).card.network
@@ -53,14 +61,15 @@ def test_fans_that_were_never_trained_on_are_predicted_to_the_noise(
     assert evaluate(stored, [then]).pooled.rmse_rad_s == pytest.approx(error.rmse_rad_s, rel=1e-9)
 
 
-def test_what_fans_did_not_show_is_typical_and_widens_the_band(type_twin: Path, others: tuple[Run, Run]) -> None:
-    own, then = others
+def test_what_fans_did_not_show_is_typical_and_widens_the_band(
+    type_twin: Path, others: tuple[Run, Run], placed: TrainedTwin
+) -> None:
     slow = published_fan.rough_run(8, OWN_S, 4, low=20.0, high=60.0).run
-    little, much = (place_twin(type_twin, [run], [], name="placed") for run in (slow, own))
-    few, many = little.identification.standard_errors, much.identification.standard_errors
+    little = place_twin(type_twin, [slow], [], name="placed")
+    few, many = little.identification.standard_errors, placed.identification.standard_errors
     assert np.all(few[:, 2] > 1.2 * many[:, 2]), "of the drag, which shows at speed"
-    assert np.all(_std_where_it_settles(little, 85.0) > 1.2 * _std_where_it_settles(much, 85.0))
-    assert evaluate(little, [then]).pooled.coverage_2_sigma > 0.9
+    assert np.all(_std_where_it_settles(little, 85.0) > 1.2 * _std_where_it_settles(placed, 85.0))
+    assert evaluate(little, [others[1]]).pooled.coverage_2_sigma > 0.9
 
 
 def _std_where_it_settles(twin: TrainedTwin, command: float) -> Array:
@@ -71,21 +80,22 @@ def _std_where_it_settles(twin: TrainedTwin, command: float) -> Array:
     return uncertainty.std_at(np.array([settled]), np.full((1, len(settled)), command))[0]
 
 
-def test_a_fan_of_another_type_is_named(type_twin: Path, others: tuple[Run, Run]) -> None:
+def test_a_fan_of_another_type_is_named(type_twin: Path, others: tuple[Run, Run], placed: TrainedTwin) -> None:
     own, _ = others
     heavy = published_fan.published_fan(2.0 * own.command[:, :1], 3, "other").run
     other = Run("mixed", own.t_s, own.command[:, :1], heavy.speed_rad_s)
     (warning,) = place_twin(type_twin, [other], [], name="placed").identification.warnings
     assert warning.startswith("fan 0: its ")
     assert "standard deviations from that of its type: it is another type of fan, or faulty" in warning
-    assert not place_twin(type_twin, [own], [], name="placed").identification.warnings
+    assert not placed.identification.warnings
 
 
-def test_what_cannot_be_placed_is_refused_in_one_line(type_twin: Path, others: tuple[Run, Run], tmp_path: Path) -> None:
+def test_what_cannot_be_placed_is_refused_in_one_line(
+    type_twin: Path, others: tuple[Run, Run], physical: TrainedTwin, tmp_path: Path
+) -> None:
     own, _ = others
-    physical = train_twin([own], [], "physical", name="physical").save(tmp_path / "physical.onnx")
     with pytest.raises(TwinError, match="a physical twin has no physics beside a network; give a hybrid"):
-        place_twin(physical, [own], [], name="x")
+        place_twin(physical.save(tmp_path / "physical.onnx"), [own], [], name="x")
     silent = Run("silent", own.t_s, own.command, np.where(np.arange(4) == 2, np.nan, own.speed_rad_s))
     with pytest.raises(TwinError, match="fan 2: fewer than 100 measured speeds"):
         place_twin(type_twin, [silent], [], name="x")

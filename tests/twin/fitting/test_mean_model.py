@@ -35,11 +35,3 @@ def test_its_acceleration_is_the_mean_of_theirs_and_its_lag_too(kind, inputs: tu
         model.equation(parameters).acceleration(speed_rad_s, command), np.mean(theirs, axis=0), rtol=1e-9, atol=1e-9
     )
     np.testing.assert_allclose(parameters[:, LAG], np.mean([own[:, LAG] for _, own in members], axis=0))
-
-
-def test_what_is_the_same_for_all_stays_so_to_the_bit() -> None:
-    (one, own), (other, _) = trained(0), trained(1)
-    np.testing.assert_array_equal(mean_model([(one, own), (other, own)])[1], own)
-    model, parameters = mean_model([(one, own)])
-    np.testing.assert_array_equal(model.theta, one.theta)
-    np.testing.assert_array_equal(parameters, own)

@@ -59,11 +59,11 @@ def two_fans(first: Run, second: Run) -> Run:
 def test_what_one_fan_has_shown_is_not_all_known_of_another() -> None:
     """A second fan like the first that had only the upper half of the commands."""
     whole, upper_half = fan_data.rough_run(5, 40.0), fan_data.rough_run(6, 40.0, low=50.0)
-    table = known(train_twin([two_fans(whole, upper_half)], [], "hybrid", name="x", max_iterations=10))
+    table = known(train_twin([two_fans(whole, upper_half)], [], "hybrid", name="x", max_iterations=3))
     command = np.full((1, 2), 25.0)
     speed_rad_s = np.array([[np.interp(25.0, table.commands, of_fan) for of_fan in table.settled_speed_rad_s]])
     shown, not_shown = table.std_at(speed_rad_s, command)[0]
-    alone = train_twin([upper_half], [], "hybrid", name="x", max_iterations=10)
+    alone = train_twin([upper_half], [], "hybrid", name="x", max_iterations=3)
     alone = known(alone).std_at(speed_rad_s[:, 1:], command[:, 1:])
     assert 5.0 * shown < not_shown < 0.7 * alone[0, 0]
 
@@ -115,12 +115,17 @@ def at_levels(table: ModelUncertainty, unit: float = 1.0) -> tuple[Array, Array]
     return table.std_at(*pairs)[:, 0], table.unseen_std_at(*pairs)[:, 0]
 
 
+def of_physics(run: Run) -> ModelUncertainty:
+    """Of the physical model of a fan that has no other."""
+    found = identify([run])
+    return model_uncertainty(PhysicalModel(), found.parameters, [run], [run], found)
+
+
 def test_what_is_held_is_known_however_long_a_fan_stands() -> None:
-    twin = train_twin([held_run(standing=4)], [], "hybrid", name="x", max_iterations=5)
-    std_rad_s, unseen_rad_s = at_levels(known(twin))
-    assert std_rad_s.max() < 0.3 * twin.card.sigma_rad_s[0]
-    assert unseen_rad_s.max() < 0.3 * twin.card.sigma_rad_s[0]
-    assert known(twin).seen_std_rad_s[0] > 0.0
+    table = of_physics(held_run(standing=4))
+    std_rad_s, unseen_rad_s = at_levels(table)
+    assert max(std_rad_s.max(), unseen_rad_s.max()) < 0.3, "of the noise, which is 1 rad/s"
+    assert table.seen_std_rad_s[0] > 0.0
 
 
 def test_what_is_held_where_a_fan_turns_no_faster_is_known() -> None:
@@ -130,10 +135,7 @@ def test_what_is_held_where_a_fan_turns_no_faster_is_known() -> None:
 
 
 def test_commands_may_be_in_any_unit() -> None:
-    of_one, of_millionths = (
-        at_levels(known(train_twin([held_run(unit=unit)], [], "hybrid", name="x", max_iterations=5)), unit)[0]
-        for unit in (1.0, 1e-6)
-    )
+    of_one, of_millionths = (at_levels(of_physics(held_run(unit=unit)), unit)[0] for unit in (1.0, 1e-6))
     np.testing.assert_allclose(of_one, of_millionths, rtol=0.05)
 
 

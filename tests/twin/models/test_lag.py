@@ -29,14 +29,6 @@ def test_each_step_acts_with_the_mean_of_the_lagged_command() -> None:
         assert after[fan] == pytest.approx(lagged, rel=1e-7)
 
 
-def test_without_lag_the_command_acts_unchanged() -> None:
-    acting, after = effective_command(COMMAND, STEP_S, np.zeros(2), BEFORE)
-    np.testing.assert_array_equal(acting, COMMAND)
-    np.testing.assert_array_equal(after, COMMAND[-1])
-    mixed, _ = effective_command(COMMAND, STEP_S, np.array([0.0, 0.08]), BEFORE)
-    np.testing.assert_array_equal(mixed[:, 0], COMMAND[:, 0])
-
-
 def test_a_step_of_zero_changes_nothing() -> None:
     acting, after = effective_command(COMMAND[:3], np.zeros((3, 2)), np.array([0.0, 0.08]), BEFORE)
     assert np.all(np.isfinite(acting))

@@ -31,7 +31,7 @@ from tests.support.browser import seen_in_browser
 from tests.support.fan_data import PUBLISHED_PARAMETERS, published_run, rough_run
 from tests.support.fantwin_command import error_of, fantwin
 
-SECTIONS = ["assessment", "figures", "alarms", "parameters", "fan-0", "meaning", "card"]
+SECTIONS = ["assessment", "figures", "alarms", "parameters", "fan-0", "fan-1", "meaning", "card"]
 TITLES = [
     "Fit and error over time",
     "Around the largest error",
@@ -94,26 +94,28 @@ class Page(HTMLParser):
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Recordings of published fans, and the twins of one and of two."""
     path = tmp_path_factory.mktemp("report")
-    record(path / "healthy.mcap", published_run(1, 30.0), unit="rpm")
-    record(path / "held-out.mcap", published_run(2, 30.0), unit="rpm")
-    record(path / "two.mcap", published_run(3, 15.0, fans=2))
-    record(path / "three.mcap", published_run(4, 5.0, fans=3))
-    common = ("--model", "physical", "--command-unit", "%")
-    for name, validate in (("healthy", ("--validate", path / "held-out.mcap")), ("two", ())):
-        made = fantwin("train", path / f"{name}.mcap", *validate, *common, "-o", path / f"{name}.onnx")
+    for name, first_seed, fans in (("one", 1, 1), ("two", 11, 2)):
+        runs = {"healthy": published_run(first_seed, 30.0, fans), "held-out": published_run(first_seed + 1, 30.0, fans)}
+        (path / name).mkdir()
+        for of, run in runs.items():
+            record(path / name / f"{of}.mcap", run, unit="rpm")
+        common = ("--model", "physical", "--command-unit", "%")
+        recordings = (path / name / "healthy.mcap", "--validate", path / name / "held-out.mcap")
+        made = fantwin("train", *recordings, *common, "-o", path / name / "twin.onnx")
         assert made.exit_code == 0, made.output
+    record(path / "three.mcap", published_run(4, 5.0, fans=3))
     return path
 
 
 @pytest.fixture(scope="module")
 def twin(folder: Path) -> OnnxTwin:
-    return OnnxTwin(folder / "healthy.onnx")
+    return OnnxTwin(folder / "one" / "twin.onnx")
 
 
 @pytest.fixture(scope="module")
 def reported(folder: Path) -> dict[str, Any]:
     """What the command says of the page that it wrote."""
-    words = (folder / "healthy.onnx", folder / "held-out.mcap", "-o", folder / "page.html", "--json")
+    words = (folder / "two" / "twin.onnx", folder / "two" / "held-out.mcap", "-o", folder / "page.html", "--json")
     result = fantwin("report", *words)
     assert result.exit_code == 0, result.output
     return json.loads(result.stdout)
@@ -127,16 +129,28 @@ def page(folder: Path, reported: dict[str, Any]) -> str:
 
 @pytest.fixture(scope="module")
 def evaluated(folder: Path) -> dict[str, Any]:
-    return json.loads(fantwin("evaluate", folder / "healthy.onnx", folder / "held-out.mcap", "--json").stdout)
+    of = folder / "two"
+    return json.loads(fantwin("evaluate", of / "twin.onnx", of / "held-out.mcap", "--json").stdout)
 
 
 @pytest.fixture(scope="module")
 def hybrid(folder: Path) -> OnnxTwin:
     """A twin whose card says what it knows: it uses its network."""
     record(folder / "rough.mcap", rough_run(1, 30.0))
-    made = fantwin("train", folder / "rough.mcap", "--iterations", 10, "-o", folder / "hybrid.onnx")
+    words = ("--iterations", 5, "--networks", 1)
+    made = fantwin("train", folder / "rough.mcap", *words, "-o", folder / "hybrid.onnx")
     assert made.exit_code == 0, made.output
     return OnnxTwin(folder / "hybrid.onnx")
+
+
+@pytest.fixture(scope="module")
+def content_of_hybrid(hybrid: OnnxTwin) -> Content:
+    return content_of(hybrid, rough_run(2, 30.0))
+
+
+@pytest.fixture(scope="module")
+def page_of_hybrid(content_of_hybrid: Content) -> str:
+    return report_page(content_of_hybrid)
 
 
 @pytest.fixture
@@ -158,8 +172,8 @@ def test_the_page_holds_every_section_and_every_figure(page):
     parsed = Page(page)
     assert parsed.sections == SECTIONS
     assert [title for title in TITLES if title in parsed.text] == TITLES
-    assert page.count("<svg ") == len(TITLES) + 1  # time is drawn twice: for wide screens and for phones
-    for expected in ("physical twin of 1 fan", "held-out data", "95%", "sha256"):
+    assert page.count("<svg ") == 2 * (len(TITLES) + 1)  # time is drawn twice: for wide screens and for phones
+    for expected in ("physical twin of 2 fans", "held-out data", "95%", "sha256"):
         assert expected in parsed.text
 
 
@@ -170,14 +184,11 @@ def test_the_page_needs_nothing_but_itself(page):
     assert not re.search(r"url\((?!#)|@import", page)
 
 
-def test_ids_are_unique_and_every_reference_has_its_target(folder):
-    fantwin("report", folder / "two.onnx", folder / "two.mcap", "-o", folder / "two.html")
-    text = (folder / "two.html").read_text(encoding="utf-8")
-    parsed = Page(text)
+def test_ids_are_unique_and_every_reference_has_its_target(page):
+    parsed = Page(page)
     assert len(parsed.ids) == len(set(parsed.ids))
-    targets = {reference[1:] for reference in parsed.references} | set(re.findall(r"url\(#([^)]*)\)", text))
+    targets = {reference[1:] for reference in parsed.references} | set(re.findall(r"url\(#([^)]*)\)", page))
     assert targets <= set(parsed.ids)
-    assert parsed.sections == ["assessment", "figures", "alarms", "parameters", "fan-0", "fan-1", "meaning", "card"]
     assert set(parsed.numbers) > {"pooled", "row-0", "row-1"}
 
 
@@ -187,7 +198,7 @@ def test_json_and_page_hold_the_figures_of_evaluate(reported, page, evaluated):
         assert reported[figure] == evaluated[figure]
         assert reported["fans"][0][figure] == evaluated["fans"][0][figure]
     assert (reported["assessment"], reported["fans"][0]["fan"]) == ("as declared", 0)
-    assert Page(page).numbers["row-0"][0] == pytest.approx(evaluated["rmse"], rel=1e-12)
+    assert Page(page).numbers["row-0"][0] == pytest.approx(evaluated["fans"][0]["rmse"], rel=1e-12)
 
 
 def test_a_healthy_fan_is_followed_as_declared_and_without_a_warning(twin):
@@ -329,8 +340,8 @@ def test_recordings_summed_one_by_one_give_the_figures_of_all_their_samples(twin
 
 
 def test_invalid_input_is_a_one_line_error(folder, tmp_path):
-    twin, held_out = folder / "healthy.onnx", folder / "held-out.mcap"
-    assert "has fans 0, 1, the runs have 0, 1, 2" in error_of("report", folder / "two.onnx", folder / "three.mcap")
+    twin, held_out = folder / "two" / "twin.onnx", folder / "two" / "held-out.mcap"
+    assert "has fans 0, 1, the runs have 0, 1, 2" in error_of("report", twin, folder / "three.mcap")
     assert "no such file" in error_of("report", tmp_path / "nowhere.onnx", held_out)
     (tmp_path / "text.onnx").write_text("text")
     assert "not an ONNX file" in error_of("report", tmp_path / "text.onnx", held_out)
@@ -342,9 +353,9 @@ def test_invalid_input_is_a_one_line_error(folder, tmp_path):
     assert "cannot be written" in error_of("report", twin, held_out, "-o", tmp_path / "folder.html")
 
 
-@pytest.mark.parametrize("width_px", [390])
-def test_in_a_browser_nothing_overflows_is_fetched_or_too_small_to_read(hybrid, tmp_path, width_px):
-    seen = seen_in_browser(report_page(content_of(hybrid, rough_run(2, 30.0))), width_px, tmp_path)
+def test_in_a_browser_nothing_overflows_is_fetched_or_too_small_to_read(page_of_hybrid, tmp_path):
+    width_px = 390
+    seen = seen_in_browser(page_of_hybrid, width_px, tmp_path)
     assert seen["needs"] <= seen["width"] <= width_px
     assert seen["fetched"] == []
     assert seen["background"] == "rgb(255, 255, 255)"
@@ -362,13 +373,12 @@ def test_in_a_browser_nothing_overflows_is_fetched_or_too_small_to_read(hybrid, 
         assert left + width <= seen["width"]
 
 
-def test_what_the_twin_knows_is_drawn_where_its_card_says_it(twin, hybrid, monkeypatch):
-    assert content_of(twin, published_run(2, 10.0)).card.model_uncertainty is None
-    content = content_of(hybrid, rough_run(2, 10.0))
+def test_what_the_twin_knows_is_drawn_where_its_card_says_it(twin, content_of_hybrid, page_of_hybrid):
+    assert twin.card.model_uncertainty is None
+    content, page = content_of_hybrid, page_of_hybrid
     known = content.card.model_uncertainty
     assert known is not None
     assert figures.OUTSIDE in figures.what_is_known(content, content.fans[0], known)
-    page = report_page(content)
     assert [title for title in TITLES_OF_HYBRID if title in page] == TITLES_OF_HYBRID
     assert page.count("<svg ") == len(TITLES_OF_HYBRID) + 1
     assert "What to record next: " in page or "more such data hardly reduce its error" in page
