@@ -62,7 +62,7 @@ def test_a_network_comes_from_windows_and_the_physics_of_each_fan_from_all_its_r
     def trained() -> tuple[TrainedTwin, list[int], set[str]]:
         parts: set[str] = set()
         fits_of_networks.clear()
-        twin = train_twin([run], [], "hybrid", name="x", max_iterations=6, progress=lambda part, *_: parts.add(part))
+        twin = train_twin([run], [], "hybrid", name="x", max_iterations=10, progress=lambda part, *_: parts.add(part))
         return twin, [int(data.compared.sum()) for data in fits_of_networks], parts
 
     def error_and_uncertainty(twin: TrainedTwin) -> tuple[float, float]:
