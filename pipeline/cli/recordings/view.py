@@ -1,4 +1,4 @@
-"""`fantwin view`: a recording as a view file for Rerun or as a plot."""
+"""`fantwin view`: a recording as a view file for Rerun or as a plot; a view file as a picture."""
 
 from __future__ import annotations
 
@@ -24,7 +24,9 @@ PLOTS = (".png", ".svg", ".pdf")
 
 
 def view(
-    files: Annotated[list[Path], typer.Argument(metavar="REC.mcap...", help="A recording, or its parts.")],
+    files: Annotated[
+        list[Path], typer.Argument(metavar="REC.mcap...", help="A recording, or its parts; or a view file (.rrd).")
+    ],
     output: Annotated[
         Path,
         typer.Option("-o", "--output", help="What to write: a view file .rrd for Rerun, or a plot .png, .svg or .pdf."),
@@ -46,7 +48,8 @@ def view(
 ) -> None:
     """Turn a recording into a view file for Rerun, or plot its speeds, predictions, bands, alarms and states.
 
-    Topics that the recorder left out (recorder.topics) are made again first.
+    Topics that the recorder left out (recorder.topics) are made again first. A view file becomes a picture .png with a
+    headless Rerun viewer, which needs a Vulkan driver.
 
     Exits with 3 if the recording could not be read in full, or if making the topics again shows that data were lost.
     The rest is shown then.
@@ -60,6 +63,9 @@ def view(
         raise UsageError(f"--unit {unit}: no such unit of speed; known: rpm, rad/s")
     if output.suffix not in (".rrd", *PLOTS):
         raise UsageError(f"{output}: name a file that ends in .rrd, {', '.join(PLOTS)} with -o")
+    if files[0].suffix == ".rrd":
+        _draw(files, output, json_output=json_output)
+        return
     require("a plot", "report", "matplotlib") if is_plot else require("a view", "view")
     if output.exists() and not is_plot and not force:
         raise UserError(f"{output}: exists; name another file with -o, or use --force")
@@ -85,6 +91,23 @@ def view(
         typer.echo(line, err=True)
     if damage:
         raise typer.Exit(3)
+
+
+def _draw(files: Sequence[Path], output: Path, *, json_output: bool) -> None:
+    """Draw a view file as a PNG, and say what the viewer reported."""
+    if output.suffix != ".png" or len(files) > 1:
+        raise UsageError(f"{files[0]}: a view file becomes a picture: name one, and -o NAME.png")
+    require("a picture of a view", "view")
+    from fantwin.pipeline.outputs.rerun.rerun_picture import draw_picture  # noqa: PLC0415  an extra
+
+    with working(f"drawing {output}"):
+        drawn = draw_picture(files[0])
+    output.write_bytes(drawn.png)
+    shown = f"{output}: {', '.join(sorted(drawn.reports))}"
+    show({"picture": str(output), "views": drawn.reports}, shown, json_output=json_output)
+    for name, reports in drawn.reports.items():
+        for report in reports:
+            typer.echo(f"{name}: {report}", err=True)
 
 
 @dataclass
