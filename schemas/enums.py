@@ -13,7 +13,6 @@ class InvalidReason(OpenEnum):
     GAP = 2
     WARMING_UP = 3
     OUT_OF_RANGE = 4
-    SATURATED = 5
     NO_SPEED = 6
     NO_TWIN = 7
     CLOCK_RESTARTED = 8

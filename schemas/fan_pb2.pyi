@@ -14,7 +14,6 @@ class InvalidReason(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     INVALID_REASON_GAP: _ClassVar[InvalidReason]
     INVALID_REASON_WARMING_UP: _ClassVar[InvalidReason]
     INVALID_REASON_OUT_OF_RANGE: _ClassVar[InvalidReason]
-    INVALID_REASON_SATURATED: _ClassVar[InvalidReason]
     INVALID_REASON_NO_SPEED: _ClassVar[InvalidReason]
     INVALID_REASON_NO_TWIN: _ClassVar[InvalidReason]
     INVALID_REASON_CLOCK_RESTARTED: _ClassVar[InvalidReason]
@@ -110,7 +109,6 @@ INVALID_REASON_STALE: InvalidReason
 INVALID_REASON_GAP: InvalidReason
 INVALID_REASON_WARMING_UP: InvalidReason
 INVALID_REASON_OUT_OF_RANGE: InvalidReason
-INVALID_REASON_SATURATED: InvalidReason
 INVALID_REASON_NO_SPEED: InvalidReason
 INVALID_REASON_NO_TWIN: InvalidReason
 INVALID_REASON_CLOCK_RESTARTED: InvalidReason

@@ -25,8 +25,8 @@ from fantwin.pipeline.site.fan_history import curves_of
 from fantwin.pipeline.site.fleet import Fan
 from fantwin.pipeline.site.other_stages import VIEWER, configured, recordings_of, viewer_urls
 from fantwin.pipeline.site.request_desk import RequestDesk
-from fantwin.pipeline.site.shown import alarm_json, curves_json, fleet_json, stages_json
 from fantwin.pipeline.site.site_core import SiteCore
+from fantwin.pipeline.site.site_json import alarm_json, curves_json, fleet_json, stages_json
 from fantwin.pipeline.site.site_model import SiteModel
 from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.messages import Alarm, Message

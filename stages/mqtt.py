@@ -25,8 +25,8 @@ from fantwin.pipeline.runtime.stage import BuiltStage, Context, Stage, StageErro
 from fantwin.pipeline.site.alarm_history import FILE, AlarmHistory
 from fantwin.pipeline.site.fleet import Fan
 from fantwin.pipeline.site.request_desk import RequestDesk
-from fantwin.pipeline.site.shown import stages_json, transition_json
 from fantwin.pipeline.site.site_core import SiteCore
+from fantwin.pipeline.site.site_json import stages_json, transition_json
 from fantwin.pipeline.site.site_model import SiteModel
 from fantwin.pipeline.sources.mqtt.client import connection_problems, new_client
 from fantwin.pipeline.sources.mqtt.config import FAN

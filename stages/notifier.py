@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 from fantwin.pipeline.config.models import TrayConfig
 from fantwin.pipeline.outputs.notify.alertmanager import AlertSender
 from fantwin.pipeline.outputs.notify.config import NotifierConfig
-from fantwin.pipeline.outputs.notify.notifications import Changes, Notifications
+from fantwin.pipeline.outputs.notify.notification_flow import Changes, Notifications
 from fantwin.pipeline.outputs.notify.outbox import Outbox
 from fantwin.pipeline.outputs.notify.sending import Sender
 from fantwin.pipeline.outputs.notify.targets import problems_of, sender_of

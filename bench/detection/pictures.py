@@ -33,7 +33,7 @@ from fantwin.schemas.enums import Transition
 from fantwin.schemas.messages import Array, Grid
 from fantwin.schemas.units import NS_PER_S, RAD_S_PER_UNIT
 from fantwin.scoring.alarms.alarm_text import AlarmText
-from fantwin.scoring.diagnosis.shown_causes import MIN_PROBABILITY, short_name
+from fantwin.scoring.diagnosis.causes import MIN_PROBABILITY, short_name
 from fantwin.scoring.model.healthy import FAULT as FAULT_STATE
 from fantwin.simulation.faults import Fault
 from fantwin.simulation.tray import SimulatedTray, TraySettings

@@ -21,7 +21,7 @@ from fantwin.client import errors
 from fantwin.client.losses import WITHOUT_SPEED, CountsOfAcquisition, Losses
 from fantwin.client.outbox import Block, Outbox
 from fantwin.client.times import Time, times_ns
-from fantwin.pipeline.acquisition.tray_acquisition import TrayAcquisition
+from fantwin.pipeline.acquisition.acquisition_watch import TrayAcquisition
 from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.sources.source import limits_of_float32
 from fantwin.schemas.channels import BY_NAME as CHANNELS_BY_NAME

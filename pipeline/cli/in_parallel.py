@@ -275,7 +275,7 @@ def _versions() -> str:
 
 
 class NetworksInParallel:
-    """A twin.networks.ForEachNetwork with processes. A context manager: its end is theirs."""
+    """A twin.each_network.ForEachNetwork with processes. A context manager: its end is theirs."""
 
     def __init__(self, jobs: int | None = None) -> None:
         """jobs: networks at a time; None: one for each core."""
@@ -292,12 +292,12 @@ class NetworksInParallel:
     def __call__(
         self, work: Callable[[Item, Progress], Result], items: Sequence[Item], doing: str, progress: Progress
     ) -> list[Result]:
-        """See twin.networks.ForEachNetwork.
+        """See twin.each_network.ForEachNetwork.
 
         Raises:
             UserError: a process was ended from outside.
         """
-        from fantwin.twin.networks import one_after_another  # noqa: PLC0415  loaded only when it is needed
+        from fantwin.twin.each_network import one_after_another  # noqa: PLC0415  loaded only when it is needed
 
         jobs = min(self._jobs, len(items))
         if jobs == 1:

@@ -1,4 +1,4 @@
-"""Receives what a child process reports by systemd's protocol; see `pipeline.runtime.notifier`."""
+"""Receives what a child process reports by systemd's protocol; see `pipeline.runtime.service_manager`."""
 
 from __future__ import annotations
 

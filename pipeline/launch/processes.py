@@ -14,7 +14,7 @@ from pathlib import Path
 
 from fantwin.pipeline.config.shards import StageProcess
 from fantwin.pipeline.launch.notices import Notices
-from fantwin.pipeline.runtime.notifier import VARIABLE as NOTIFY_VARIABLE
+from fantwin.pipeline.runtime.service_manager import VARIABLE as NOTIFY_VARIABLE
 from fantwin.pipeline.timebase.host_clock import VARIABLE as CLOCK_VARIABLE
 
 EXIT_CANNOT_START = 78  # the stage cannot run as configured; one line on stderr says why (EX_CONFIG of sysexits.h)

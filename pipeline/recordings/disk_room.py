@@ -1,4 +1,4 @@
-"""The limits on the disk space of recordings and clips, and the deletions that keep them.
+"""The limits on a part and on the disk space of recordings and clips, and the deletions that keep them.
 
 The oldest recordings are deleted when they are older than `keep_days`, when all recordings and clips of the folder
 exceed `keep_share_of_disk`, or when the disk is nearly full. A clip is deleted with the parts of its time, once its

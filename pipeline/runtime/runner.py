@@ -27,12 +27,12 @@ from fantwin.pipeline.runtime.ending import Ending, Step
 from fantwin.pipeline.runtime.health import HealthBuilder
 from fantwin.pipeline.runtime.inbox import INBOX_SIZE, FromBus, FromSource, Inbox, Item, Liveness
 from fantwin.pipeline.runtime.kept_snapshots import KeptForOthers
-from fantwin.pipeline.runtime.notifier import Notifier
 from fantwin.pipeline.runtime.outputs import Outputs
 from fantwin.pipeline.runtime.receiving import Receiver
+from fantwin.pipeline.runtime.service_manager import Notifier
 from fantwin.pipeline.runtime.sessions import Session, Sessions, trays_in_words
-from fantwin.pipeline.runtime.sources import Sources
 from fantwin.pipeline.runtime.stage import BuiltStage, Core, Stage, StageError
+from fantwin.pipeline.runtime.started_sources import Sources
 from fantwin.pipeline.runtime.steps import Steps
 from fantwin.pipeline.timebase.host_clock import HOST_CLOCK
 from fantwin.pipeline.timebase.stage_clock import StageClock

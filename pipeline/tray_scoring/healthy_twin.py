@@ -15,8 +15,8 @@ from fantwin.schemas.standstill import Standstill
 from fantwin.schemas.tacho import Tacho
 from fantwin.schemas.units import S_PER_DAY
 from fantwin.scoring.calibration.calibration import Calibration
-from fantwin.scoring.diagnosis.advice import Advice
 from fantwin.scoring.diagnosis.steady_fan import SteadyFan
+from fantwin.scoring.diagnosis.what_would_tell import Advice
 from fantwin.scoring.model.operation import Fans
 from fantwin.scoring.model.priors import Priors
 from fantwin.scoring.unseen_error import UnseenError

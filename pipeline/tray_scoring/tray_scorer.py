@@ -22,10 +22,10 @@ from fantwin.scoring.alarms.alarm_manager import AlarmManager, Measured
 from fantwin.scoring.alarms.alarm_text import AlarmText
 from fantwin.scoring.alarms.fan_condition import ConditionSettings
 from fantwin.scoring.alarms.tray_conditions import Decided
-from fantwin.scoring.diagnosis.advice import KNOWN_SOON, SeenSinceOnset
-from fantwin.scoring.diagnosis.cause_words import CauseWords, PossibleCause
-from fantwin.scoring.diagnosis.shown_causes import CANNOT_TELL, CAUSES, SENSOR_DROPOUT, SLOW_CHANGE, is_of_standstill
+from fantwin.scoring.diagnosis.causes import CANNOT_TELL, CAUSES, SENSOR_DROPOUT, SLOW_CHANGE, is_of_standstill
+from fantwin.scoring.diagnosis.ranked_causes import CauseWords, PossibleCause
 from fantwin.scoring.diagnosis.standstill_causes import Standing, standstill_causes
+from fantwin.scoring.diagnosis.what_would_tell import KNOWN_SOON, SeenSinceOnset
 from fantwin.scoring.model.bins import Bin, Bins, bin_ns_of
 from fantwin.scoring.model.decision import Decision
 from fantwin.scoring.model.saved import as_json, from_json, part, within

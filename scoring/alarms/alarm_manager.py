@@ -16,8 +16,8 @@ from fantwin.scoring.alarms.alarm_flags import is_listed
 from fantwin.scoring.alarms.alarm_text import AlarmText
 from fantwin.scoring.alarms.fan_condition import AlarmState, ConditionSettings
 from fantwin.scoring.alarms.tray_conditions import Decided, TrayConditions
-from fantwin.scoring.diagnosis.cause_words import says_more
-from fantwin.scoring.diagnosis.shown_causes import is_of_standstill
+from fantwin.scoring.diagnosis.causes import is_of_standstill
+from fantwin.scoring.diagnosis.ranked_causes import says_more
 
 AGAIN_AFTER_S = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512)
 """times after an alarm was raised at which its causes are looked at again"""

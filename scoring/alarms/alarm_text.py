@@ -10,7 +10,7 @@ from fantwin.schemas.enums import Severity, Statistic, Transition
 from fantwin.schemas.messages import Alarm
 from fantwin.schemas.units import SpeedUnit
 from fantwin.scoring.alarms.alarm_units import AlarmUnits
-from fantwin.scoring.diagnosis.shown_causes import CANNOT_TELL, CAUSES, STANDSTILL_CAUSES
+from fantwin.scoring.diagnosis.causes import CANNOT_TELL, CAUSES, STANDSTILL_CAUSES
 
 TRANSITIONS = {
     Transition.CLEARED: "back to normal",
@@ -53,7 +53,8 @@ class AlarmText:
             others = (
                 f"; {alike} other fans of the tray have the same: see what they share (supply, air)" if alike else ""
             )
-            what = f"{self._deviation(alarm)}{self._cause_if_known(alarm)}"
+            known = alarm.causes and alarm.causes[0].cause != CANNOT_TELL
+            what = self._deviation(alarm) + (f"; {self._cause(alarm)}" if known else "")
             if _is_against_command(alarm):  # by how much it was slower while it fell is no news
                 what = self._cause(alarm)
             return f"{fan}: {what}{others}"
@@ -71,10 +72,6 @@ class AlarmText:
         deviation = self.units.deviation(alarm)
         return f"slowly, {deviation}" if alarm.statistic == Statistic.WEAR else deviation
 
-    def _cause_if_known(self, alarm: Alarm) -> str:
-        known = alarm.causes and alarm.causes[0].cause != CANNOT_TELL
-        return f"; {self._cause(alarm)}" if known else ""
-
     def _cause(self, alarm: Alarm) -> str:
         if not alarm.causes:
             return "cause unknown"
@@ -87,6 +84,11 @@ class AlarmText:
             return first.evidence or name  # the evidence begins with the name
         evidence = f": {first.evidence}" if first.evidence else ""
         return f"{name}, {100 * first.probability:.0f} %{evidence}"
+
+
+def deviation_in(message: str, fan: int) -> str:
+    """The part of the line of a raised alarm that says how far the fan is off, without its name and cause."""
+    return message.removeprefix(f"fan {fan}: ").partition("; ")[0]
 
 
 def _after_restart(alarm: Alarm) -> str:

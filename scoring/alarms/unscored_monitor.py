@@ -17,7 +17,6 @@ REASONS = {
     InvalidReason.GAP: "samples are missing",
     InvalidReason.WARMING_UP: "the twin is warming up",
     InvalidReason.OUT_OF_RANGE: "the command is outside the twin's range, or a value is not a number",
-    InvalidReason.SATURATED: "saturated",
     InvalidReason.NO_SPEED: "no speed",
     InvalidReason.NO_TWIN: "there is no twin yet, or it does not fit the grid's rate",
     InvalidReason.CLOCK_RESTARTED: "the clock of the device restarted",

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from enum import Enum
 
 from fantwin.schemas.messages import Diagnosis
-from fantwin.scoring.diagnosis.shown_causes import (
+from fantwin.scoring.diagnosis.causes import (
     BLOCKED,
     MIN_PROBABILITY,
     NO_POWER,

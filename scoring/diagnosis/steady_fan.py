@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from fantwin.scoring.diagnosis.shown_causes import Size
+from fantwin.scoring.diagnosis.causes import Size
 
 OF_BALANCE = (Size.DRAG, Size.FRICTION, Size.TORQUE, Size.GAIN)
 LEAST_SPEED = 0.05

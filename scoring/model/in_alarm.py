@@ -17,7 +17,7 @@ import numpy as np
 from scipy.special import expit
 
 from fantwin.schemas.messages import Array
-from fantwin.scoring.diagnosis.cause_words import PossibleCause
+from fantwin.scoring.diagnosis.ranked_causes import PossibleCause
 from fantwin.scoring.model.faults import BEFORE_GROWTH, GROWS_S, UNSTEADY, forces
 from fantwin.scoring.model.healthy import HealthyFans
 from fantwin.scoring.model.onsets import Evidence, Hypotheses, Sums

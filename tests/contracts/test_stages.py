@@ -25,7 +25,7 @@ from fantwin.pipeline.outputs.mqtt.link import Received
 from fantwin.pipeline.outputs.mqtt.outbox import Outgoing
 from fantwin.pipeline.outputs.mqtt.topics import Topics
 from fantwin.pipeline.outputs.notify.config import NotifierConfig
-from fantwin.pipeline.outputs.notify.notifications import Notifications, Saved
+from fantwin.pipeline.outputs.notify.notification_flow import Notifications, Saved
 from fantwin.pipeline.outputs.notify.outbox import Outbox
 from fantwin.pipeline.outputs.notify.wording import Place
 from fantwin.pipeline.outputs.rerun.fleet_view import FleetView

@@ -20,7 +20,7 @@ from fantwin.pipeline.outputs.web.config import GatewayConfig
 from fantwin.pipeline.recordings.clips.clip import Clip, ClipAlarm, clips_as_text
 from fantwin.pipeline.recordings.rare_messages import rare_messages
 from fantwin.pipeline.site.fleet import Fan
-from fantwin.pipeline.site.shown import alarms_json, curves_json, fan_in_full, fan_json, rates_json, site_json
+from fantwin.pipeline.site.site_json import alarms_json, curves_json, fan_in_full, fan_json, rates_json, site_json
 from fantwin.schemas.enums import Action, FanState, Feedback, InvalidReason, Severity, Transition
 from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Alarm, Diagnosis, ModelCard, Request, Score, ScorerSnapshot

@@ -6,6 +6,7 @@ from typing import Literal
 
 import numpy as np
 
+from fantwin.twin.each_network import ForEachNetwork, one_after_another
 from fantwin.twin.evaluation.accuracy import evaluation_pieces
 from fantwin.twin.fitting.cross_validation import choose_prior_std
 from fantwin.twin.fitting.drive_fit import FoundDrive
@@ -17,7 +18,6 @@ from fantwin.twin.models.fan_ode import FanOde, NetworkOde
 from fantwin.twin.models.model import Model
 from fantwin.twin.models.network import TanhNetwork
 from fantwin.twin.models.physical import PhysicalModel
-from fantwin.twin.networks import ForEachNetwork, one_after_another
 from fantwin.twin.progress import Progress, unreported
 from fantwin.twin.runs import Array, Run
 

@@ -26,6 +26,7 @@ from typing import Literal
 
 import numpy as np
 
+from fantwin.twin.each_network import ForEachNetwork, one_after_another
 from fantwin.twin.evaluation.accuracy import evaluation_pieces
 from fantwin.twin.fitting.free_run_fit import FreeRunFit, fit_free_run
 from fantwin.twin.fitting.free_run_problem import NONE_FREE, FreeRunProblem, NetworkPrior, Point, Prior, Unknowns
@@ -40,7 +41,6 @@ from fantwin.twin.models.integration import WIDE_BATCH
 from fantwin.twin.models.network import Scaling
 from fantwin.twin.models.physical import PhysicalModel, fitted_unknowns, physical_parameters
 from fantwin.twin.models.physics import LAG, PARAMETER_NAMES
-from fantwin.twin.networks import ForEachNetwork, one_after_another
 from fantwin.twin.progress import Progress, unreported
 from fantwin.twin.runs import Array, Run
 

@@ -37,7 +37,8 @@ from fantwin.pipeline.replay.offline.rescoring import RescoredTray, rescore
 from fantwin.pipeline.replay.offline.tolerance import RELATIVE
 from fantwin.schemas.messages import Diagnosis
 from fantwin.schemas.units import NS_PER_S
-from fantwin.scoring.diagnosis.shown_causes import most_probable
+from fantwin.scoring.alarms.alarm_text import deviation_in
+from fantwin.scoring.diagnosis.causes import most_probable
 
 EXIT_DIFFERS, EXIT_CANNOT_COMPARE, EXIT_LOST = 1, 2, 3
 _SHOWN = 40
@@ -233,7 +234,7 @@ def _table(title: str, alarms: Sequence[dict[str, Any]], start_ns: int) -> Table
         cleared = "active" if one["cleared_ns"] is None else f"{(one['cleared_ns'] - start_ns) / NS_PER_S:.2f}"
         first = "\n".join(most_probable([Diagnosis(**each) for each in one["causes"]])) or "-"
         # the message also names fan and first cause; both have columns of their own, with the newest cause
-        what = one["message"].removeprefix(f"fan {one['fan']}: ").partition("; ")[0]
+        what = deviation_in(one["message"], one["fan"])
         table.add_row(one["tray"], str(one["fan"]), raised, cleared, one["severity"], first, escape(what))
     return table
 

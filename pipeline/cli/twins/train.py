@@ -42,8 +42,8 @@ from fantwin.pipeline.extras import require_torch
 if TYPE_CHECKING:
     from fantwin.schemas.reference_conditions import ReferenceConditions
     from fantwin.twin.comparison import Candidate
+    from fantwin.twin.each_network import ForEachNetwork
     from fantwin.twin.finishing import TrainedTwin
-    from fantwin.twin.networks import ForEachNetwork
     from fantwin.twin.progress import Progress
 
 
@@ -249,8 +249,8 @@ def fit_twin(
         TwinError: the data do not suffice.
     """
     from fantwin.twin.build import train_twin  # noqa: PLC0415  the command line loads twin only when it is needed
+    from fantwin.twin.each_network import one_after_another  # noqa: PLC0415
     from fantwin.twin.kinds import BOTH_INPUTS, find_kind  # noqa: PLC0415
-    from fantwin.twin.networks import one_after_another  # noqa: PLC0415
     from fantwin.twin.progress import unreported  # noqa: PLC0415
 
     can_average = find_kind(settings.model).averages_networks and settings.trainer == DEFAULT_SETTINGS.trainer

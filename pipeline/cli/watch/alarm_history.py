@@ -28,7 +28,7 @@ from fantwin.schemas.enums import Feedback
 from fantwin.schemas.messages import Alarm, ModelCard, Score
 from fantwin.schemas.units import NS_PER_S
 from fantwin.scoring.calibration.observed_rate import ObservedRate, declared_per_day, together
-from fantwin.scoring.diagnosis.shown_causes import with_share
+from fantwin.scoring.diagnosis.causes import with_share
 
 NS_PER_HOUR = 3600 * NS_PER_S
 _STYLES = {"warning": "yellow", "alarm": "bold red"}

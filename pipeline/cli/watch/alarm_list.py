@@ -27,7 +27,7 @@ from fantwin.schemas.messages import Alarm, Diagnosis
 from fantwin.schemas.units import NS_PER_S
 from fantwin.scoring.alarms.alarm_flags import is_listed, is_presented
 from fantwin.scoring.alarms.current_alarms import CurrentAlarm, clock, current_alarm
-from fantwin.scoring.diagnosis.shown_causes import CANNOT_TELL, CAUSES, MIN_PROBABILITY, with_share
+from fantwin.scoring.diagnosis.causes import CANNOT_TELL, CAUSES, MIN_PROBABILITY, with_share
 from fantwin.scoring.wear.slow_change import is_of_slow_change
 
 _SCORES_S = 3.0  # a score of every tray arrives in this time

@@ -11,8 +11,8 @@ from typing import TypeVar
 
 import numpy as np
 
+from fantwin.pipeline.acquisition.acquisition_watch import TrayAcquisition
 from fantwin.pipeline.acquisition.device_commands import not_sent, reason_in
-from fantwin.pipeline.acquisition.tray_acquisition import TrayAcquisition
 from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.config.models import Config, TrayConfig
 from fantwin.pipeline.errors import UsageError, UserError

@@ -40,7 +40,7 @@ from fantwin.pipeline.site.site_model import SiteModel
 from fantwin.pipeline.site.site_watcher import SiteWatcher
 from fantwin.schemas.enums import FanState
 from fantwin.schemas.units import NS_PER_S, RAD_S_PER_UNIT
-from fantwin.scoring.diagnosis.shown_causes import short_name
+from fantwin.scoring.diagnosis.causes import short_name
 
 DEMO_FOLDER = Path(__file__).parents[2] / "demo"
 SEED = 7

@@ -17,8 +17,8 @@ from fantwin.pipeline.config.shards import Shard
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.launch.processes import EXIT_CANNOT_START
 from fantwin.pipeline.runtime.figures import without_figures
-from fantwin.pipeline.runtime.notifier import starting
 from fantwin.pipeline.runtime.runner import Runner
+from fantwin.pipeline.runtime.service_manager import starting
 from fantwin.pipeline.runtime.signals import set_when_stdin_closes
 from fantwin.pipeline.runtime.stage import load_stage
 from fantwin.schemas.health import Health

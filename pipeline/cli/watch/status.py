@@ -36,7 +36,7 @@ from fantwin.schemas.topics import ALL_TRAYS
 from fantwin.schemas.units import NS_PER_S
 from fantwin.scoring.alarms.alarm_flags import is_listed, is_presented
 from fantwin.scoring.alarms.current_alarms import CurrentAlarm, clock
-from fantwin.scoring.diagnosis.shown_causes import most_probable
+from fantwin.scoring.diagnosis.causes import most_probable
 
 _STYLES = {Severity.NONE: "", Severity.WARNING: "yellow", Severity.ALARM: "bold red"}
 _LISTEN_S = 2.5  # two health messages of every stage, which give rates

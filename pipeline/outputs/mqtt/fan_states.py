@@ -7,7 +7,7 @@ from typing import Any
 
 from fantwin.pipeline.recordings.dates import format_utc
 from fantwin.pipeline.site.fleet import Fan, FanNow
-from fantwin.pipeline.site.shown import alarm_json
+from fantwin.pipeline.site.site_json import alarm_json
 from fantwin.pipeline.site.site_model import SiteModel, TrayNow
 from fantwin.schemas.units import RAD_S_PER_UNIT
 from fantwin.scoring.alarms.alarm_flags import is_listed

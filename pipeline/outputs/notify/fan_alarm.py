@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from fantwin.schemas.enums import Severity
 from fantwin.schemas.messages import Diagnosis
 from fantwin.scoring.alarms.alarm_flags import is_presented, is_silenced
+from fantwin.scoring.alarms.alarm_text import deviation_in
 from fantwin.scoring.alarms.current_alarms import CurrentAlarm
 
 FanName = tuple[str, int]
@@ -65,7 +66,7 @@ def fan_alarm(current: CurrentAlarm, first_heard_ns: int) -> FanAlarm:
         presented=is_presented(alarm),
         silenced=is_silenced(alarm),
         stale=alarm.stale,
-        deviation=raised.message.removeprefix(f"fan {alarm.fan}: ").partition("; ")[0] if raised else "",
+        deviation=deviation_in(raised.message, alarm.fan) if raised else "",
         deviation_t_ns=raised.t_ns if raised else 0,
         causes=current.causes,
     )

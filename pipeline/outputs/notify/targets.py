@@ -9,10 +9,10 @@ from pathlib import Path
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.extras import require
 from fantwin.pipeline.outputs.notify.alertmanager import Alertmanager, AlertSender, test_alert
+from fantwin.pipeline.outputs.notify.apprise_service import Service
 from fantwin.pipeline.outputs.notify.config import NotifierConfig, TargetConfig
 from fantwin.pipeline.outputs.notify.outbox import Outbox
 from fantwin.pipeline.outputs.notify.sending import Failure, Sender
-from fantwin.pipeline.outputs.notify.services import Service
 from fantwin.pipeline.outputs.notify.wording import Place, test_text
 from fantwin.pipeline.sources.secret_file import read_secret, secret_of_environment
 

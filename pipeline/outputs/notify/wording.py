@@ -15,8 +15,7 @@ from fantwin.pipeline.outputs.notify.gathering import Happened, ranges
 from fantwin.schemas.enums import Severity
 from fantwin.schemas.messages import Diagnosis
 from fantwin.schemas.units import NS_PER_S
-from fantwin.scoring.diagnosis.advice import KNOWN_SOON
-from fantwin.scoring.diagnosis.shown_causes import (
+from fantwin.scoring.diagnosis.causes import (
     CANNOT_TELL,
     CAUSES,
     advice,
@@ -25,6 +24,7 @@ from fantwin.scoring.diagnosis.shown_causes import (
     likely_evidence,
     likely_with_share,
 )
+from fantwin.scoring.diagnosis.what_would_tell import KNOWN_SOON
 
 MOST_TRAYS, MOST_RANGE_CHARACTERS, MOST_NAMED_CAUSES = 20, 120, 4
 """of a message about many fans"""

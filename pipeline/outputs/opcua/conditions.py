@@ -16,7 +16,7 @@ from fantwin.schemas.messages import Alarm
 from fantwin.scoring.alarms.alarm_flags import is_retained, is_silenced
 from fantwin.scoring.alarms.current_alarms import CurrentAlarm, current_alarm
 from fantwin.scoring.alarms.fan_condition import UNTIL_IT_CLEARS_T_NS
-from fantwin.scoring.diagnosis.shown_causes import CANNOT_TELL, likely_causes, likely_evidence
+from fantwin.scoring.diagnosis.causes import CANNOT_TELL, likely_causes, likely_evidence
 
 SEVERITIES = {Severity.NONE: 1, Severity.WARNING: 500, Severity.ALARM: 900}
 """of Part 5: 401 to 600 is medium, 801 to 1000 high"""

@@ -12,7 +12,7 @@ from fantwin.schemas.messages import Alarm
 from fantwin.schemas.units import NS_PER_S
 from fantwin.scoring.alarms.alarm_text import TRANSITIONS
 from fantwin.scoring.alarms.fan_condition import UNTIL_IT_CLEARS_T_NS
-from fantwin.scoring.diagnosis.shown_causes import CANNOT_TELL, with_share
+from fantwin.scoring.diagnosis.causes import CANNOT_TELL, with_share
 
 LINE_LENGTH = 64
 """a longer line is cut"""

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from fantwin.pipeline.outputs.rerun.alarm_log import clock_utc, cut, exceeded
 from fantwin.scoring.alarms.alarm_flags import is_listed, is_silenced
 from fantwin.scoring.alarms.current_alarms import CurrentAlarm
-from fantwin.scoring.diagnosis.shown_causes import most_probable
+from fantwin.scoring.diagnosis.causes import most_probable
 
 ALARMS_LISTED = 16
 NAME_LENGTH, CAUSE_LENGTH = 24, 40

@@ -306,4 +306,4 @@ class Refused(Problem, ScorerAnswers):
 
 
 JSON = dict[str, Any]
-"""what `pipeline.site.shown` makes; FastAPI checks it against the type that a path declares"""
+"""what `pipeline.site.site_json` makes; FastAPI checks it against the type that a path declares"""

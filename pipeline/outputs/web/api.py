@@ -26,7 +26,7 @@ from fantwin.pipeline.site.fan_history import HISTORY_S
 from fantwin.pipeline.site.fleet import Fan, FanGroup
 from fantwin.pipeline.site.request_desk import RequestDesk
 from fantwin.pipeline.site.request_form import RequestForm
-from fantwin.pipeline.site.shown import (
+from fantwin.pipeline.site.site_json import (
     alarms_json,
     clip_json,
     curves_json,

@@ -18,7 +18,7 @@ from fantwin.schemas.enums import InvalidReason
 from fantwin.schemas.messages import Alarm, Raw, Score
 from fantwin.schemas.twin_card import CARD_PROPERTY
 from fantwin.schemas.units import NS_PER_S
-from fantwin.scoring.diagnosis.shown_causes import short_name
+from fantwin.scoring.diagnosis.causes import short_name
 from tests.support.fantwin_command import error_of, fantwin
 from tests.support.killed_site import Site
 from tests.support.offline_replay import changed

@@ -6,7 +6,7 @@ import pytest
 
 from fantwin.pipeline.launch.notices import Notices
 from fantwin.pipeline.launch.watchdog import Watchdog
-from fantwin.pipeline.runtime.notifier import Notifier, starting
+from fantwin.pipeline.runtime.service_manager import Notifier, starting
 from fantwin.pipeline.site.site_state import START_LIMIT_S
 from tests.support.running_chain import eventually
 

@@ -11,7 +11,7 @@ from fantwin.schemas.enums import Severity, Statistic, Transition
 from fantwin.schemas.messages import Alarm, Diagnosis
 from fantwin.schemas.units import SpeedUnit
 from fantwin.scoring.alarms.alarm_text import AlarmText
-from fantwin.scoring.diagnosis.shown_causes import (
+from fantwin.scoring.diagnosis.causes import (
     CANNOT_TELL,
     CAUSES,
     SENSOR_DROPOUT,

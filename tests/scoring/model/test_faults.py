@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fantwin.scoring.diagnosis.shown_causes import CAUSES
+from fantwin.scoring.diagnosis.causes import CAUSES
 from fantwin.scoring.model import decision
 from fantwin.scoring.model.decision import Decision
 from fantwin.scoring.model.faults import BEFORE_GROWTH, DRIVE, FALLS, FAULTS, RISES, SCALE, Fault

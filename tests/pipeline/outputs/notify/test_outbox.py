@@ -11,7 +11,7 @@ from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.outputs.notify import outbox as module
 from fantwin.pipeline.outputs.notify.deciding import Announced, Event, Kind
 from fantwin.pipeline.outputs.notify.gathering import Gathered, Happened
-from fantwin.pipeline.outputs.notify.notifications import Basket, Changes, Outgoing, Saved
+from fantwin.pipeline.outputs.notify.notification_flow import Basket, Changes, Outgoing, Saved
 from fantwin.pipeline.outputs.notify.outbox import Outbox
 from fantwin.pipeline.outputs.notify.wording import Level, Text
 from fantwin.schemas.units import NS_PER_S

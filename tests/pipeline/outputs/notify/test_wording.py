@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from fantwin.pipeline.outputs.notify.services import Service
+from fantwin.pipeline.outputs.notify.apprise_service import Service
 from fantwin.pipeline.outputs.notify.wording import Level, Text
-from fantwin.scoring.diagnosis.shown_causes import CANNOT_TELL, CAUSES, WHAT_TO_DO
+from fantwin.scoring.diagnosis.causes import CANNOT_TELL, CAUSES, WHAT_TO_DO
 from tests.support.message_receivers import HttpReceiver, MailServer, free_port
 
 PAGE = Path(__file__).parents[4] / "docs" / "how-to" / "notify.md"

@@ -23,7 +23,7 @@ from fantwin.schemas.units import RAD_S_PER_UNIT
 from fantwin.scoring.alarms.alarm_flags import is_listed
 from fantwin.scoring.alarms.current_alarms import CurrentAlarm
 from fantwin.scoring.calibration.observed_rate import together
-from fantwin.scoring.diagnosis.shown_causes import (
+from fantwin.scoring.diagnosis.causes import (
     CANNOT_TELL,
     advice,
     less_likely,

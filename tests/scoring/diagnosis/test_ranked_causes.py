@@ -1,4 +1,4 @@
-"""scoring.diagnosis.cause_words: sizes with intervals, when no cause is named first, and when there is news."""
+"""scoring.diagnosis.ranked_causes: sizes with intervals, when no cause is named first, and when there is news."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from fantwin.schemas.messages import Diagnosis
-from fantwin.scoring.diagnosis import cause_words
-from fantwin.scoring.diagnosis.advice import KNOWN_SOON, Advice, SeenSinceOnset
-from fantwin.scoring.diagnosis.cause_words import CauseWords, PossibleCause, says_more
-from fantwin.scoring.diagnosis.shown_causes import CAUSES, ROWS, WHAT_TO_DO, CauseRow, Size, advice, likely_causes
+from fantwin.scoring.diagnosis import ranked_causes
+from fantwin.scoring.diagnosis.causes import CAUSES, ROWS, WHAT_TO_DO, CauseRow, Size, advice, likely_causes
+from fantwin.scoring.diagnosis.ranked_causes import CauseWords, PossibleCause, says_more
 from fantwin.scoring.diagnosis.steady_fan import SteadyFan
+from fantwin.scoring.diagnosis.what_would_tell import KNOWN_SOON, Advice, SeenSinceOnset
 from fantwin.scoring.model.faults import FAULTS
 
 FAN = SteadyFan(viscous=2e-4, drag=3e-6, friction=0.04, top_rad_s=500.0)
@@ -164,5 +164,5 @@ def test_a_new_fault_is_a_row_and_is_named_even_without_one(monkeypatch: pytest.
     (found,) = words(toy)
     assert found.evidence == "speed -12 % (95 %: -14 to -10)"
     assert (likely_causes([found]), advice([found])) == ("toy_fault", "")
-    monkeypatch.setattr(cause_words, "ROWS", (*ROWS, CauseRow("toy_fault", "a toy", "play", Size.READING)))
+    monkeypatch.setattr(ranked_causes, "ROWS", (*ROWS, CauseRow("toy_fault", "a toy", "play", Size.READING)))
     assert words(toy)[0].evidence == "speed reading -12 % (95 %: -14 to -10)"

@@ -1,4 +1,4 @@
-"""scoring.diagnosis.advice: the command that would tell a cause, or where to look at a fan that does not turn."""
+"""scoring.diagnosis.what_would_tell: the command that would tell a cause, or where to look at a standing fan."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import pytest
 
-from fantwin.scoring.diagnosis.advice import KNOWN_SOON, Advice, SeenSinceOnset
 from fantwin.scoring.diagnosis.steady_fan import SteadyFan
+from fantwin.scoring.diagnosis.what_would_tell import KNOWN_SOON, Advice, SeenSinceOnset
 
 FAN = SteadyFan(viscous=2e-4, drag=3e-6, friction=0.04, top_rad_s=500.0)
 SEEN = SeenSinceOnset(20.0, 300.0, 300.0, FAN.needed(300.0), FAN.needed(300.0), is_standing=False)

@@ -9,7 +9,7 @@ import pytest
 
 from fantwin.pipeline.outputs.notify.config import NotifierConfig
 from fantwin.pipeline.outputs.notify.deciding import Event
-from fantwin.pipeline.outputs.notify.notifications import FIRST_LOOK_NS, Changes, Notifications, Saved
+from fantwin.pipeline.outputs.notify.notification_flow import FIRST_LOOK_NS, Changes, Notifications, Saved
 from fantwin.pipeline.outputs.notify.wording import Level, Place, Text
 from fantwin.schemas.enums import Feedback, Severity, Transition
 from fantwin.schemas.messages import Alarm, Diagnosis

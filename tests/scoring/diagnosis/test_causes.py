@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from fantwin.schemas.messages import Diagnosis
-from fantwin.scoring.diagnosis.shown_causes import (
+from fantwin.scoring.diagnosis.causes import (
     CANNOT_TELL,
     advice,
     less_likely,

@@ -10,8 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from fantwin.schemas.messages import Diagnosis
-from fantwin.scoring.diagnosis.advice import Advice, SeenSinceOnset
-from fantwin.scoring.diagnosis.shown_causes import (
+from fantwin.scoring.diagnosis.causes import (
     CANNOT_TELL,
     CAUSES,
     GAIN_DOWN,
@@ -22,6 +21,7 @@ from fantwin.scoring.diagnosis.shown_causes import (
     short_name,
 )
 from fantwin.scoring.diagnosis.steady_fan import OF_BALANCE, SteadyFan
+from fantwin.scoring.diagnosis.what_would_tell import Advice, SeenSinceOnset
 
 CLEAR = 0.6
 """least probability of a cause that is named first: below it, the first cause is wrong too often"""
