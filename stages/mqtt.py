@@ -131,7 +131,7 @@ class MqttCore(SiteCore):
 
     def notes(self) -> Sequence[str]:
         """Fans that are left out of Home Assistant."""
-        left_out = self._home_assistant.left_out if self._devices else 0
+        left_out = self._home_assistant.left_out if self._config.home_assistant == "publish" else 0
         if not left_out:
             return ()
         return (f"Home Assistant: {left_out} fans have no entities; home_assistant_trays chooses those that have",)

@@ -1,9 +1,9 @@
 """What a fleet costs the viewer: the time of the processor for each fan-sample, and as a share of one core.
 
-The scores of a made-up fleet are made beforehand, a second at a time, and handed over as the runner does: of the trays
-that the core follows every message, header read, sequence checked, core stepped; of the others the newest once a
-second; and a tick every 50 ms of the data's time. The view goes to a file and is served, with nobody watching. All
-threads of this process count, Rerun's, too; the bus does not, it is not in this process: `bench.fleet.viewer_on_bus`.
+The scores of a made-up fleet are made beforehand, a second at a time, and handed over as the runner does: header read,
+sequence checked, core stepped, and a tick every 50 ms of the data's time. The view goes to a file and is served, with
+nobody watching. All threads of this process count, Rerun's, too; the bus does not, it is not in this process:
+`bench.fleet.viewer_on_bus`.
 
     python -m bench.fleet.viewer_cost
     python -m bench.fleet.viewer_cost --fans 1000 --seconds 20 --profile
@@ -33,7 +33,6 @@ from fantwin.pipeline.runtime.sequence_tracker import Found, SequenceTracker
 from fantwin.pipeline.runtime.stage import Context, Core
 from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.messages import Alarm
-from fantwin.schemas.topics import tray_of
 from fantwin.schemas.units import NS_PER_S
 from fantwin.stages.viewer import ViewerConfig, build
 
@@ -96,7 +95,6 @@ def cost_of(fleet: FleetScores, seconds: int, folder: Path, profiler: cProfile.P
             profiler.enable()
         for message in messages:
             viewer.take(message)
-        viewer.take_newest()
         if profiler:
             profiler.disable()
     cost = viewer.close()
@@ -113,42 +111,25 @@ class _Viewer:
         self._tracker = SequenceTracker(lambda _request: Found(was_asked=False))
         self._cost = ViewerCost()
         self._next_tick_ns = START_NS
-        self._followed = core.followed()
-        self._others: dict[str, Envelope] = {}
-        """the newest of the trays that are not followed"""
 
     def take(self, message: Envelope | Alarm) -> None:
-        """What is sent reaches the viewer, or waits until the newest is asked for; then its time has come."""
+        """What is sent reaches the viewer; then its time has come."""
         if isinstance(message, Alarm):
             t_ns = message.t_ns
             self._run("step", lambda: self._core.step(message))
         else:
             t_ns = message.received_t_ns
-            if self._followed is None or tray_of(message.key) in self._followed:
-                for due in self._run("receive", lambda: self._tracker.accept(message)):
-                    self._run("step", lambda due=due: self._core.step(due))
-            else:
-                self._others[message.key] = message
+            for due in self._run("receive", lambda: self._tracker.accept(message)):
+                self._run("step", lambda due=due: self._core.step(due))
         while self._next_tick_ns <= t_ns:
-            self._run("tick", self._tick)
+            self._run("tick", lambda: self._core.tick(self._next_tick_ns))
             self._next_tick_ns += round(TICK_S * NS_PER_S)
-
-    def take_newest(self) -> None:
-        """The newest of the trays that are not followed is asked for."""
-        for envelope in self._others.values():
-            self._run("receive", lambda envelope=envelope: envelope.header)
-            self._run("step", lambda envelope=envelope: self._core.step(envelope))
-        self._others = {}
 
     def close(self) -> ViewerCost:
         """End the view."""
         self._run("close", self._core.close)
         self._cost.counters = dict(self._core.counters())
         return self._cost
-
-    def _tick(self) -> None:
-        self._core.tick(self._next_tick_ns)
-        self._followed = self._core.followed()
 
     def _run(self, name: str, part: Callable[[], AnyResult]) -> AnyResult:
         began_s = time.process_time()

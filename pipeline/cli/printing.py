@@ -57,6 +57,7 @@ def table_of(left: Sequence[str], right: Sequence[str] = (), more: Sequence[str]
 
 
 def duration_text(seconds: float) -> str:
-    """A length of time to two digits or so: 45 s, 12 min, 5 h, 3 d."""
+    """A length of time to two digits or so: 0.4 s, 45 s, 12 min, 5 h, 3 d."""
     units = (("d", 86_400.0), ("h", 3600.0), ("min", 60.0))
-    return next((f"{seconds / size:.0f} {unit}" for unit, size in units if seconds >= 2 * size), f"{seconds:.0f} s")
+    below_minutes = f"{seconds:.0f} s" if seconds >= 10.0 else f"{seconds:.1f} s"
+    return next((f"{seconds / size:.0f} {unit}" for unit, size in units if seconds >= 2 * size), below_minutes)

@@ -89,7 +89,8 @@ def read_runs(
         payloads = pending.setdefault(tray_of(envelope.key), [])
         payloads.append(envelope.payload)
         if len(payloads) == MERGED_MESSAGES:
-            by_tray.setdefault(tray_of(envelope.key), []).extend(_decoded(payloads, reading))
+            if messages := _decoded(payloads, reading):
+                by_tray.setdefault(tray_of(envelope.key), []).extend(messages)
             payloads.clear()
     for name, payloads in pending.items():
         if messages := by_tray.get(name, []) + _decoded(payloads, reading):

@@ -1,7 +1,7 @@
 """For how long the fans of each tray were judged: what a rate of alarms is relative to.
 
-Of a large site the newest score of each tray comes about once a second, and not every sample; so a score stands for the
-time since the one before.
+Of a large site some scores of each tray are decoded, and not every one; so a score stands for the time since the one
+before.
 """
 
 from __future__ import annotations

@@ -38,6 +38,13 @@ UNHEARD = "unheard"
 USERS = dict.fromkeys((OPERATOR, "changes", "guessed", UNHEARD), UserRole.OPERATOR)
 
 
+class Heard:
+    """Takes events."""
+
+    def event_notification(self, event: Any) -> None:
+        """Do nothing with it."""
+
+
 @pytest.fixture(scope="module")
 def opcua(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningOpcua]:
     """One for all tests that do not end it; who changes a user has one of his own."""
@@ -102,6 +109,25 @@ def test_a_scorer_that_does_not_answer_is_a_timeout_and_others_are_served_meanwh
     status, message = asyncio.run(acts())
     assert status == "BadTimeout"
     assert message.startswith("fan 2: 90 rpm")
+
+
+def test_an_attribute_that_there_is_not_fails_alone_and_a_short_queue_that_is_asked_for_later_drops_no_event(opcua):
+    async def reads() -> list[str]:
+        async with Client(opcua.url) as client:
+            node = client.get_node(f"{ALARM}/Message").nodeid
+            wanted = [ua.ReadValueId(node, ua.UInt32(attribute)) for attribute in (99, ua.AttributeIds.Value)]
+            found = await client.uaclient.read(ua.ReadParameters(NodesToRead=wanted))
+            subscription = await client.create_subscription(100, Heard())
+            number = await subscription.subscribe_events(client.nodes.server)
+            item = ua.MonitoredItemModifyRequest(
+                MonitoredItemId=number, RequestedParameters=ua.MonitoringParameters(QueueSize=1)
+            )
+            changed = await client.uaclient.modify_monitored_items(
+                ua.ModifyMonitoredItemsParameters(subscription.subscription_id, ItemsToModify=[item])
+            )
+            return [*(each.StatusCode.name for each in found), str(changed[0].RevisedQueueSize)]
+
+    assert asyncio.run(reads()) == ["BadAttributeIdInvalid", "Good", "10000"]
 
 
 def check_that_only_trusted_clients_connect(running: RunningOpcua, folder: Path, capfd: Any) -> None:

@@ -6,7 +6,6 @@ import gc
 import os
 from importlib.metadata import version
 from pathlib import Path
-from tempfile import gettempdir, mkdtemp
 from typing import Any
 
 import pytest
@@ -19,7 +18,7 @@ from tests.support.running_gateway import free_port
 from tests.support.site_users import make_users
 
 _make_standard_nodes = InternalServer.load_standard_address_space
-_STANDARD_NODES = Path(gettempdir()) / f"asyncua-{version('asyncua')}-nodes-of-user-{os.getuid()}"
+_STANDARD_NODES = Path(__file__).parents[2] / "build" / f"asyncua-{version('asyncua')}-nodes"
 
 
 async def _load_standard_nodes(server: InternalServer, shelf_file: Path | None = None) -> None:
@@ -32,7 +31,8 @@ async def _load_standard_nodes(server: InternalServer, shelf_file: Path | None =
         await _make_standard_nodes(server, shelf_file)
     finally:
         gc.enable()
-    part = Path(mkdtemp(prefix="opcua-")) / "standard"
+    _STANDARD_NODES.parent.mkdir(exist_ok=True)
+    part = _STANDARD_NODES.with_name(f"{_STANDARD_NODES.name}.{os.getpid()}")
     server.aspace.dump(part)
     part.replace(_STANDARD_NODES)
 

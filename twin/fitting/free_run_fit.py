@@ -137,5 +137,6 @@ def fit_physics(
         prior=prior,
         max_iterations=MOST_ITERATIONS_OF_PHYSICS,
         with_errors=True,
+        iteration_done=iteration_done,
     )
     return replace(weighted, iterations=fit.iterations + weighted.iterations)

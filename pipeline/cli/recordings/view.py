@@ -21,6 +21,7 @@ from fantwin.pipeline.recordings.left_out import RAW, left_out
 from fantwin.pipeline.recordings.run_recordings import recorded_files
 
 PLOTS = (".png", ".svg", ".pdf")
+WINDOW_S = 30.0
 
 
 def view(
@@ -34,7 +35,7 @@ def view(
     layout: Annotated[
         ViewLayout, typer.Option(help="all: every fan; alarms: fans that were in alarm; wear: change over days.")
     ] = ViewLayout.ALL,
-    window: Annotated[float, typer.Option(min=0.1, help="Length of time shown, s.")] = 30.0,
+    window: Annotated[float, typer.Option(min=0.1, help="Length of time shown, s.")] = WINDOW_S,
     tray: Annotated[str | None, typer.Option(help="Plot: which tray, if there are several.")] = None,
     fans: Annotated[
         str | None, typer.Option(help="Plot: which fans, e.g. 2,5. Default: with alarms, and one without.")
@@ -64,6 +65,8 @@ def view(
     if output.suffix not in (".rrd", *PLOTS):
         raise UsageError(f"{output}: name a file that ends in .rrd, {', '.join(PLOTS)} with -o")
     if files[0].suffix == ".rrd":
+        if tray or fans or layout != ViewLayout.ALL or window != WINDOW_S:
+            raise UsageError(f"{files[0]}: its picture has its own layout: no --layout, --window, --tray or --fans")
         _draw(files, output, json_output=json_output)
         return
     require("a plot", "report", "matplotlib") if is_plot else require("a view", "view")

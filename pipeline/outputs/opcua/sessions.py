@@ -27,8 +27,8 @@ from fantwin.pipeline.outputs.opcua.log_in import LogIn, SessionUser, TrustedCli
 MOST_CONNECTIONS = 100
 MOST_SUBSCRIPTIONS = 200
 SHORTEST_PUBLISHING_MS = 100.0
-_EVERY_EVENT = 0
-"""as a size of a queue: the largest that the library has"""
+EVENT_QUEUE, DATA_QUEUE = 10_000, 5
+"""events, and at most values, that wait for a client"""
 
 CURRENT_SESSION: ContextVar[SiteSession] = ContextVar("session")
 """the session for which a method runs"""
@@ -127,12 +127,19 @@ class SiteSession(InternalSession):
         """Monitored items. No event is dropped because a client asks for a short queue."""
         for item in params.ItemsToCreate:
             wanted = item.RequestedParameters
-            if item.ItemToMonitor.AttributeId == ua.AttributeIds.EventNotifier:
-                wanted.QueueSize = ua.UInt32(_EVERY_EVENT)
-                if isinstance(wanted.Filter, ua.EventFilter):
-                    namespace = self.iserver.site_nodes.namespace
-                    wanted.Filter.WhereClause = as_the_library_evaluates(wanted.Filter.WhereClause, namespace)
+            is_event = item.ItemToMonitor.AttributeId == ua.AttributeIds.EventNotifier
+            wanted.QueueSize = ua.UInt32(EVENT_QUEUE if is_event else max(1, min(wanted.QueueSize, DATA_QUEUE)))
+            if is_event and isinstance(wanted.Filter, ua.EventFilter):
+                namespace = self.iserver.site_nodes.namespace
+                wanted.Filter.WhereClause = as_the_library_evaluates(wanted.Filter.WhereClause, namespace)
         return await super().create_monitored_items(params)
+
+    async def modify_monitored_items(self, params: ua.ModifyMonitoredItemsParameters) -> Any:
+        """Monitored items. No event is dropped because a client asks for a short queue later; here none can be told
+        from a value."""
+        for item in params.ItemsToModify:
+            item.RequestedParameters.QueueSize = ua.UInt32(EVENT_QUEUE)
+        return await super().modify_monitored_items(params)
 
 
 class _SiteUsers(UserManager):

@@ -60,11 +60,11 @@ def write_view(site: RecordedSite, output: Path, options: ViewOptions) -> list[s
     try:
         while first is not None:
             envelope, first = first, next(messages, None)
+            core.tick(envelope.received_t_ns)
             try:
                 core.step(envelope if envelope.topic == "score" else envelope.message)
             except CodecError:
                 continue  # counted by the reading
-            core.tick(envelope.received_t_ns)
     except BaseException:
         core.abort()
         raise

@@ -4,6 +4,7 @@ for it."""
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -68,6 +69,7 @@ class AlarmClips:
     def tick(self, now_ns: int, open_part: Callable[[], PartIndex | None], unsaved_since_ns: int | None = None) -> None:
         """Take what was cut, delete what is too much, and have cut what is due. open_part: of the part that is being
         written, asked for only where something is due. unsaved_since_ns: see `ClipTracker.due`."""
+        self.tracker.follow(now_ns)  # also while clips are cut
         self._take_results()
         self._undeletable = ""
         try:
@@ -99,10 +101,11 @@ class AlarmClips:
     def close(self, open_part: Callable[[], PartIndex | None]) -> None:
         """The recorder stops: cut what is due as far as it goes, while there is time. After a restart it is cut again,
         with what follows."""
-        self._join()
+        until_s = time.monotonic() + CLOSE_S
+        self._join(until_s)
         if not self._thread and (unfinished := self.tracker.unfinished()):
             self._begin(unfinished, open_part())
-            self._join()
+            self._join(until_s)
         self._take_results()
         self._save(self._saved_ns)
 
@@ -123,10 +126,10 @@ class AlarmClips:
                 result = CutResult(clip.name, problem=f"{type(error).__name__}: {error}")
             self._results.put(result)
 
-    def _join(self) -> None:
+    def _join(self, until_s: float) -> None:
         """Wait for the clips that are being cut, while there is time."""
         if self._thread:
-            self._thread.join(CLOSE_S)
+            self._thread.join(max(0.0, until_s - time.monotonic()))
             self._thread = self._thread if self._thread.is_alive() else None
 
     def _take_results(self) -> None:

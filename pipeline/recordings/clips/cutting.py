@@ -102,7 +102,11 @@ class ClipCutter:
         within = [part for part in parts if part.first_ns <= clip.until_ns and part.last_ns >= start_ns]
         if not within:
             raise RecordingError("nothing of that time is recorded any more")
-        metadata, attachments = _about(read_metadata(within[0].file), clip, start_ns)
+        try:
+            of_part = read_metadata(within[0].file)
+        except RecordingError as error:  # deleted to make room: at the next attempt it is not among the parts
+            raise DiskError(str(error)) from error
+        metadata, attachments = _about(of_part, clip, start_ns)
         judged_after_ns = snapshot.newest_t_ns if snapshot else None
         if judged_after_ns is not None:
             metadata[CLIP_SNAPSHOT_KEY] = str(judged_after_ns)
@@ -149,16 +153,16 @@ def remove_unfinished(folder: Path) -> None:
 def _parts_since(recording: Path, open_part: PartIndex | None, tray: str, t_ns: int) -> list[IndexedRecording]:
     """The parts with a message from this time on, and PARTS_SEARCHED before them, the oldest first; of a tray.
 
-    Where the host's clock was set back after a part, it and all before it have later times, and may be thousands.
+    Where the host's clock was set back after a part, it is the last: all before it have later times, and may be
+    thousands.
     """
     found: list[IndexedRecording] = []
     before = 0
     for part in _parts_backwards(recording, open_part, tray):
-        if found and part.first_ns > found[-1].first_ns + SET_BACK_NS:
-            break
+        was_set_back = bool(found) and part.first_ns > found[-1].first_ns + SET_BACK_NS
         found.append(part)
         before += part.last_ns < t_ns
-        if before > PARTS_SEARCHED:
+        if was_set_back or before > PARTS_SEARCHED:
             break
     return found[::-1]
 

@@ -91,13 +91,17 @@ class ClipTracker:
         elif alarm.transition == Transition.RAISED and not is_silenced(alarm):
             self._raise(alarm, received_t_ns, of_tray)
 
+    def follow(self, now_ns: int) -> None:
+        """Follow the host's clock."""
+        if now_ns < self._now_ns - SET_BACK_NS:
+            self._end_running(now_ns)
+        self._now_ns = now_ns
+
     def due(self, now_ns: int, unsaved_since_ns: int | None = None) -> list[Clip]:
         """The clips to be cut now, which count as being cut until `cut` says what came of it. What a clip over the
         limit of bytes needs is never due: it is not kept. unsaved_since_ns: what was received from then on is not on
         the disk yet; None: all is."""
-        if now_ns < self._now_ns - SET_BACK_NS:
-            self._end_running(now_ns)
-        self._now_ns = now_ns
+        self.follow(now_ns)
         found = [
             clip
             for clip in self._clips.values()

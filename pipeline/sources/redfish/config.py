@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Self
 from urllib.parse import urlsplit
 
-from pydantic import Field, field_validator
+from pydantic import Field, field_validator, model_validator
 
 from fantwin.pipeline.sources.polling import SLOWEST_S, PolledConfig
 from fantwin.pipeline.sources.secret_file import LogIn
@@ -44,6 +44,12 @@ class RedfishConfig(PolledConfig, LogIn, frozen=True):
         if parts.username is not None:
             raise ValueError("a configuration is recorded: give username, and password_file")
         return value
+
+    @model_validator(mode="after")
+    def _has_password(self) -> Self:
+        if self.username and not (self.password_file or self.password_env):
+            raise ValueError("username needs password_file or password_env")
+        return self
 
     @property
     def why_no_commands(self) -> str:

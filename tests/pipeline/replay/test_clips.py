@@ -98,6 +98,20 @@ def test_the_same_alarm_comes_out_of_a_clip_with_raw_samples_only(undisturbed, t
     assert (raised.fan, raised.severity) == (alarm.fan, alarm.severity)
 
 
+def test_a_clip_of_the_time_before_the_clock_was_set_back_is_cut_from_the_part_of_that_time(undisturbed, tmp_path):
+    """As after a power cut on a board whose clock begins in the past: the next part has earlier times."""
+    recording = tmp_path / "recording.mcap"
+    record(undisturbed, recording).close()
+    head = read_metadata(recording)
+    with RecordingWriter(tmp_path / "recording-2.mcap", head.metadata, head.attachments) as later:
+        for envelope in list(read_recording(undisturbed))[:100]:
+            later.add(envelope.received_at(envelope.received_t_ns - 3600 * S))
+    clip = clip_of(first_raised(undisturbed), before_s=0.5, after_s=2.0)
+    result = cutter(recording, margin_s=MARGIN_S).cut(clip)
+    assert result.size_bytes and not result.problem
+    assert recorded(tmp_path / "clips" / clip.name, "raw")
+
+
 def test_a_clip_is_not_verified_and_why_is_said(clip):
     with pytest.raises(CannotCompareError, match="without --verify .* or verify the recording that it was cut from"):
         verified(clip)
