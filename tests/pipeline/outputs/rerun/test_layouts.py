@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +16,9 @@ from tests.stages.test_viewer_fleet import messages_of, play
 from tests.support.running_chain import eventually
 from tests.support.score_data import made_up_tray
 
-DRIVERS = Path("/usr/share/vulkan/icd.d")
+rerun_picture = pytest.importorskip("fantwin.pipeline.outputs.rerun.rerun_picture", exc_type=ModuleNotFoundError)
 needs_a_driver = pytest.mark.skipif(
-    not DRIVERS.is_dir(), reason="no Vulkan driver here: apt-get install mesa-vulkan-drivers"
+    not rerun_picture.has_vulkan_driver(), reason="no Vulkan driver here: apt-get install mesa-vulkan-drivers"
 )
 
 
@@ -38,13 +36,6 @@ def fleet_view(folder: Path) -> Path:
     return folder / "view.rrd"
 
 
-@contextmanager
-def headless_viewer() -> Iterator[Any]:
-    client = pytest.importorskip("rerun.experimental").ViewerClient
-    with client.spawn(headless=True, port=free_port(), hide_welcome_screen=True) as viewer:
-        yield viewer
-
-
 def reports(viewer: Any) -> dict[str, list[str]]:
     """What the viewer reports of each view, by name."""
     return {view.name: [str(report) for report in view.reports] for view in viewer.get_state().views}
@@ -55,7 +46,6 @@ def reports(viewer: Any) -> dict[str, list[str]]:
 def test_each_layout_of_a_live_view_a_recording_and_a_fleet_opens_without_a_report(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("RUST_LOG", "error")  # it warns of a host without a graphics card
     made = {
         live_view(tmp_path, window_s=1.0): plots("tray1/0", "tray1/1", "tray1/2") | {"temperature (°C)"},
         live_view(tmp_path / "wear", "wear"): {"tray1 / speed since commissioning (%)"},
@@ -64,7 +54,7 @@ def test_each_layout_of_a_live_view_a_recording_and_a_fleet_opens_without_a_repo
     monkeypatch.setattr("fantwin.stages.viewer.FLEET_ABOVE", 3)
     made[fleet_view(tmp_path / "fleet")] = plots("tray1/0", "tray2/2")
     for path, names in made.items():
-        with headless_viewer() as viewer:
+        with rerun_picture.headless_viewer() as viewer:
             viewer.open(str(path))
             eventually(lambda: reports(viewer).keys() == names, f"the views of {path}")  # noqa: B023  at once
             axes = [part["TimeAxis"] for part in viewer.get_blueprint().blueprint.values() if "TimeAxis" in part]
@@ -80,7 +70,7 @@ def test_a_live_viewer_follows_an_old_recording(tmp_path: Path) -> None:
     scores, _ = made_up_tray(seconds=5)
     port = free_port()
     core = build(context(tmp_path, serve=True, grpc_port=port, web_port=0)).core
-    with headless_viewer() as viewer:
+    with rerun_picture.headless_viewer() as viewer:
         viewer.open(f"rerun+http://127.0.0.1:{port}/proxy")
         for number, item in enumerate(scores):
             core.step(sent(item))
