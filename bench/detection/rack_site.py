@@ -26,6 +26,7 @@ from fantwin.pipeline.config.loading import parse_config
 from fantwin.pipeline.config.models import Config
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.learning.healthy_history import HealthyHistory
+from fantwin.pipeline.learning.learning_process import LearningProcess
 from fantwin.pipeline.learning.ordinary_operation import OrdinaryOperation
 from fantwin.pipeline.learning.versions import TwinVersions, Version, learning_folder
 from fantwin.pipeline.recordings.metadata import recording_metadata
@@ -78,7 +79,7 @@ class RackMonth:
 _MONTH = TypeAdapter(RackMonth)
 
 
-class LearningAtOnce:
+class LearningAtOnce(LearningProcess):
     """`fantwin twins learn` in this process: a version is there as soon as it is due."""
 
     def __init__(self, folder: Path, tray: str, per_day: float, took_s: list[float]) -> None:
@@ -87,8 +88,15 @@ class LearningAtOnce:
         self._ended: str | None = None
         self._took_s = took_s
 
-    seconds = None
-    is_free = True
+    @property
+    def seconds(self) -> float | None:
+        """None: nothing is under way."""
+        return None
+
+    @property
+    def is_free(self) -> bool:
+        """Always."""
+        return True
 
     def start(self, *, only_if_changed: bool) -> str:
         """Make the next version."""

@@ -83,7 +83,7 @@ def _line(row: Row) -> str:
 
 
 def _table(rows: list[Row]) -> Table:
-    table = table_of(("", "scenario"), (), ("promised", "seen"))
+    table = table_of([""], (), ("scenario", "promised", "seen"))
     for row in rows:
         table.add_row(Text(_STATES[row.kept], style=_STYLES[row.kept]), row.name, row.promise, row.seen)
     return table
