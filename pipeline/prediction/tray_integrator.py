@@ -41,9 +41,7 @@ class TwinIntegratorConfig(StageConfig):
     """Section `[twin_integrator]`. The tray names the twin."""
 
     start_samples: int = Field(default=5, ge=1, description="a free run starts from the mean of this many speeds")
-    warm_up_s: float = Field(
-        default=3.0, ge=0, lt=10, description="a free run is not valid for this long after its start"
-    )
+    warm_up_s: float = Field(default=3.0, ge=0, description="a free run is not valid for this long after its start")
     hold_limit_s: float = Field(default=0.5, ge=0, description="how long the last command is held without samples")
 
 

@@ -140,7 +140,7 @@ def test_a_lane_follows_the_states_to_the_sample_and_repeats_a_steady_one_for_vi
 def test_a_change_of_reason_is_a_change_of_state_and_what_is_not_known_is_shown_with_its_number() -> None:
     sink = FakeSink()
     (score,), _ = made_up_tray(seconds=0.1, fans=1, faulty_fan=None, gap_fan=None)
-    unknown, newer = FanState.UNKNOWN, len(InvalidReason)
+    unknown, newer = FanState.UNKNOWN, max(InvalidReason) + 1
     state = np.array([[unknown]] * 4 + [[FanState.NORMAL]] * 3 + [[99]] * 3, np.uint8)
     reason = np.array([[InvalidReason.WARMING_UP]] * 2 + [[newer]] * 2 + [[InvalidReason.NONE]] * 6, np.uint8)
     core = core_of(sink, fans=1)
