@@ -8,8 +8,8 @@ some hours.
 
 All racks are simulated in one process, in minutes, and each is watched in a process of its own. After each of its days
 a rack writes what became of it to FOLDER, where a month that was interrupted goes on; `--show` prints the tables of the
-days that all racks have had so far. A rack takes three to five hours of a core: `--only 1,2` watches two of them, and
-the tables are of the racks whose file `rackN.json` is in FOLDER.
+days that all racks have had so far. A rack takes some five hours of a core, by what a third of its first day took:
+`--only 1,2` watches two of them, and the tables are of the racks whose file `rackN.json` is in FOLDER.
 """
 
 from __future__ import annotations

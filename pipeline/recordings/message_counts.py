@@ -10,7 +10,7 @@ from fantwin.schemas.topics import known_topic
 
 
 class MessageCounts:
-    """Of one file. Messages are added in file order."""
+    """Counts of one file. Messages are added in file order."""
 
     def __init__(self) -> None:
         self.ledger = SequenceLedger()

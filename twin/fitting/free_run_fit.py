@@ -116,27 +116,22 @@ def fit_physics(
 
     Arguments as of fit_free_run.
     """
-    fit = fit_free_run(
-        model,
-        physics,
-        top_speed_rad_s,
-        trajectories,
-        free=free,
-        prior=prior,
-        max_iterations=MOST_ITERATIONS_OF_PHYSICS,
-        iteration_done=iteration_done,
-    )
+
+    def fitted(start: Array, *, with_errors: bool) -> FreeRunFit:
+        return fit_free_run(
+            model,
+            start,
+            top_speed_rad_s,
+            trajectories,
+            free=free,
+            prior=prior,
+            max_iterations=MOST_ITERATIONS_OF_PHYSICS,
+            with_errors=with_errors,
+            iteration_done=iteration_done,
+        )
+
+    fit = fitted(physics, with_errors=False)
     if not counts(trajectories):
         return fit
-    weighted = fit_free_run(
-        model,
-        fit.point.unknowns.physics,
-        top_speed_rad_s,
-        trajectories,
-        free=free,
-        prior=prior,
-        max_iterations=MOST_ITERATIONS_OF_PHYSICS,
-        with_errors=True,
-        iteration_done=iteration_done,
-    )
+    weighted = fitted(fit.point.unknowns.physics, with_errors=True)
     return replace(weighted, iterations=fit.iterations + weighted.iterations)

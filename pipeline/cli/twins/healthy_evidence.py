@@ -54,7 +54,7 @@ class MarkedRunning:
         return lines
 
     def as_json(self) -> list[dict[str, Any]]:
-        """For --json."""
+        """Fields for --json."""
         return [each.as_json() for each in self.alarms]
 
 

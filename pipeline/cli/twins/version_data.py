@@ -71,7 +71,7 @@ def _thinned(data: TrainingData) -> TrainingData:
 
 
 def every_of(rate_hz: float) -> int:
-    """Of how many samples of a line one is used."""
+    """Number of samples of a line of which one is used."""
     return max(1, math.ceil(rate_hz / MOST_HZ - NEARLY))
 
 
@@ -107,7 +107,7 @@ class Windows:
         )
 
     def chosen(self, count: int) -> Windows:
-        """At most so many: half of them evenly spread, the others those that add most to what these show.
+        """Choose at most so many: half of them evenly spread, the others those that add most to what these show.
 
         Always the same ones for the same windows.
         """

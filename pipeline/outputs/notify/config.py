@@ -78,7 +78,7 @@ class TargetConfig(Section):
 
     @property
     def least_severity(self) -> int:
-        """As a number of schemas.enums.Severity."""
+        """Number of that severity in schemas.enums.Severity."""
         return 2 if self.severity == "alarm" else 1
 
     @model_validator(mode="after")

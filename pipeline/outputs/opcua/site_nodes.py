@@ -50,8 +50,7 @@ class SiteNode:
             return ua.DataValue(ua.Variant(self._browse_name()))
         if attribute == ua.AttributeIds.DisplayName:
             return ua.DataValue(ua.Variant(ua.LocalizedText(self._browse_name().Name)))
-        of_template = {int(number): value for number, value in self._template.attributes.items()}
-        return of_template.get(attribute) or ua.DataValue(StatusCode=STATUS["BadAttributeIdInvalid"])
+        return self._template.attributes.get(attribute) or ua.DataValue(StatusCode=STATUS["BadAttributeIdInvalid"])
 
 
 class SiteNodes:

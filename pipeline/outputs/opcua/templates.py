@@ -63,7 +63,7 @@ class Template:
     node_class: ua.NodeClass
     type: ua.NodeId
     by: ua.NodeId
-    attributes: Mapping[ua.AttributeIds, ua.DataValue]
+    attributes: Mapping[int, ua.DataValue]
     kind: str = ""
     children: list[str] = field(default_factory=list)
     methods: Sequence[ua.NodeId] = ()
