@@ -5,7 +5,7 @@ the unit of the tray. Samples are collected and drawn twice a second, because a 
 in it is cheap.
 
 With more than 64 fans, only some are drawn: those in alarm, as far as there is room, and those in `show`. Of the scores
-of other trays, a few a second are decoded.
+of other trays, two a second are decoded.
 
 Samples and alarms are on the time line, at the time of the sample; wear has a timeline of its own.
 It may drop messages: the runner keeps a bounded queue in front of it and counts what it drops.

@@ -14,7 +14,9 @@ from fantwin.schemas.health import Health
 from fantwin.schemas.messages import Alarm, Message, ModelCard, ScorerSnapshot
 
 ALL_SAMPLES = 64
-"""number of fans up to which all samples are kept; of a larger site, a few a second of each tray"""
+"""number of fans up to which all samples are kept; of a larger site, some of each tray"""
+SAMPLED_S = 0.5
+"""time between two scores of a tray of a larger site that are decoded: at 10,000 fans that is what an output costs"""
 
 
 class SiteCore(Core):
@@ -49,7 +51,7 @@ class SiteCore(Core):
 
     def needs_score(self, tray: str) -> bool:
         """Whether the score of a tray that has arrived is to be decoded."""
-        return self._is_small or self._model.wants_score(tray)
+        return self._is_small or self._model.wants_score(tray, SAMPLED_S)
 
     @abstractmethod
     def add_score(self, envelope: Envelope) -> None:

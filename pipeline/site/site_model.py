@@ -37,8 +37,6 @@ from fantwin.scoring.wear.recorded_wear import wear_in, wear_rows
 SILENT_AFTER_S = 5.0
 """a tray without a score for so long is silent; and so is a stage without a health, which may have left the bus. A fan
 is judged now if it was this recently"""
-_SAMPLED_S = 0.1
-"""scores of a tray that are watched by a command are looked at this often: a fast line sends hundreds a second"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,10 +125,10 @@ class SiteModel:
             return None
         return self.add_decoded_score(envelope.header.tray, score)
 
-    def wants_score(self, tray: str) -> bool:
-        """Whether a known tray's last score was some time ago."""
+    def wants_score(self, tray: str, every_s: float) -> bool:
+        """Whether a known tray's last score was so long ago."""
         with self._lock:
-            return self._now_s() - self._heard_s.get(tray, -np.inf) >= _SAMPLED_S
+            return self._now_s() - self._heard_s.get(tray, -np.inf) >= every_s
 
     def add_decoded_score(self, name: str, score: Score) -> Score | None:
         """The same for one that has been decoded, of the tray whose key it came on."""

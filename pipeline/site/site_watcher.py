@@ -28,6 +28,8 @@ from fantwin.scoring.alarms.current_alarms import CurrentAlarm
 
 MOST_WATCHED_SESSIONS = 1000
 """so many last healths are kept; of more, those heard longest ago are forgotten, those of launched sessions last"""
+SAMPLED_S = 0.1
+"""time between two scores of a tray that a command looks at: a fast line sends hundreds a second"""
 MOST_UNKNOWN_SESSIONS = 64
 """producers without a token of a session whose health is kept; those heard longest ago are forgotten first"""
 
@@ -220,7 +222,7 @@ class SiteWatcher:
 
     def _on_score(self, key: str, payload: bytes) -> None:
         tray = key.split("/")[2]
-        if self.model.wants_score(tray):
+        if self.model.wants_score(tray, SAMPLED_S):
             score = _decoded(Score, payload)
             if isinstance(score, Score) and self.counts(key, score.header.producer):
                 self.model.add_decoded_score(tray, score)
