@@ -18,6 +18,7 @@ from mcap.reader import make_reader
 from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.config.models import BusConfig
 from fantwin.pipeline.recordings.reading import read_recording
+from fantwin.pipeline.site.loss_accounting import label
 from fantwin.schemas.codec import decode
 from fantwin.schemas.messages import Raw
 from fantwin.schemas.topics import tray_key
@@ -178,12 +179,16 @@ def test_without_their_launcher_all_stages_end_in_order_and_leave_a_whole_record
     up = start(chain)
     with chain.watcher() as watcher:
         children = chain.process_ids()
+
+        def say() -> dict[str, str]:
+            return {label(view.health): view.health.status.name for view in watcher.stages()}
+
+        # peers meet through the launcher: without it this watcher would not hear those it has not met
+        chain.eventually(watcher, lambda: say() == dict.fromkeys(chain.stages, "OK"), "the watcher hears all stages")
         up.process.kill()
-        eventually(lambda: not any(map(is_running, children.values())), "all stages have ended")
+        chain.eventually(watcher, lambda: not any(map(is_running, children.values())), "all stages have ended")
         # what the last one has sent may still be on its way
-        eventually(
-            lambda: {view.health.status.name for view in watcher.stages()} == {"STOPPED"}, "all say that they end"
-        )
+        chain.eventually(watcher, lambda: say() == dict.fromkeys(chain.stages, "STOPPED"), "all say that they end")
         assert not any(watcher.losses().values())
     assert chain.tray and chain.tray.end() == 0
     check_whole(chain, MANY)
