@@ -127,13 +127,13 @@ class DeviceClock:
         """Start a new segment of the mapping at this sample, without a jump, with the slope of the new line."""
         lowest_device_ns, lowest_offset_ns = self._lowest
         lateness_ns = lowest_offset_ns + lowest_device_ns - self._map(lowest_device_ns)
-        late = lateness_ns > JUMP_NS
+        late, follows_late = lateness_ns > JUMP_NS, self._late_buckets > 0
         if late and (self._late_buckets == 0 or self._is_shrinking(lowest_device_ns, lateness_ns)):
             self._late_buckets, self._first_lateness = 1, (lowest_device_ns, lateness_ns)
         else:
             self._late_buckets = self._late_buckets + 1 if late else 0
         self._slew = 0.0
-        if not late:
+        if not (late or follows_late):  # the end of a backlog is late, too
             self._points.append(self._lowest)
             while self._points[0][0] < device_ns - WINDOW_BUCKETS * BUCKET_NS and len(self._points) > 1:
                 self._points.popleft()

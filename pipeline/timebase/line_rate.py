@@ -29,6 +29,10 @@ LONGEST_WAIT_US = 5_000_000  # after this MIN_SAMPLES are enough: a slow line mu
 ENOUGH_SAMPLES = 26
 SHORTEST_WAIT_US = 1_000_000  # a host that stalls delivers the samples of a tenth of a second at once
 MAX_SAMPLES = 2000
+MOST_KEPT = 6000
+"""samples of a line that has not caught up: a minute at 100 Hz. With more, its clock does not fit"""
+PACE_US = 250_000
+"""time of the device over which its line is seen to deliver what it had kept"""
 MOST_PERIODS = 5  # a longer pause says nothing about the period
 MIN_USED_SHARE = 0.5  # of the steps
 MOST_UNEVEN = 0.15  # mean distance of steps from whole periods, in periods; a quarter where there is no period
@@ -179,19 +183,24 @@ def common_period_us(steps_us: Array) -> float | None:
 
 
 class LineRate:
-    """Measures the rate of a line from its first samples.
+    """Measures the rate of a line from its first samples, and how late the first one was.
 
-    The result depends on the samples only, and not on how they are divided into messages.
+    A line that delivers what it had kept before it was opened is measured until it has caught up. The result depends on
+    the samples only, and not on how they are divided into messages.
     """
 
     def __init__(self) -> None:
-        self._times = SampleTimes(MAX_SAMPLES)
+        self._times = SampleTimes(MOST_KEPT)
         self._seen = 0
         self._first_t_ns = self._last_t_ns = 0
-        self._last_span_us = 0
+        self._last_span_us: float = 0
+        self._is_catching_up = False
+        """whether the line delivers samples faster than its device measures them"""
+        self._paced = (0, 0)
+        """time of the device since the first sample, us, and `first_lateness_ns`, when that was last looked at"""
         self.first_lateness_ns = 0
-        """delay of the first sample beyond that of the least delayed one of the first second; 0 if the device has no
-        clock"""
+        """delay of the first sample beyond that of the least delayed one of the first second, or of the time until the
+        line had caught up; 0 if the device has no clock"""
 
     def add(self, message: Raw) -> bool:
         """Add the samples of a message; returns whether they are enough for `line_hz`."""
@@ -202,6 +211,7 @@ class LineRate:
             if not self._times.count:
                 self._first_t_ns = self._last_t_ns = t_ns
                 self._last_span_us = self.first_lateness_ns = 0
+                self._is_catching_up, self._paced = False, (0, 0)
             self._times.add_time(us)
             if len(message.device_clock_us):
                 self._compare_delay(t_ns)
@@ -210,15 +220,23 @@ class LineRate:
     def _compare_delay(self, t_ns: int) -> None:
         """Compare the delay of the newest sample, received at t_ns, with that of the first."""
         span_us = self._times.span_us  # it falls where the clock of the device went back
-        if self._last_span_us <= span_us <= SHORTEST_WAIT_US and t_ns >= self._last_t_ns:
+        is_early = span_us <= SHORTEST_WAIT_US or self._is_catching_up
+        if self._last_span_us <= span_us and is_early and t_ns >= self._last_t_ns:
             self._last_span_us, self._last_t_ns = span_us, t_ns
             self.first_lateness_ns = max(self.first_lateness_ns, self._first_t_ns + span_us * 1000 - t_ns)
+            passed_us = span_us - self._paced[0]
+            if passed_us >= PACE_US:
+                gained_ns = self.first_lateness_ns - self._paced[1]
+                self._is_catching_up = 2 * gained_ns > 1000 * passed_us  # less than half of that time has passed here
+                self._paced = span_us, self.first_lateness_ns
         else:
-            self._last_span_us = SHORTEST_WAIT_US + 1  # a later sample says nothing about the first one
+            self._last_span_us, self._is_catching_up = math.inf, False  # a later sample says nothing about the first
 
     @property
     def is_enough(self) -> bool:
         """Return whether there are enough samples. After very many without a usable time, there are."""
+        if self._is_catching_up and self._seen < MOST_KEPT:
+            return False
         count, span_us = self._times.count, self._times.span_us
         return (
             (count >= ENOUGH_SAMPLES and span_us >= SHORTEST_WAIT_US)

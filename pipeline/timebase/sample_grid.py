@@ -234,7 +234,8 @@ class SampleGrid:
             self._set_back_ns = self._set_back_ns or behind_ns
             return False
         if behind_ns >= 0:
-            self._counts["out_of_order" if behind_ns else "repeated"] += 1
+            reason = "lost_out_of_order" if is_new else "out_of_order"
+            self._counts[reason if behind_ns else "repeated"] += 1
             return False
         self._set_back_ns = 0
         if self._newest_t_ns == NEVER_NS:

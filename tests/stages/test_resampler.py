@@ -143,7 +143,7 @@ def test_for_any_sample_times_the_grid_rises_without_repeats_and_never_bridges_a
 def test_repeated_and_out_of_order_samples_are_dropped_and_counted() -> None:
     grid, core = run([raw(at(0.0, 0.01, 0.01, 0.03, 0.02, 0.04), np.array([0.0, 1, 99, 3, 99, 4]))])
     np.testing.assert_allclose(grid.speed_rad_s[:, 0], [0, 1, 2, 3, 4])
-    assert (core.counters()["repeated"], core.counters()["out_of_order"]) == (1, 1)
+    assert (core.counters()["repeated"], core.counters()["lost_out_of_order"]) == (1, 1)
 
 
 def test_a_gap_is_marked_and_holds_the_command_and_one_of_exactly_the_limit_is_bridged() -> None:

@@ -63,6 +63,37 @@ def test_a_first_sample_that_arrived_late_does_not_make_all_times_late() -> None
     assert given.t_ns[0] > grid.t_ns[0] + 300_000_000
 
 
+def test_what_a_line_had_kept_before_it_was_opened_is_on_the_grid_with_its_own_times() -> None:
+    messages = samples(times(100, 25))
+    on_time, _ = grid_of(messages)
+    opened_ns, bytes_per_s = EPOCH_NS + 15 * NS_PER_S, 100_000
+    kept = [
+        replace(m, host_receive_t_ns=np.maximum(m.host_receive_t_ns, opened_ns + k * 40 * NS_PER_S // bytes_per_s))
+        for k, m in enumerate(messages)
+    ]
+    for received in (kept, [join(kept[k : k + 70]) for k in range(0, len(kept), 70)]):
+        grid, core = grid_of(received)
+        assert not [name for name, count in core.counters().items() if name.startswith("lost_") and count]
+        assert core.counters()["clock_restarts"] == 0
+        assert len(grid.t_ns) >= len(on_time.t_ns) - 2
+        off_rad_s = np.interp(on_time.t_ns, grid.t_ns, grid.speed_rad_s[:, 0]) - on_time.speed_rad_s[:, 0]
+        assert np.abs(off_rad_s[5:-5]).max() < 0.006  # the speed rises by 1 rad/s each second: 6 ms
+
+    _, given = grid_of(kept, rate_hz=100.0)
+    assert given.counters()["lost_out_of_order"] > 1000, "no settings: no wait for the line; what that costs is counted"
+
+
+def test_a_device_whose_clock_runs_far_too_fast_is_not_waited_for_without_end() -> None:
+    messages = samples(times(100, 100))
+    squeezed = [replace(m, host_receive_t_ns=EPOCH_NS + (m.host_receive_t_ns - EPOCH_NS) // 100) for m in messages]
+    _, core = grid_of(squeezed)
+    counts = core.counters()
+    assert counts["grid_samples"] > 5000
+    assert counts["lost_out_of_order"] > 3000
+    left_out = counts["lost_out_of_order"] + counts["dropped_after_clock_restart"]
+    assert counts["grid_samples"] + left_out >= 0.99 * len(messages), "what is not on the grid is counted"
+
+
 @pytest.mark.parametrize("clock", [True, False], ids=["clock", "no clock"])
 @pytest.mark.parametrize(
     ("line_hz", "jitter", "grid_hz"),
