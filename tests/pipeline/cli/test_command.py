@@ -15,6 +15,7 @@ from typer.testing import Result
 from fantwin.pipeline.acquisition.device_commands import DeviceCommands
 from fantwin.pipeline.bus.publisher import Publisher
 from fantwin.pipeline.bus.session import Bus
+from fantwin.pipeline.cli.watch import commanding
 from fantwin.pipeline.cli.watch.commanding import CommandSender, command_of, share_note, why_not_sent
 from fantwin.pipeline.config.models import BusConfig, TrayConfig
 from fantwin.pipeline.runtime.sessions import Session
@@ -26,7 +27,7 @@ from fantwin.schemas.health import Counter, Health, Note
 from fantwin.schemas.topics import BY_NAME, alive_key, health_key
 from tests.support import made_messages
 from tests.support.fantwin_command import error_of, fantwin
-from tests.support.running_chain import Chain, RunningCommand, eventually
+from tests.support.running_chain import DEADLINE_S, Chain, RunningCommand, eventually
 
 
 @pytest.fixture
@@ -37,7 +38,9 @@ def chain(tmp_path: Path, endpoint: str) -> Iterator[Chain]:
 
 
 @pytest.fixture
-def acquisition(chain: Chain) -> Iterator[RunningCommand]:
+def acquisition(chain: Chain, monkeypatch: pytest.MonkeyPatch) -> Iterator[RunningCommand]:
+    """Acquisition as it starts: commands wait until it answers, however long it takes."""
+    monkeypatch.setattr(commanding, "_ANSWER_S", DEADLINE_S)
     running = RunningCommand(["up", "--only", "acquisition", *chain.words("run")[1:]])
     yield running
     running.kill()
@@ -49,7 +52,8 @@ def test_a_command_that_the_line_did_not_take_is_one_line_that_says_why(chain, a
     assert str(chain.port) in error
 
 
-def test_without_an_acquisition_the_command_is_reported_as_not_received(chain):
+def test_without_an_acquisition_the_command_is_reported_as_not_received(chain, monkeypatch):
+    monkeypatch.setattr(commanding, "_ANSWER_S", 0.1)
     expected = "no acquisition of tray tray1 received the command: is `fantwin up` running?"
     assert error_of(*chain.words("command"), "--fan", 3, 0.5) == expected
 

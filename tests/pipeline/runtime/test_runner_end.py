@@ -30,8 +30,7 @@ from tests.support.toy_stage import TRAY_A, TRAY_B, Bench, Burst, Passer, raw, t
 class Ended:
     """A stage that was run to its end in a thread, with what it raised and what others saw of it."""
 
-    def __init__(self, stage: Stage, config, *, tray: str | None = None, stop_timeout_s: float = 10.0) -> None:
-        config = replace(config, launcher=LauncherConfig(stop_timeout_s=stop_timeout_s))
+    def __init__(self, stage: Stage, config, *, tray: str | None = None) -> None:
         self.stop = threading.Event()
         self.error: Exception | None = None
         self.healths: list[Health] = []
@@ -101,7 +100,8 @@ def test_row_04_a_core_that_raises_while_it_is_closed_keeps_no_other_from_closin
     assert "closing a failed: OSError: [Errno 30] Read-only file system" in ended.problem
 
 
-def test_row_04_a_core_that_hangs_while_it_is_closed_is_left_behind_in_time(config):
+def test_row_04_a_core_that_hangs_while_it_is_closed_is_left_behind_in_time(config, monkeypatch):
+    monkeypatch.setattr("fantwin.pipeline.runtime.runner.CORES_CLOSED", 0.05)
     release = threading.Event()
 
     class Hangs(Passer):
@@ -109,7 +109,7 @@ def test_row_04_a_core_that_hangs_while_it_is_closed_is_left_behind_in_time(conf
             release.wait()
             return []
 
-    ended = Ended(toy(lambda _context: BuiltStage(Hangs()), core_per_tray=False), config, stop_timeout_s=0.5)
+    ended = Ended(toy(lambda _context: BuiltStage(Hangs()), core_per_tray=False), config)
     release.set()
     assert ended.has_ended
     eventually(lambda: ended.has_left_the_bus, "it leaves the bus, which it waits for no longer than the core's time")
@@ -151,7 +151,8 @@ def test_row_04_a_loop_that_hangs_is_left_behind_in_time(config, monkeypatch, wh
 def test_row_04_a_stage_that_is_stopped_while_it_waits_for_what_it_missed_ends_in_order(config, monkeypatch):
     """As when a producer hangs."""
     monkeypatch.setattr(Bus, "answer_timeout_s", 300.0)
-    settings = replace(config, launcher=LauncherConfig(stop_timeout_s=1.0))
+    for limit in ("CAUGHT_UP", "ANSWERED"):
+        monkeypatch.setattr(f"fantwin.pipeline.runtime.runner.{limit}", 0.05)
     stop, asked = threading.Event(), threading.Event()
     queries: list[Any] = []
 
@@ -159,9 +160,9 @@ def test_row_04_a_stage_that_is_stopped_while_it_waits_for_what_it_missed_ends_i
         queries.append(query)
         asked.set()
 
-    with Bus(settings.bus) as bus:
+    with Bus(config.bus) as bus:
         silent = bus._session.declare_queryable(recovery_key(tray_key("s", TRAY_A, "raw"), "hangs"), never_answer)
-        runner = Runner(toy(), settings, None, stop)
+        runner = Runner(toy(), config, None, stop)
         thread = threading.Thread(target=runner.run)
         thread.start()
         assert asked.wait(20)
@@ -261,8 +262,9 @@ def test_row_04_the_second_signal_ends_a_process_whose_main_thread_is_blocked():
         process.stdout.close()
 
 
-def test_row_18_what_is_not_processed_in_time_is_counted_as_lost(config):
+def test_row_18_what_is_not_processed_in_time_is_counted_as_lost(config, monkeypatch):
     """A device that sends faster than the stage can process."""
+    monkeypatch.setattr("fantwin.pipeline.runtime.runner.DRAINED", 0.1)
 
     class Slow(Passer):
         def step(self, item: Any) -> Sequence[Message]:
@@ -270,7 +272,7 @@ def test_row_18_what_is_not_processed_in_time_is_counted_as_lost(config):
             return super().step(item)
 
     stage = toy(lambda _context: BuiltStage(Slow(), Burst([raw(t_ns) for t_ns in range(200)])), name="acquisition")
-    ended = Ended(stage, config, tray=TRAY_A, stop_timeout_s=4.0)
+    ended = Ended(stage, config, tray=TRAY_A)
     last = ended.healths[-1]
     assert ended.error is None
     assert last.status == StageStatus.STOPPED
