@@ -95,6 +95,12 @@ def granted(request: Request) -> list[Alarm]:
     ]
 
 
+@pytest.fixture(autouse=True)
+def never_silent(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever time passes, what was fed is the state of now."""
+    monkeypatch.setattr("fantwin.pipeline.site.site_model.SILENT_AFTER_S", 1e9)
+
+
 @pytest.fixture
 def users(tmp_path: Path) -> Path:
     return make_users(tmp_path / "users.toml")

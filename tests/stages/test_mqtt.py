@@ -22,7 +22,7 @@ from fantwin.pipeline.sources.mqtt.config import MqttConfig as SourceConfig
 from fantwin.schemas.enums import Action, FanState, Transition
 from fantwin.schemas.messages import Alarm, Request
 from fantwin.stages.mqtt import build, check
-from tests.stages.test_gateway import alarm, granted, score
+from tests.stages.test_gateway import alarm, granted, never_silent, score  # noqa: F401  a fixture
 from tests.support.mosquitto import Listener, Mosquitto, needs_mosquitto, retained_by
 from tests.support.mqtt_broker import free_port
 from tests.support.running_chain import eventually
