@@ -94,6 +94,7 @@ class Bench:
         self._expects = expects
         self.stop = threading.Event()
         self.heard: queue.Queue[tuple[str, Message]] = queue.Queue()
+        self._has_heard_its_last = threading.Event()
         self.bus = Bus(config.bus)
         self.bus.subscribe(tray_key("s", "*", "grid"), self._hear(Grid))
         self.bus.subscribe(health_key("s", "*", "*"), self._hear(Health))
@@ -115,7 +116,13 @@ class Bench:
             self.crashes.append(crash)
 
     def _hear(self, kind: type[Message]) -> Callable[[str, bytes], None]:
-        return lambda key, payload: self.heard.put((key, decode(kind, payload)))
+        def hear(key: str, payload: bytes) -> None:
+            message = decode(kind, payload)
+            self.heard.put((key, message))
+            if isinstance(message, Health) and message.is_last:
+                self._has_heard_its_last.set()
+
+        return hear
 
     def feed(self, tray: str, t_ns: int) -> None:
         """Publish one sample. Neighbours differ in their columns, so that a stage takes each by itself."""
@@ -139,5 +146,6 @@ class Bench:
     def end(self) -> Health:
         self.stop.set()
         self.thread.join(20)
+        assert self._has_heard_its_last.wait(20), "closing the bus drops what is on its way"
         self.bus.close()
         return self.last[0]

@@ -19,6 +19,7 @@ import pytest
 from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.cli.watch.alarm_list import alarm_lines
 from fantwin.pipeline.cli.watch.alarms import OperatorAction
+from fantwin.pipeline.cli.watch.scorers import wait_for_stages
 from fantwin.pipeline.config.loading import load_config
 from fantwin.pipeline.runtime.runner import Runner
 from fantwin.pipeline.runtime.stage import BuiltStage, Core, Stage
@@ -287,9 +288,15 @@ def test_watching_prints_what_happens_as_it_happens(site):
     assert (acknowledged["transition"], acknowledged["acknowledged_by"]) == ("acknowledged", "Ann")
 
 
-def test_row_10_an_answer_of_a_stranger_is_none_and_a_scorer_that_does_not_answer_is_reported(site):
+def test_row_10_an_answer_of_a_stranger_is_none_and_a_scorer_that_does_not_answer_is_reported(site, monkeypatch):
     """Somebody who reads the request grants it before the scorer can."""
     key, site.core.deaf = tray_key(SITE, TRAY, "alarm"), True
+
+    def wait_for_both(bus: Bus, *words: Any, **more: Any) -> None:
+        wait_for_stages(bus, *words, **more)
+        eventually(lambda: len(bus._session.info.peers_zid()) == 2, "it has met the stranger, too")
+
+    monkeypatch.setattr("fantwin.pipeline.cli.watch.alarms.wait_for_stages", wait_for_both)
     with Bus(site.config.bus) as bus:
         stranger = bus.publisher(key, BY_NAME["alarm"], type_name(Alarm), "stranger")
         heard = threading.Event()

@@ -39,6 +39,7 @@ def woken_by(put_last: Callable[[Inbox], object], patient: int) -> Item | None:
     """What a waiting stage gets first after so many items that are not urgent, and one more."""
     inbox = Inbox(drops_oldest=False)
     getter = Getter(inbox)
+    eventually(lambda: inbox._changed._waiters, "it waits")  # pyright: ignore[reportAttributeAccessIssue]
     for number in range(patient):
         inbox.put(item(number), is_urgent=False)
     assert not getter.is_woken(MOMENT_S)

@@ -108,12 +108,13 @@ def test_row_07_only_sessions_with_a_common_tray_have_successors():
 
 def test_row_07_a_shard_with_a_tray_that_another_one_has_is_refused_in_one_line(config, monkeypatch):
     monkeypatch.setattr("fantwin.pipeline.runtime.second_owner.LEAVING_LIMIT_S", 0.0)
+    monkeypatch.setattr("fantwin.pipeline.runtime.second_owner.GOSSIP_S", 60.0)  # the first one is found before
     stop = threading.Event()
     stop.set()
     with Bus(config.bus) as bus:
         bus.declare_alive(replace(shard("a+x", 1, "a", "x"), stage="resampler", producer="resampler-a+x-1").key("s"))
         with pytest.raises(StageError) as refused:
-            Runner(toy(), config, Shard("all", (TRAY_A, TRAY_B)), stop)
+            Runner(toy(), config, Shard("all", (TRAY_A, TRAY_B)), threading.Event())
         assert str(refused.value) == (
             "resampler of site 's' cannot start: resampler/a+x already has trays a, x: process 1 on board; stop that, "
             "or give this one other trays"
@@ -130,6 +131,7 @@ def test_row_07_a_second_process_of_a_stage_is_refused_in_one_line_that_names_th
             aborted.append(True)
 
     bench = Bench(toy(), config)
+    monkeypatch.setattr("fantwin.pipeline.runtime.second_owner.GOSSIP_S", 60.0)  # the first one is found before
     first = os.getpid()
     monkeypatch.setattr("fantwin.pipeline.runtime.sessions.os.getpid", lambda: first + 1)
     with pytest.raises(
@@ -146,6 +148,7 @@ def test_row_07_a_stage_with_a_device_is_refused_where_a_replay_presents_the_sit
     config, monkeypatch
 ):
     monkeypatch.setattr("fantwin.pipeline.runtime.second_owner.LEAVING_LIMIT_S", 0.0)
+    monkeypatch.setattr("fantwin.pipeline.runtime.second_owner.GOSSIP_S", 60.0)  # the first one is found before
     with Bus(config.bus) as replay:
         replay.declare_alive(alive_key("s", "replay", "all"))
         with pytest.raises(StageError) as refused:
