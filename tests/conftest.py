@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import os
-import socket
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, settings
 
+from tests.support.ports import free_port
 from tests.support.small_disk import mount, unmount
 from tests.support.trained_once import TrainedOnce
 
@@ -67,9 +67,7 @@ def _one_process_for_each_command() -> Iterator[None]:
 @pytest.fixture
 def endpoint() -> str:
     """A bus endpoint on loopback that nothing else uses."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    return f"tcp/127.0.0.1:{free_port()}"
 
 
 @pytest.fixture(scope="session")

@@ -31,6 +31,7 @@ from fantwin.schemas.messages import Message, Score
 from fantwin.schemas.topics import tray_key
 from fantwin.schemas.units import RAD_S_PER_UNIT
 from fantwin.stages.viewer import ViewerConfig, build, check
+from tests.support.ports import free_port
 from tests.support.score_data import SIGMA, START_NS, STEP_NS, made_up_tray
 
 LATER_NS = START_NS + 400 * 86_400 * 1_000_000_000  # the host's time while what was recorded at START_NS is replayed
@@ -289,12 +290,6 @@ def context(folder: Path, *, fans: int = 3, speed_unit: Any = "rad/s", serve: bo
 
 def changed(score: Score, **columns: Any) -> Score:
     return Score(**{**vars(score), **columns})
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
 
 
 def chunks_of(path: Path) -> list[Any]:

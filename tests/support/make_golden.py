@@ -14,7 +14,6 @@ some minutes.
 
 from __future__ import annotations
 
-import socket
 import sys
 import tempfile
 from pathlib import Path
@@ -25,6 +24,7 @@ from fantwin.pipeline.recordings.reading import read_metadata, read_recording  #
 from fantwin.pipeline.recordings.writing import RecordingWriter  # noqa: E402
 from fantwin.schemas.enums import Action  # noqa: E402
 from tests.support.killed_site import Site  # noqa: E402
+from tests.support.ports import free_port  # noqa: E402
 from tests.support.running_chain import TRAY, Chain, eventually, fantwin, published, view_of  # noqa: E402
 
 DATA = Path(__file__).parent / "data"
@@ -67,10 +67,7 @@ def make_golden(path: Path) -> None:
         run("train", healthy, "--model", "physical", "--name", "golden", "-o", folder / "twin.onnx")
         run("calibrate", folder / "twin.onnx", healthy, "--false-alarms-per-day", 24, "--extrapolate")
         (folder / "golden.toml").write_text(CONFIGURATION)
-        with socket.socket() as probe:
-            probe.bind(("127.0.0.1", 0))
-            endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
-        chain = Chain(folder, endpoint, viewer=False, configuration=folder / "golden.toml")
+        chain = Chain(folder, f"tcp/127.0.0.1:{free_port()}", viewer=False, configuration=folder / "golden.toml")
         try:
             record(chain)
         finally:

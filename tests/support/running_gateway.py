@@ -4,20 +4,13 @@ from __future__ import annotations
 
 import http.client
 import json
-import socket
 from pathlib import Path
 from typing import Any
 
 from fantwin.pipeline.outputs.web.config import GatewayConfig
 from fantwin.stages.gateway import STAGE, GatewayCore
+from tests.support.ports import free_port
 from tests.support.running_core import FANS, Answer, RunningCore
-
-
-def free_port() -> int:
-    """A port on loopback that nothing else uses."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
 
 
 class RunningGateway(RunningCore[GatewayCore]):

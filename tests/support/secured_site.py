@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import socket
 import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -17,6 +16,7 @@ from fantwin.pipeline.bus.settings import Settings
 from fantwin.pipeline.config.loading import parse_config
 from fantwin.pipeline.config.models import Config
 from fantwin.schemas.topics import alive_key, rights_key
+from tests.support.ports import free_port
 from tests.support.running_chain import eventually
 from tests.support.site_certificates import SiteCertificates
 
@@ -45,9 +45,7 @@ ANSWER_S = 30.0
 
 def free_endpoint() -> str:
     """An endpoint on loopback that nothing else uses."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tls/127.0.0.1:{probe.getsockname()[1]}"
+    return f"tls/127.0.0.1:{free_port()}"
 
 
 class SecuredSite:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import queue
-import socket
 import threading
 from collections.abc import Iterator
 from dataclasses import replace
@@ -17,6 +16,7 @@ from fantwin.pipeline.bus.router import open_router
 from fantwin.pipeline.bus.session import Bus, join_bus
 from fantwin.pipeline.config.models import BusConfig
 from fantwin.schemas.topics import BY_NAME, alive_key, tray_key
+from tests.support.ports import free_port
 from tests.support.running_chain import RunningCommand, eventually
 from tests.support.secured_site import SITE, SecuredSite, free_endpoint, put
 
@@ -28,10 +28,7 @@ class Routers:
     """Two, at endpoints of their own."""
 
     def __init__(self) -> None:
-        with socket.socket() as one, socket.socket() as other:
-            for probe in (one, other):
-                probe.bind(("127.0.0.1", 0))
-            self.endpoints = [f"tcp/127.0.0.1:{probe.getsockname()[1]}" for probe in (one, other)]
+        self.endpoints = [f"tcp/127.0.0.1:{free_port()}" for _ in range(2)]
         self.running: dict[int, RunningCommand] = {}
 
     def start(self, number: int) -> None:
@@ -105,22 +102,24 @@ def test_clients_of_two_secured_routers_may_do_on_either_what_their_role_may(sec
     """Samples, what was missed, and tokens pass from one router to the other; what a role may not do passes neither."""
     first, second = secured
     key, alive = tray_key(SITE, "a", "raw"), alive_key(SITE, "acquisition", "all")
-    received, tokens = [], {}
+    tokens: dict[str, bool] = {}
     with (
         join_bus(first.config, roles=("resampler",)) as reader,
         join_bus(second.config, roles=("acquisition",)) as writer,
         join_bus(second.config, roles=("resampler",)) as reader_there,
     ):
-        for bus in (reader, reader_there):
-            bus.subscribe(key, lambda _key, payload: received.append(payload))
+        received: dict[Bus, list[bytes]] = {reader: [], reader_there: []}
+        for bus, heard in received.items():
+            bus.subscribe(key, lambda _key, payload, heard=heard: heard.append(payload))
         reader.watch_alive(alive, tokens.__setitem__)
         writer.declare_alive(alive)
         publisher = writer.publisher(key, BY_NAME["raw"], "x", "me")
         for bus in (reader, reader_there, writer):
             bus.require_rights()
         eventually(lambda: tokens.get(alive), "the token passes")
-        eventually(lambda: publisher.put(b"sample") or received.count(b"sample") > 1, "samples pass to both")
-        assert {payload for _, payload in reader.recover(key, "me")} == {b"sample"}
+        eventually(lambda: publisher.put(b"sample") or all(received.values()), "samples pass to both")
+        recovered = eventually(lambda: reader.recover(key, "me"), "they can be recovered")
+        assert {payload for _, payload in recovered} == {b"sample"}
         for site in secured:
             for role in ("viewer", "acquisition.b"):
                 liveliness = site.session(role).liveliness().declare_token(alive_key(SITE, "scorer", "all"))
@@ -131,8 +130,8 @@ def test_clients_of_two_secured_routers_may_do_on_either_what_their_role_may(sec
                 liveliness.undeclare()
         eventually(lambda: reader.alive(alive_key(SITE, "*", "*")) == {alive}, "the token is seen behind both routers")
         publisher.put(b"last")
-        eventually(lambda: received.count(b"last") == 2, "the last one has arrived")
-    assert set(received) == {b"sample", b"last"}
+        eventually(lambda: all(heard[-1] == b"last" for heard in received.values()), "the last one has arrived")
+    assert all(set(heard) == {b"sample", b"last"} for heard in received.values())
 
 
 def test_a_client_asks_its_own_router_for_its_rights_and_no_other(secured):

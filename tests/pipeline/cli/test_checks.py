@@ -12,17 +12,12 @@ from fantwin.pipeline.config.models import TrayConfig
 from fantwin.pipeline.runtime.stage import Context
 from fantwin.pipeline.sources.serial.source import SerialSource
 from fantwin.stages import acquisition, recorder, viewer
+from tests.support.ports import free_port
 
 
 def context(folder: Path, config: Any, **tray: Any) -> Context:
     trays = (TrayConfig.model_validate({"name": "tray1", "fans": 1, **tray}),)
     return Context(site="s", trays=trays, config=config, folder=folder, run_folder=folder / "run", started_t_ns=0)
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
 
 
 def test_the_port_is_found_beside_the_configuration(tmp_path, monkeypatch):

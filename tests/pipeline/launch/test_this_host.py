@@ -23,17 +23,17 @@ def path(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def two_ports() -> Iterator[tuple[int, socket.socket]]:
-    """A port that is taken, with the socket that has it; the next one is free."""
+    """A port that is taken, with the socket that has it; the next one is kept free."""
     while True:
         with socket.socket() as taken, socket.socket() as following:
             taken.bind(("127.0.0.1", 0))
             taken.listen()
             port = taken.getsockname()[1]
+            following.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             try:
                 following.bind(("127.0.0.1", port + 1))
             except OSError:
                 continue
-            following.close()
             yield port, taken
             return
 
