@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import shutil
 import subprocess
 from pathlib import Path
@@ -18,13 +19,15 @@ def node_modules(package: str, version: str, what: str) -> Path:
     modules = NODE / "node_modules"
     if shutil.which("node") is None or shutil.which("npm") is None:
         pytest.skip(f"no {what}: needs node and npm")
-    if not (modules / package / "package.json").exists():
-        NODE.mkdir(parents=True, exist_ok=True)
-        command = ["npm", "install", "--no-audit", "--no-fund", "--prefix", str(NODE), f"{package}@{version}"]
-        try:
-            done = subprocess.run(command, capture_output=True, text=True, timeout=_INSTALL_LIMIT_S, check=False)
-        except subprocess.TimeoutExpired:
-            pytest.skip(f"no {what}: npm install {package} takes too long")
-        if done.returncode:
-            pytest.skip(f"no {what}: npm install {package}: {done.stderr[-200:]}")
+    NODE.mkdir(parents=True, exist_ok=True)
+    with (NODE / "lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)  # one worker installs, the others find it
+        if not (modules / package / "package.json").exists():
+            command = ["npm", "install", "--no-audit", "--no-fund", "--prefix", str(NODE), f"{package}@{version}"]
+            try:
+                done = subprocess.run(command, capture_output=True, text=True, timeout=_INSTALL_LIMIT_S, check=False)
+            except subprocess.TimeoutExpired:
+                pytest.skip(f"no {what}: npm install {package} takes too long")
+            if done.returncode:
+                pytest.skip(f"no {what}: npm install {package}: {done.stderr[-200:]}")
     return modules

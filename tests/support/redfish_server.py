@@ -6,7 +6,6 @@ import base64
 import json
 import ssl
 import threading
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -22,7 +21,8 @@ class Controller:
         self.is_new, self.user, self.password = is_new, user, password
         self.rpm = [4000, 4200]
         self.percent: list[int | None] = [40, 42]
-        self.delay_s = 0.0
+        self.may_answer = threading.Event()
+        self.may_answer.set()
         self.status = 200
         self.asked: list[str] = []
 
@@ -73,7 +73,7 @@ def redfish_server(controller: Controller, tls: ssl.SSLContext | None = None) ->
     class Handler(BaseHTTPRequestHandler):
         def do_GET(self) -> None:
             controller.asked.append(self.path)
-            time.sleep(controller.delay_s)
+            controller.may_answer.wait()
             expected = base64.b64encode(f"{controller.user}:{controller.password}".encode()).decode()
             is_let_in = not controller.user or self.headers.get("Authorization") == f"Basic {expected}"
             document = controller.document(self.path)

@@ -152,20 +152,24 @@ def test_when_stopped_before_anybody_reads_the_truth_is_that_nothing_happened(tm
 
 
 def test_unread_samples_are_counted_and_a_later_reader_sees_the_gap(tmp_path: Path) -> None:
-    with simulated(tmp_path, duration=1.5) as (_, playing):
+    with simulated(tmp_path) as (stop, _):
         first = Reader(tmp_path / "tray")
         first.read_until(10)
         first.serial.close()
+        threading.Event().wait(1.0)  # nobody reads 100 samples
         second = Reader(tmp_path / "tray")
         second.read_until(10)
-        second.serial.close()
-        playing.join(10.0)
+        stop.set()
+        second.read_all()
     truth = truth_of(tmp_path)
-    first_end, second_start = first.samples[-1].sequence, second.samples[0].sequence
+    first_end, second_start, end = (
+        each.sequence for each in (first.samples[-1], second.samples[0], second.samples[-1])
+    )
     assert first_end is not None
     assert second_start is not None
+    assert end is not None
     assert second_start > first_end
-    assert truth["samples_sent"] + truth["samples_unsent"] == 150
+    assert truth["samples_sent"] + truth["samples_unsent"] == end + 1
     assert truth["samples_unsent"] > 50
 
 

@@ -131,12 +131,15 @@ class SnapshotSender(Core):
 
     def __init__(self, notes: Sequence[ScorerSnapshot]) -> None:
         self._notes = list(notes)
+        self.has_sent = threading.Event()
 
     def step(self, item: object) -> Sequence[Message]:
         return []
 
     def tick(self, now_ns: int) -> Sequence[Message]:
         notes, self._notes = self._notes, []
+        if not notes:
+            self.has_sent.set()
         return notes
 
 
@@ -157,6 +160,7 @@ def site(endpoint: str, request: pytest.FixtureRequest, notes: list[ScorerSnapsh
     runner = Runner(stage, load_config(DEMO / "demo.toml", [f"bus.endpoint='{endpoint}'"]), None, stop)
     thread = threading.Thread(target=runner.run)
     thread.start()
+    assert core.has_sent.wait(20)
     yield words
     stop.set()
     thread.join(20)

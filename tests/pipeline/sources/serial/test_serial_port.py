@@ -125,7 +125,8 @@ def test_a_port_in_use_is_opened_when_it_is_free_and_a_file_that_is_no_port_is_r
     no_port.stop()
 
 
-def test_stop_delivers_the_bytes_that_had_arrived_and_no_more(device: Device) -> None:
+def test_stop_delivers_the_bytes_that_had_arrived_and_no_more(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("fantwin.pipeline.sources.serial.port.DRAIN_LIMIT_S", TIMEOUT_S)  # a pause ends it
     device.plug_in()
     items = Items()
     line = SerialPort(str(device.path), 115200)
