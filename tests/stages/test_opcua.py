@@ -97,9 +97,10 @@ def test_a_scorer_that_does_not_answer_is_a_timeout_and_others_are_served_meanwh
 
     async def acts() -> tuple[str, str]:
         client = await encrypted(opcua, tmp_path, UNHEARD)
-        async with Client(opcua.url) as other:
+        async with Client(opcua.url, timeout=60) as other:
             waiting = asyncio.create_task(status_of_suppress(client))
-            await asyncio.sleep(0.5)
+            while not any(asked.operator_name == UNHEARD for asked in opcua.sent):
+                await asyncio.sleep(0.01)
             message = await other.get_node(f"{ALARM}/Message").read_value()
             assert not waiting.done()
             status = await waiting
@@ -113,7 +114,7 @@ def test_a_scorer_that_does_not_answer_is_a_timeout_and_others_are_served_meanwh
 
 def test_an_attribute_that_there_is_not_fails_alone_and_a_short_queue_that_is_asked_for_later_drops_no_event(opcua):
     async def reads() -> list[str]:
-        async with Client(opcua.url) as client:
+        async with Client(opcua.url, timeout=60) as client:
             node = client.get_node(f"{ALARM}/Message").nodeid
             wanted = [ua.ReadValueId(node, ua.UInt32(attribute)) for attribute in (99, ua.AttributeIds.Value)]
             found = await client.uaclient.read(ua.ReadParameters(NodesToRead=wanted))
@@ -162,7 +163,7 @@ def test_a_session_cannot_be_guessed_and_nobody_refreshes_the_subscription_of_an
         def event_notification(self, event: Any) -> None: ...
 
     async def tries() -> tuple[str, int]:
-        async with Client(opcua.url) as one, Client(opcua.url) as other:
+        async with Client(opcua.url, timeout=60) as one, Client(opcua.url, timeout=60) as other:
             subscription = await one.create_subscription(500, Ignores())
             refresh = ua.CallMethodRequest(
                 ObjectId=ua.NodeId(ua.ObjectIds.ConditionType),

@@ -15,7 +15,7 @@ import pytest
 from paho.mqtt.enums import CallbackAPIVersion
 
 from tests.support.mqtt_broker import free_port
-from tests.support.running_chain import eventually
+from tests.support.running_chain import DEADLINE_S, eventually
 
 needs_mosquitto = pytest.mark.skipif(shutil.which("mosquitto") is None, reason="mosquitto is not installed")
 
@@ -68,7 +68,7 @@ class Listener:
         client.on_message = self._on_message
         client.connect("127.0.0.1", port)
         client.loop_start()
-        assert self._subscribed.wait(20)
+        assert self._subscribed.wait(DEADLINE_S)
 
     def _on_connect(self, client: paho.Client, *_rest: Any) -> None:
         client.subscribe("#", 0)

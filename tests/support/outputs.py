@@ -111,7 +111,7 @@ class OpcuaOutput:
 
     async def _read(self) -> dict[int, tuple[bool, bool]]:
         names = ("ActiveState/Id", "AckedState/Id", "SuppressedOrShelved")
-        async with OpcuaClient(self.running.url) as client:
+        async with OpcuaClient(self.running.url, timeout=60) as client:
             nodes = [client.get_node(f"ns=2;s={TRAY}/{fan}/Alarm/{name}") for fan in range(FANS) for name in names]
             values = await client.read_values(nodes)
         fans = {fan: values[3 * fan : 3 * fan + 3] for fan in range(FANS)}
