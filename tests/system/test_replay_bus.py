@@ -11,7 +11,7 @@ import subprocess
 import termios
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -25,8 +25,9 @@ from fantwin.schemas.codec import decode
 from fantwin.schemas.enums import StageStatus
 from fantwin.schemas.header import Header
 from fantwin.schemas.health import Health
-from fantwin.schemas.messages import Clock, Grid, Message, ModelCard
+from fantwin.schemas.messages import Clock, Grid, Message, ModelCard, Raw
 from fantwin.schemas.topics import health_key, tray_key
+from fantwin.stages.resampler import ResamplerConfig, ResamplerCore
 from tests.support.fantwin_command import as_typed
 from tests.support.killed_site import Site as RecordedSite
 from tests.support.replay_data import START_NS, STEP_NS, write_raw
@@ -45,7 +46,6 @@ from tests.support.score_data import made_up_tray
 from tests.support.twin_files import small_hybrid, write_twin
 
 pytestmark = pytest.mark.real_time
-MANY = 1500
 WORKING = ["resampler", "twin_integrator", "scorer", "recorder"]
 
 
@@ -151,43 +151,11 @@ def terminals() -> Iterator[list[Terminal]]:
         terminal.close()
 
 
-def columns(grids: list[Grid]) -> dict[str, np.ndarray]:
-    names = ("t_ns", "command", "speed_rad_s", "valid", "invalid_reason")
-    return {name: np.concatenate([getattr(grid, name) for grid in grids]) for name in names}
-
-
 @pytest.mark.slow
-def test_at_full_speed_the_stages_take_every_message_and_decide_every_sample(tmp_path, endpoint):
-    recording = write_raw(tmp_path / "source.mcap", MANY)
-    chain = Chain(tmp_path, endpoint, f"launcher.stages={json.dumps(WORKING)}", viewer=False)
-    try:
-        up = chain.start_up()
-        with chain.watcher() as watcher:
-            eventually(lambda: {v.health.stage for v in watcher.stages() if v.alive} == set(WORKING), "all are there")
-        done = as_typed("replay", recording, "--rate", "max", "--from", "raw", "--json", *chain.words("")[1:])
-        status, account = up.end(), up.output()
-    finally:
-        chain.close()
-    report = json.loads(done.stdout)
-    assert done.returncode == 0, (report, done.stderr)
-    assert report["messages"] == {"raw": MANY}
-    assert (report["lost"], report["behind"], report["stopped"]) == ({}, [], False)
-    assert set(report["listeners"]) == {"recorder", "resampler"}
-    assert status == 0, account
-    entries = list(read_recording(tmp_path / "recording.mcap"))
-    found = {
-        topic: [e.message for e in entries if e.topic == topic] for topic in ("raw", "grid", "prediction", "score")
-    }
-    assert [raw.header.sequence for raw in found["raw"]] == list(range(MANY))
-    assert {raw.header.producer.startswith("replay-") for raw in found["raw"]} == {True}
-    last_ns = START_NS + (MANY - 1) * STEP_NS
-    for topic in ("grid", "prediction", "score"):
-        times = [t for m in found[topic] for t in m.t_ns.tolist() if t <= last_ns]  # type: ignore[union-attr]
-        assert times == list(range(START_NS, last_ns + 1, STEP_NS)), topic
-
-
-@pytest.mark.slow
-def test_stages_without_a_twin_of_their_own_change_to_the_learned_twins_at_the_recorded_samples(tmp_path, endpoint):
+def test_at_full_speed_stages_take_every_message_change_to_the_learned_twins_and_decide_every_sample(
+    tmp_path, endpoint
+):
+    """No stage has a twin of its own."""
     recorded_site = RecordedSite(tmp_path, 7, raw_samples=4, learns=True)
     recorded_site.run(300)
     for number in (1, 2):
@@ -195,24 +163,29 @@ def test_stages_without_a_twin_of_their_own_change_to_the_learned_twins_at_the_r
         recorded_site.put_in_force(f"tray1-{number}", twin.read_bytes())
         recorded_site.run(200)
     source = recorded_site.finished().rename(tmp_path / "source.mcap")
-    stages = WORKING
-    settings = [f"launcher.stages={json.dumps(stages)}", f"site='{SITE}'"]
+    settings = [f"launcher.stages={json.dumps(WORKING)}", f"site='{SITE}'"]
     chain = Chain(tmp_path / "run", endpoint, *settings, viewer=False, configuration=tmp_path / "site.toml")
     try:
         up = chain.start_up()
         with chain.watcher() as watcher:
-            eventually(lambda: {v.health.stage for v in watcher.stages() if v.alive} == set(stages), "all are there")
+            eventually(lambda: {v.health.stage for v in watcher.stages() if v.alive} == set(WORKING), "all are there")
         done = as_typed("replay", source, "--rate", "max", "--from", "raw", "--json", *chain.words("")[1:])
         status, account = up.end(), up.output()
     finally:
         chain.close()
-    assert (done.returncode, status) == (0, 0), (done.stdout, done.stderr, account)
-    assert json.loads(done.stdout)["messages"]["new_twin"] == 2
+    assert (done.returncode, status) == (0, 0), (done.stdout, done.stderr, account, up.lines[-20:])
+    report = json.loads(done.stdout)
+    assert report["messages"] == {"raw": 700 // 4, "new_twin": 2}
+    assert (report["lost"], report["behind"], report["stopped"]) == ({}, [], False)
+    assert set(report["listeners"]) == {"recorder", "resampler"}
     then, now = (messages_by_topic(path) for path in (source, tmp_path / "run" / "recording.mcap"))
+    assert [raw.header.sequence for raw in now["raw"]] == list(range(700 // 4))
+    assert {raw.header.producer.startswith("replay-") for raw in now["raw"]} == {True}
     changes = [[(card.twin, card.t_ns) for card in found["twin"]] for found in (then, now)]
     assert changes[0] == changes[1]
     assert [twin for twin, _ in changes[0]] == ["tray1-1", "tray1-2"]
-    for topic, column in (("prediction", "predicted_speed_rad_s"), ("score", "t_ns"), ("score", "score")):
+    columns = (("grid", "t_ns"), ("prediction", "predicted_speed_rad_s"), ("score", "t_ns"), ("score", "score"))
+    for topic, column in columns:
         before, after = (np.concatenate([getattr(each, column) for each in found[topic]]) for found in (then, now))
         np.testing.assert_array_equal(before, after[: len(before)], f"{topic} {column}")  # then comes the silence
 
@@ -224,38 +197,32 @@ def messages_by_topic(path: Path) -> dict[str, list[Any]]:
     return found
 
 
-@pytest.mark.slow
-def test_a_replay_paused_for_longer_than_the_watermark_gives_the_same_grid(tmp_path, endpoint, terminals):
+def test_a_replay_paused_for_longer_than_the_watermark_gives_the_grid_of_a_resampler_that_nothing_pauses(
+    site, tmp_path, terminals
+):
     recording = write_raw(tmp_path / "source.mcap", 500, missing=range(200, 300))
-    until_ns = START_NS + 499 * STEP_NS
-    found: list[dict[str, np.ndarray]] = []
-    for run in ("whole", "paused"):
-        site = Site(tmp_path / run, endpoint)
-        try:
-            site.start("resampler")
-            if run == "whole":
-                done = site.replay(recording, "--rate", "max", "--from", "raw")
-                assert done.returncode == 0, (done.stdout, done.stderr)
-            else:
-                terminals.append(Terminal(site.words(recording, "--from", "raw", "--rate", 8, "--json")))
-                while site.next(Clock).t_ns < START_NS + 10**9:
-                    pass
-                terminals[0].press(b" ")
-                while site.next(Clock).rate:
-                    pass
-                paused = [site.next(Clock) for _ in range(30)]  # 20 a second
-                assert {(clock.t_ns, clock.rate) for clock in paused} == {(paused[0].t_ns, 0.0)}
-                terminals[0].press(b" ")
-                status, out, err = terminals[0].end()
-                assert status == 0, (out, err)
-                assert 0.0 < json.loads(out)["rate"] < 8.5, "a busy machine plays more slowly, none faster"
-            found.append(columns(site.grids_until(until_ns)))
-        finally:
-            site.close()
-    for name, column in found[0].items():
-        np.testing.assert_array_equal(column[:500], found[1][name][:500], name)
-    assert (found[0]["invalid_reason"][210:290] > 0).all(), "the gap is there"
-    assert found[0]["valid"][:199].all()
+    core = ResamplerCore(8, ResamplerConfig(rate_hz=100.0))
+    expected = [grid for entry in read_recording(recording) for grid in core.step(cast(Raw, entry.message))]
+    site.start("resampler")
+    terminals.append(Terminal(site.words(recording, "--from", "raw", "--rate", 8, "--json")))
+    while site.next(Clock).t_ns < START_NS + 10**9:
+        pass
+    terminals[0].press(b" ")
+    while site.next(Clock).rate:
+        pass
+    paused = [site.next(Clock) for _ in range(30)]  # 20 a second
+    assert {(clock.t_ns, clock.rate) for clock in paused} == {(paused[0].t_ns, 0.0)}
+    terminals[0].press(b" ")
+    status, out, err = terminals[0].end()
+    assert status == 0, (out, err)
+    assert 0.0 < json.loads(out)["rate"] < 8.5, "a busy machine plays more slowly, none faster"
+    found = site.grids_until(START_NS + 499 * STEP_NS)
+    for name in ("t_ns", "command", "speed_rad_s", "valid", "invalid_reason"):
+        then, now = (np.concatenate([getattr(grid, name) for grid in grids]) for grids in (expected, found))
+        assert len(then) > 490
+        np.testing.assert_array_equal(now[: len(then)], then, name)
+    valid = np.concatenate([grid.valid for grid in expected])
+    assert valid[:199].all() and not valid[210:290].any(), "the gap is there"
 
 
 def test_at_a_terminal_it_steps_and_quits_and_gives_the_terminal_back(site, tmp_path, terminals):
@@ -277,22 +244,6 @@ def test_at_a_terminal_it_steps_and_quits_and_gives_the_terminal_back(site, tmp_
     report = json.loads(out)
     assert report["stopped"]
     assert report["messages"] == {"raw": 3}
-
-
-def test_a_signal_ends_the_replay_cleanly_and_restores_the_terminal(site, tmp_path, terminals):
-    recording = write_raw(tmp_path / "source.mcap", 500)
-    terminal = Terminal(site.words(recording, "--rate", 0.01))
-    terminals.append(terminal)
-    while not site.next(Health).outputs:
-        pass
-    assert not terminal.is_restored()
-    terminal.process.send_signal(signal.SIGTERM)
-    status, _, err = terminal.end()
-    assert status == 0, err
-    assert terminal.is_restored()
-    while (last := site.next(Health)).status != StageStatus.STOPPED:
-        pass
-    assert last.outputs[0].key == tray_key(SITE, TRAY, "raw")
 
 
 def test_the_viewer_draws_every_score_of_a_replay(site, tmp_path):
@@ -333,11 +284,15 @@ def test_a_stage_that_writes_what_a_replay_writes_ends_it_and_keeps_the_next_fro
     assert {kind: q.qsize() for kind, q in site.heard.items() if kind is not Grid} == heard, "not even health"
 
 
-def test_row_07_beside_a_replay_neither_a_site_nor_an_acquisition_starts_and_the_replay_goes_on(site, tmp_path):
-    words = site.words(write_raw(tmp_path / "source.mcap", 500), "--rate", 0.01)
-    replay = RunningCommand(words)
-    site.running.append(replay)
-    site.next(Clock)
+def test_row_07_beside_a_replay_no_site_and_no_acquisition_starts_and_a_signal_ends_it_cleanly(
+    site, tmp_path, terminals
+):
+    recording = write_raw(tmp_path / "source.mcap", 500)
+    terminal = Terminal(site.words(recording, "--rate", 0.01))
+    terminals.append(terminal)
+    while not site.next(Health).outputs:
+        pass
+    assert not terminal.is_restored()
     up = fantwin(*site.chain.words("up"))
     acquisition = fantwin("up", "--only", "acquisition", *site.chain.words("")[1:])
     assert (up.returncode, acquisition.returncode) == (1, 1)
@@ -352,7 +307,13 @@ def test_row_07_beside_a_replay_neither_a_site_nor_an_acquisition_starts_and_the
     while not site.heard[Clock].empty():
         site.next(Clock)
     site.next(Clock)
-    assert replay.end() == 0
+    terminal.process.send_signal(signal.SIGTERM)
+    status, _, err = terminal.end()
+    assert status == 0, err
+    assert terminal.is_restored()
+    while (last := site.next(Health)).status != StageStatus.STOPPED:
+        pass
+    assert last.outputs[0].key == tray_key(SITE, TRAY, "raw")
 
 
 def test_unreadable_parts_are_reported_in_the_output_and_the_exit_code(tmp_path, endpoint):

@@ -23,7 +23,7 @@ from fantwin.schemas.topics import ALL_TRAYS, BY_NAME, alive_key, sessions_key, 
 
 _POLL_S = 0.02
 _ANY_STAGE_S = 2.0  # to find any stage: one whose first peer has died tries its endpoint every second
-_ALL_STAGES_S = 4.0  # to receive the health of all stages that were found
+_ALL_STAGES_S = 30.0  # to receive the health of all stages that were found: one that is not linked yet misses messages
 _UNCHANGED_S = 1.0  # after so long without a new stage, all are found
 _STALLED_S = 10.0  # at the end: after so long without progress, waiting for stages that are behind ends
 
