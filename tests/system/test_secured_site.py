@@ -16,7 +16,7 @@ from fantwin.pipeline.bus.session import join_bus
 from fantwin.pipeline.config.loading import load_config
 from fantwin.pipeline.site.site_watcher import SiteWatcher
 from tests.support.fantwin_command import as_typed
-from tests.support.running_chain import DEMO, TRAY, Chain, RunningCommand, eventually, received, view_of
+from tests.support.running_chain import DEADLINE_S, DEMO, TRAY, Chain, RunningCommand, eventually, received, view_of
 
 pytestmark = [pytest.mark.slow, pytest.mark.real_time]
 
@@ -59,7 +59,7 @@ def run(chain: Chain) -> None:
         chain.kill(watcher, "scorer")
         (alarm,) = eventually(watcher.current_alarms, "an alarm stands")
         assert (alarm.newest.header.tray, alarm.newest.fan) == (TRAY, FAULTY)
-        acknowledged = as_typed(*chain.words("alarms"), "ack", TRAY, FAULTY)
+        acknowledged = as_typed(*chain.words("alarms"), "ack", TRAY, FAULTY, "--timeout", DEADLINE_S)
         assert acknowledged.returncode == 0, acknowledged.stderr
         assert not any(view.health.problem for view in watcher.stages() if "certificate" in view.health.problem)
     doctor = as_typed(*chain.words("doctor"), "--listen-s", 0, "--json")

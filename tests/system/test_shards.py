@@ -27,7 +27,7 @@ from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Alarm, Score, ScorerSnapshot
 from fantwin.schemas.topics import BY_NAME, tray_key
 from tests.support.fantwin_command import as_typed
-from tests.support.running_chain import RunningCommand, eventually
+from tests.support.running_chain import DEADLINE_S, RunningCommand, eventually
 from tests.support.scored_blocks import EPOCH_NS, STEP_NS, prediction_of
 from tests.support.twin_files import write_twin
 
@@ -168,7 +168,7 @@ def counter(shards: Shards, stage: str, name: str) -> int:
 def alarm_is_raised_and_acknowledged(shards: Shards) -> Alarm:
     shards.feed(20)
     eventually(lambda: shards.heard(Transition.DIAGNOSED), "the fault has an alarm and a cause")
-    asked = as_typed("alarms", "ack", "b", FAULTY, *shards.words("here"))
+    asked = as_typed("alarms", "ack", "b", FAULTY, "--timeout", DEADLINE_S, *shards.words("here"))
     assert asked.returncode == 0, asked.stderr
     (acknowledged,) = eventually(lambda: shards.heard(Transition.ACKNOWLEDGED), "it is acknowledged")
     assert (acknowledged.header.tray, acknowledged.fan, acknowledged.active) == ("b", FAULTY, True)

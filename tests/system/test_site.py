@@ -51,7 +51,7 @@ def current_alarms(chain: Chain) -> list[dict[str, Any]]:
 
 def ask(chain: Chain, *words: object) -> dict[str, Any]:
     """The answer for the one fan."""
-    done = as_typed(*chain.words("alarms"), *words, "--json")
+    done = as_typed(*chain.words("alarms"), *words, "--timeout", 300, "--json")
     assert done.returncode == 0, done.stderr
     (answer,) = json.loads(done.stdout)["answers"]
     return answer
@@ -64,7 +64,7 @@ def operate(chain: Chain) -> list[dict[str, Any]]:
     ask(chain, "ack", TRAY, FAULTY, "--operator", "Ann")
     ask(chain, "shelve", TRAY, FAULTY, "--for", "30m", "--operator", "Bob")
     ask(chain, "out-of-service", TRAY, 5)
-    refused = as_typed(*chain.words("alarms"), "ack", TRAY, FAULTY)
+    refused = as_typed(*chain.words("alarms"), "ack", TRAY, FAULTY, "--timeout", 300)
     expected = f"fantwin: {TRAY}: fan {FAULTY}: refused: it is acknowledged already\n"
     assert (refused.returncode, refused.stderr) == (1, expected)
     alarms = current_alarms(chain)
