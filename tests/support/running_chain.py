@@ -49,9 +49,11 @@ def eventually(condition: Callable[[], Any], what: str, deadline_s: float = DEAD
 
 
 def is_running(process_id: int) -> bool:
-    """Whether there is such a process and it is no zombie."""
+    """Whether there is such a process and it is no zombie whose threads have all ended."""
+    process = Path(f"/proc/{process_id}")
     try:
-        return Path(f"/proc/{process_id}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+        is_zombie = (process / "stat").read_text().rpartition(")")[2].split()[0] == "Z"
+        return not is_zombie or len(list((process / "task").iterdir())) > 1
     except OSError:
         return False
 
@@ -129,7 +131,9 @@ class Chain:
         self.settings = [
             *(f"run_folder='{folder}'", f"tray.0.port='{self.port}'", f"bus.endpoint='{endpoint}'"),
             *("viewer.serve=false", "viewer.file='view.rrd'", f"launcher.stages={json.dumps(stages)}"),
-            *("recorder.topics=['raw', 'grid', 'prediction', 'score']", "recorder.flush_interval_s=1", *settings),
+            *("recorder.topics=['raw', 'grid', 'prediction', 'score']", "recorder.flush_interval_s=1"),
+            # nothing is late, hangs or is cut short where other tests hold up a process for seconds
+            *("resampler.watermark_s=600", "launcher.watchdog_s=300", "launcher.stop_timeout_s=120", *settings),
         ]
         self.stages = [f"acquisition/{TRAY}", *stages[1:]]
         self.tray: RunningCommand | None = None

@@ -47,15 +47,17 @@ from tests.support.twin_files import small_hybrid, write_twin
 
 pytestmark = pytest.mark.real_time
 WORKING = ["resampler", "twin_integrator", "scorer", "recorder"]
+SILENCE = "resampler.watermark_s=0.5"
+"""as by default: a replay is silent by its own clock, on any machine"""
 
 
 class Site:
     """Stages of the site of the demo, and the messages received on their bus."""
 
-    def __init__(self, folder: Path, endpoint: str) -> None:
-        self.chain = Chain(folder, endpoint, viewer=False)
+    def __init__(self, folder: Path, endpoint: str, *, listens: bool = True) -> None:
+        self.chain = Chain(folder, endpoint, SILENCE, viewer=False)
         self.heard: dict[type[Message], queue.Queue[Message]] = {kind: queue.Queue() for kind in (Grid, Clock, Health)}
-        self.bus = Bus(BusConfig(endpoint=endpoint))
+        self.bus = Bus(BusConfig(endpoint=endpoint), listens=listens)
         self.watcher = SiteWatcher(self.bus, SITE)
         self.running: list[RunningCommand] = []
         for topic, kind in (("grid", Grid), ("clock", Clock)):
@@ -102,8 +104,14 @@ class Site:
 
 
 @pytest.fixture
-def site(tmp_path, endpoint) -> Iterator[Site]:
-    site = Site(tmp_path, endpoint)
+def listens() -> bool:
+    """Whether the test is at the endpoint, where every other process meets it first."""
+    return True
+
+
+@pytest.fixture
+def site(tmp_path, endpoint, listens) -> Iterator[Site]:
+    site = Site(tmp_path, endpoint, listens=listens)
     yield site
     site.close()
 
@@ -163,7 +171,7 @@ def test_at_full_speed_stages_take_every_message_change_to_the_learned_twins_and
         recorded_site.put_in_force(f"tray1-{number}", twin.read_bytes())
         recorded_site.run(200)
     source = recorded_site.finished().rename(tmp_path / "source.mcap")
-    settings = [f"launcher.stages={json.dumps(WORKING)}", f"site='{SITE}'"]
+    settings = [f"launcher.stages={json.dumps(WORKING)}", f"site='{SITE}'", SILENCE]
     chain = Chain(tmp_path / "run", endpoint, *settings, viewer=False, configuration=tmp_path / "site.toml")
     try:
         up = chain.start_up()
@@ -284,6 +292,7 @@ def test_a_stage_that_writes_what_a_replay_writes_ends_it_and_keeps_the_next_fro
     assert {kind: q.qsize() for kind, q in site.heard.items() if kind is not Grid} == heard, "not even health"
 
 
+@pytest.mark.parametrize("listens", [False], ids=["the replay is met first"])
 def test_row_07_beside_a_replay_no_site_and_no_acquisition_starts_and_a_signal_ends_it_cleanly(
     site, tmp_path, terminals
 ):
