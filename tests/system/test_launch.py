@@ -167,9 +167,12 @@ def test_row_08_and_16_visitors_cut_links_and_a_closed_terminal_lose_nothing_and
 
 def test_a_recorder_that_is_down_at_the_end_is_restarted_to_record_what_it_missed(chain):
     up = start(chain)
-    os.kill(chain.process_ids()["recorder"], signal.SIGKILL)
-    up.line_with("recorder: was ended by signal 9")
-    status = up.end(signal.SIGINT)
+    recorder = chain.process_ids()["recorder"]
+    up.process.send_signal(signal.SIGSTOP)  # it learns of the kill and of its own end together
+    os.kill(recorder, signal.SIGKILL)
+    eventually(lambda: not is_running(recorder), "it is dead")
+    up.process.send_signal(signal.SIGINT)
+    status = up.end(signal.SIGCONT)
     assert chain.tray and chain.tray.end() == 0
     assert status == 0, (up.output()["lost"], up.lines[-3:])
     check_that_no_sample_is_missing(chain, MANY)
