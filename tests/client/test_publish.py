@@ -84,25 +84,6 @@ def test_samples_arrive_with_their_times_numbers_and_units(endpoint: str, raws: 
     np.testing.assert_array_equal(raws.column("command")[:3], [[0.25, 0.5], [0.25, 0.5], [0.3, 0.5]])
 
 
-def test_samples_that_are_sent_together_count_as_received_one_after_another(
-    endpoint: str, client: Client, raws: Raws, tmp_path: Path
-) -> None:
-    with acquisition(push_config(endpoint, tmp_path)):
-        tray = client.tray(TRAY)
-        before_ns = time.time_ns()
-        tray.publish(T_S + np.arange(3000) / 100, np.full((3000, 2), 0.5), np.full((3000, 2), 100.0))
-        tray.check()
-        raws.wait_for(3000)
-        after_ns = time.time_ns()
-    received_ns = raws.column("host_receive_t_ns")
-    assert before_ns <= received_ns[-1] <= after_ns, "the newest was received now"
-    steps_ns = np.diff(received_ns)
-    assert steps_ns.min() >= 0
-    # between messages the time that sending took is added
-    assert np.mean(np.abs(steps_ns - 10_000_000) < 1000) > 0.99
-    assert received_ns[-1] - received_ns[0] == pytest.approx(29.99e9, abs=after_ns - before_ns)
-
-
 def test_what_cannot_be_a_sample_of_the_tray_is_refused_at_once(
     endpoint: str, client: Client, raws: Raws, tmp_path: Path
 ) -> None:
@@ -124,13 +105,9 @@ def test_what_cannot_be_a_sample_of_the_tray_is_refused_at_once(
         for t, words in (
             (datetime(2026, 1, 1), "without a time zone"),
             (np.nan, "no time"),
-            (1e12, "2116"),
             ("now", "give seconds"),
             (datetime(2200, 1, 1, tzinfo=UTC), "2200-01-01 .*: beyond the year 2116"),
-            (datetime(2300, 1, 1, tzinfo=UTC), "2116"),
-            (np.datetime64("2200-01-01"), "2200-01-01: beyond the year 2116"),
-            (np.datetime64("3000-01-01"), "2116"),  # wraps to 1830 in ns
-            (np.datetime64("1700-01-01T00:00:00.000000000"), "2116"),
+            (np.datetime64("3000-01-01"), "3000-01-01: beyond the year 2116"),  # wraps to 1830 in ns
         ):
             with pytest.raises(TimeOrderError, match=words):
                 tray.publish(t, [0.5, 0.5], [1.0, 1.0])  # type: ignore[arg-type]
@@ -264,29 +241,24 @@ def test_a_date_in_summer_time_is_the_moment_it_names() -> None:
     assert times_ns(1_790_000_000.123456) == pytest.approx(1_790_000_000_123_456_000, abs=300)
 
 
-@pytest.mark.parametrize(
-    ("role", "why"),
-    [
-        ("viewer", "is a certificate of role 'viewer', which may not publish reading of a"),
-        ("source.b", "is a certificate of role 'source.b', which may not publish reading of a"),
-        (
-            "stranger",
-            "is a certificate of role 'stranger': the router at .* does not say what it may do; it has no such role in "
-            "site 'site', or is overloaded",
-        ),
-    ],
-)
-def test_a_certificate_that_may_not_publish_is_named_with_its_role(tmp_path: Path, role: str, why: str) -> None:
+def test_a_certificate_that_may_not_publish_is_named_with_its_role(tmp_path: Path) -> None:
     site = SecuredSite(tmp_path, free_endpoint())
     site.certificates.issue("stranger")
-    ca, (certificate, key) = tmp_path / "ca.pem", (tmp_path / f"{role}.{end}" for end in ("pem", "key"))
-    security = {"ca": ca, "certificate": certificate, "key": key}
-    with (
-        site.running(),
-        fantwin.client.connect(site.endpoint, "site", mode="client", security=security) as client,
-        pytest.raises(fantwin.client.NotAllowedError, match=f"tray a: .*{role}.pem {why}; use one of role 'source', "),
-    ):
-        client.tray("a")
+    unknown = "the router at .* does not say what it may do; it has no such role in site 'site', or is overloaded"
+    with site.running():
+        for role, why in (
+            ("viewer", "'viewer', which may not publish reading of a"),
+            ("source.b", "'source.b', which may not publish reading of a"),
+            ("stranger", f"'stranger': {unknown}"),
+        ):
+            files = {name: tmp_path / f"{role}.{end}" for name, end in (("certificate", "pem"), ("key", "key"))}
+            security = {"ca": tmp_path / "ca.pem", **files}
+            expected = f"tray a: .*{role}.pem is a certificate of role {why}; use one of role 'source', "
+            with (
+                fantwin.client.connect(site.endpoint, "site", mode="client", security=security) as client,
+                pytest.raises(fantwin.client.NotAllowedError, match=expected),
+            ):
+                client.tray("a")
 
 
 def test_with_certificates_a_source_publishes(endpoint: str, tmp_path: Path) -> None:

@@ -32,12 +32,20 @@ def moving(seconds: float, fans: int = 2, seed: int = 1) -> Array:
 
 def recorded(folder: Path, first_s: float, command: Array, rate_hz: float = RATE_HZ) -> None:
     """Add a recording of fans with a time constant of a second, from first_s after START_S on."""
-    history = HealthyHistory(folder, "site", "tray1", {"trays": "tray1"}, {}, hold_back_s=0.0, kept_s=1e9)
     speed = GAIN * command
     decay = np.exp(-1.0 / rate_hz)
     for k in range(1, len(command)):
         speed[k] = GAIN * command[k - 1] + decay * (speed[k - 1] - GAIN * command[k - 1])
     speed += np.random.default_rng(len(command)).normal(0.0, NOISE_RAD_S, speed.shape)
+    add_history(folder, first_s, command, speed, rate_hz)
+
+
+def add_history(
+    folder: Path, first_s: float, command: Array, speed_rad_s: Array, rate_hz: float, *, has_alarm: bool = False
+) -> None:
+    """Add a recording to the history of a tray. command, speed_rad_s: (samples, fans). has_alarm: one of the fans has
+    an alarm all the time."""
+    history = HealthyHistory(folder, "site", "tray1", {"trays": "tray1"}, {}, hold_back_s=0.0, kept_s=1e9)
     t_ns = round((START_S + first_s) * NS_PER_S) + (np.arange(len(command)) / rate_hz * NS_PER_S).astype(np.int64)
     for number, first in enumerate(range(0, len(command), SAMPLES_PER_MESSAGE)):
         rows = slice(first, first + SAMPLES_PER_MESSAGE)
@@ -46,7 +54,7 @@ def recorded(folder: Path, first_s: float, command: Array, rate_hz: float = RATE
             fans=command.shape[1],
             host_receive_t_ns=t_ns[rows],
             command=command[rows],
-            speed_rad_s=speed[rows],
+            speed_rad_s=speed_rad_s[rows],
         )
-        history.add(raw, has_alarm=False, is_watched=False)
+        history.add(raw, has_alarm=has_alarm, is_watched=False)
     history.close()

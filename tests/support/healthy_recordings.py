@@ -6,13 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from fantwin.pipeline.learning.healthy_history import HealthyHistory
-from fantwin.schemas.header import Header
-from fantwin.schemas.messages import Raw
-from fantwin.schemas.units import NS_PER_S
-from tests.support.fan_data import published_run
+from tests.support.commanded_fans import START_S, add_history
+from tests.support.fan_data import RATE_HZ, published_run
 
-START_S = 1_800_000_000
+__all__ = ["FANS", "START_S", "add_recording"]
+
 FANS = 2
 KEPT_EVERY = 5
 """sample of the simulation: 20 Hz, so that training takes seconds"""
@@ -29,17 +27,6 @@ def add_recording(
 ) -> None:
     """Two published fans under stairs from 0 to 100, from first_s after START_S on. factor: on their speeds. has_alarm:
     one of them has an alarm all the time."""
-    history = HealthyHistory(folder, "site", "tray1", {"trays": "tray1"}, {}, hold_back_s=0.0, kept_s=1e9)
     run = published_run(seed, seconds, FANS)
-    t_s, command, speed = (each[::KEPT_EVERY] for each in (run.t_s, run.command, run.speed_rad_s * np.array(factor)))
-    for number, first in enumerate(range(0, len(t_s), 100)):
-        rows = slice(first, first + 100)
-        raw = Raw(
-            header=Header("acquisition", number, "tray1"),
-            fans=FANS,
-            host_receive_t_ns=(START_S + first_s) * NS_PER_S + (t_s[rows] * NS_PER_S).astype(np.int64),
-            command=command[rows],
-            speed_rad_s=speed[rows],
-        )
-        history.add(raw, has_alarm=has_alarm, is_watched=False)
-    history.close()
+    command, speed = (each[::KEPT_EVERY] for each in (run.command, run.speed_rad_s * np.array(factor)))
+    add_history(folder, first_s, command, speed, RATE_HZ / KEPT_EVERY, has_alarm=has_alarm)

@@ -11,6 +11,7 @@ from fantwin.pipeline.recordings.reading import read_recording
 from fantwin.pipeline.recordings.writing import RecordingWriter
 from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Alarm, Array, Raw
+from fantwin.schemas.tacho import INSTANTANEOUS, tachos_to_json
 from fantwin.schemas.topics import tray_key
 from fantwin.twin.runs import Run
 from tests.support import made_messages
@@ -46,18 +47,22 @@ def write(path: Path, messages: int, **options: Any) -> Path:
     return writer.path
 
 
-def write_run(path: Path, run: Run) -> Path:
-    """A recording of a run, as `fantwin import` makes one of a table."""
+def write_run(path: Path, run: Run, unit: str = "rad/s") -> Path:
+    """A recording of a run, as `fantwin import` makes one of a table. unit: of speed, for people."""
     t_ns = np.rint(run.t_s * 1e9).astype(np.int64)
-    with RecordingWriter(path, {"site": "plant", "trays": "tray1", "source": run.name}) as writer:
+    metadata = {"site": "plant", "trays": "tray1", "source": run.name, "speed_unit": unit}
+    metadata |= {"tacho.tray1": tachos_to_json(run.tacho)} if run.tacho != INSTANTANEOUS else {}
+    with RecordingWriter(path, metadata) as writer:
         for sequence, first in enumerate(range(0, run.samples, 100)):
             rows = slice(first, first + 100)
+            auxiliary: dict[str, Any] = {name: of[rows].astype(np.float32) for name, of in run.auxiliary.items()}
             message = Raw(
                 header=Header("imported", sequence, "tray1"),
                 fans=run.fans,
                 host_receive_t_ns=t_ns[rows],
                 command=run.command[rows],
                 speed_rad_s=run.speed_rad_s[rows],
+                **auxiliary,
             )
             writer.add_message(RAW_KEY, message, int(t_ns[rows][-1]))
     return path

@@ -10,10 +10,19 @@ from pathlib import Path
 
 import pytest
 
+from fantwin.pipeline.cli.twins import drops_found
 from tests.support.fantwin_command import fantwin
 from tests.support.healthy_site import EPOCH_NS, PER_DAY, recorded
 
 MadeOnce = Callable[[str, Callable[[Path], None]], Path]
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _short_steady_time() -> Iterator[None]:
+    """The drops that a twin finds are asked of fans that have run steadily for seconds, not for a minute."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(drops_found, "STEADY_S", 5.0)
+        yield
 
 
 @pytest.fixture(autouse=True)

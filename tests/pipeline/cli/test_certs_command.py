@@ -13,7 +13,6 @@ from typer.testing import CliRunner, Result
 from fantwin.pipeline.bus.credentials import checked_credentials
 from fantwin.pipeline.cli import main as command_line
 from fantwin.pipeline.config.loading import load_config
-from fantwin.pipeline.config.roles import roles_of
 from fantwin.pipeline.errors import UserError
 from tests.support.site_certificates import SiteCertificates
 
@@ -134,14 +133,6 @@ def test_an_expired_certificate_is_shown_and_ends_the_command_with_1(path):
     assert "viewer.pem: expired on" in result.stdout
 
 
-def test_roles_of_a_site_are_its_stages_people_programs_and_one_for_each_tray(path):
-    roles = roles_of(load_config(path, stages=()))
-    assert {"dcim", "operator", "viewer", "source", "source.tray1", "router", "replay", "scorer.tray2"} <= set(roles)
-    assert roles["acquisition.tray1"].trays == ("tray1",)
-    assert roles["acquisition"].writes == ("raw",)
-    assert roles["dcim"].writes == ("command", "request")
-
-
 @pytest.mark.parametrize("host", ["a b", "", "10.0.0.0/8", "-a", "a..b", "x" * 64])
 def test_a_host_that_cannot_be_one_is_refused(path, host):
     done = certs(path, "issue", "router", "--host", host)
@@ -155,12 +146,6 @@ def test_a_name_or_an_address_of_a_host_is_in_the_certificate(path):
     made(certs(path, "issue", "router", *(word for host in hosts for word in ("--host", host)), "--json"))
     (shown,) = json.loads(certs(path, "show", "router", "--json").stdout)
     assert set(hosts) <= set(shown["hosts"])
-
-
-def test_this_host_may_have_a_name_for_which_there_is_no_certificate(path, monkeypatch):
-    monkeypatch.setattr("socket.gethostname", lambda: "münchen")
-    certs(path, "init")
-    assert made(certs(path, "issue", "router", "--json")) == ["router"]
 
 
 @pytest.mark.parametrize("content", [b"", b"\xff\xfe"])

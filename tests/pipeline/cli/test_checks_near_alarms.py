@@ -11,14 +11,13 @@ from fantwin.pipeline.cli.twins import next_version
 from fantwin.pipeline.cli.twins.fan_changes import changes_to_list, mean_changes
 from fantwin.pipeline.cli.twins.next_version import make_next_version
 from fantwin.pipeline.cli.twins.version_data import spread_parts
-from fantwin.pipeline.learning.healthy_history import HealthyHistory, healthy_recordings, recordings_near_alarms
+from fantwin.pipeline.learning.healthy_history import healthy_recordings, recordings_near_alarms
 from fantwin.pipeline.learning.versions import Check, TwinVersions
-from fantwin.schemas.header import Header
-from fantwin.schemas.messages import Array, Raw
+from fantwin.schemas.messages import Array
 from fantwin.schemas.units import NS_PER_S
 from fantwin.twin.models.physical import PhysicalModel
 from tests.pipeline.learning.test_versions import version
-from tests.support.commanded_fans import GAIN, RATE_HZ, START_S, moving
+from tests.support.commanded_fans import GAIN, RATE_HZ, START_S, add_history, moving
 from tests.support.twin_files import write_twin
 
 
@@ -48,30 +47,11 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def run(
-    folder: Path,
-    first_s: int,
-    seconds: float,
-    factor: tuple[float, float] | Array = (1.0, 1.0),
-    *,
-    has_alarm: bool = False,
-    is_commanded: bool = True,
+    folder: Path, first_s: int, seconds: float, factor: tuple[float, float] | Array = (1.0, 1.0), **more: bool
 ) -> None:
     """Always the same commands, so that the change of a fan is that of its factor."""
     command = np.tile(moving(100.0), (round(seconds / 100.0), 1))
-    speed = GAIN * command * np.array(factor)
-    history = HealthyHistory(folder, "site", "tray1", {"trays": "tray1"}, {}, hold_back_s=0.0, kept_s=1e9)
-    t_ns = (START_S + first_s) * NS_PER_S + (np.arange(len(command)) / RATE_HZ * NS_PER_S).astype(np.int64)
-    for number, first in enumerate(range(0, len(command), 50)):
-        rows = slice(first, first + 50)
-        raw = Raw(
-            header=Header("acquisition", number, "tray1"),
-            fans=2,
-            host_receive_t_ns=t_ns[rows],
-            command=command[rows] if is_commanded else np.full_like(command[rows], np.nan),
-            speed_rad_s=speed[rows],
-        )
-        history.add(raw, has_alarm=has_alarm, is_watched=False)
-    history.close()
+    add_history(folder, first_s, command, GAIN * command * np.array(factor), RATE_HZ, **more)
 
 
 def check(folder: Path) -> Check:
@@ -80,11 +60,6 @@ def check(folder: Path) -> Check:
     kept = TwinVersions(folder, "tray1").read().check
     assert kept
     return kept
-
-
-def usable_from_s(folder: Path) -> list[int]:
-    left = healthy_recordings(folder, TwinVersions(folder, "tray1").read().excluded_spans)
-    return [each.span[0] // NS_PER_S - START_S for each in left]
 
 
 def test_what_is_between_the_alarms_of_one_fan_is_not_taken_as_unchanged(folder: Path) -> None:
@@ -96,17 +71,6 @@ def test_what_is_between_the_alarms_of_one_fan_is_not_taken_as_unchanged(folder:
     run(folder, 51_000, 100.0, (1.0, 0.95))
     with pytest.raises(OfferError, match=r"^fan 1 is \d\.\d % slower"):
         check(folder)
-
-
-def test_when_one_fan_is_found_changed_all_since_the_last_check_is_left_out(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(next_version._Work, "needs_offer", lambda _work: False)
-    for day in range(1, 6):
-        run(folder, 10_000 * day, 300.0, (1.0, 0.95), has_alarm=True)
-        run(folder, 10_000 * day + 1000, 100.0, (1.0, 0.95))
-        check(folder)
-    assert usable_from_s(folder) == [0]
 
 
 def test_near_alarms_a_fault_of_one_fan_is_no_change_of_all(folder: Path) -> None:
@@ -137,13 +101,6 @@ def test_without_healthy_running_since_a_version_near_alarms_are_checked(folder:
     versions.use("tray1-2")
     run(folder, 5000, 200.0, has_alarm=True)
     assert check(folder).near_t_ns // NS_PER_S - START_S == 5199
-
-
-def test_samples_near_an_alarm_without_commands_keep_nothing_from_being_checked(folder: Path) -> None:
-    run(folder, 5000, 500.0, (1.05, 1.05))
-    run(folder, 6000, 100.0, has_alarm=True, is_commanded=False)
-    with pytest.raises(OfferError, match=r"^all fans are \d\.\d % faster"):
-        check(folder)
 
 
 def test_an_offer_is_not_learned_from_a_recording_that_began_before_the_change(

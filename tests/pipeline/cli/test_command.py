@@ -37,19 +37,26 @@ def chain(tmp_path: Path, endpoint: str) -> Iterator[Chain]:
     chain.close()
 
 
-@pytest.fixture
-def acquisition(chain: Chain, monkeypatch: pytest.MonkeyPatch) -> Iterator[RunningCommand]:
-    """Acquisition as it starts: commands wait until it answers, however long it takes."""
-    monkeypatch.setattr(commanding, "_ANSWER_S", DEADLINE_S)
-    running = RunningCommand(["up", "--only", "acquisition", *chain.words("run")[1:]])
-    yield running
-    running.kill()
+def test_what_the_line_did_not_take_is_one_line_that_says_why_and_a_note_names_what_was_probably_meant(
+    chain, monkeypatch
+):
+    monkeypatch.setattr(commanding, "_ANSWER_S", DEADLINE_S)  # a command waits for the acquisition, which starts
+    acquisition = RunningCommand(["up", "--only", "acquisition", *chain.words("run")[1:]])
+    try:
+        error = error_of(*chain.words("command"), "--fan", 3, 0.5)  # there is no tray
+        assert "tray tray1: the command failed: " in error and str(chain.port) in error
+        chain.start_tray()
+        words = (*chain.words("command"), "--set", "tray.0.command_max=255", "--json")
 
+        def sent() -> Result | None:
+            done = fantwin(*words, "--fan", 3, 0.6)
+            return None if done.exit_code else done
 
-def test_a_command_that_the_line_did_not_take_is_one_line_that_says_why(chain, acquisition):
-    error = error_of(*chain.words("command"), "--fan", 3, 0.5)  # there is no tray
-    assert "tray tray1: the command failed: " in error
-    assert str(chain.port) in error
+        done = eventually(sent, "the acquisition takes a command")
+    finally:
+        acquisition.kill()
+    assert json.loads(done.stdout)["value"] == 0.6
+    assert done.stderr == "note: commands of tray tray1 go from 0 to 255, and 0.6 was sent; 60 % of this range is 153\n"
 
 
 def test_without_an_acquisition_the_command_is_reported_as_not_received(chain, monkeypatch):
@@ -125,16 +132,3 @@ def test_a_set_point_is_sent_in_rad_s_and_leaves_the_other_fans_alone():
 )  # fmt: skip
 def test_a_share_is_noted_where_commands_are_no_shares(low, high, command, is_noted):
     assert bool(share_note(TrayConfig(name="a", fans=1, command_min=low, command_max=high), command)) == is_noted
-
-
-def test_a_note_names_the_range_and_the_command_that_was_probably_meant(chain, acquisition):
-    chain.start_tray()
-    words = (*chain.words("command"), "--set", "tray.0.command_max=255", "--json")
-
-    def sent() -> Result | None:
-        done = fantwin(*words, "--fan", 3, 0.6)
-        return None if done.exit_code else done
-
-    done = eventually(sent, "the acquisition that starts takes a command")
-    assert json.loads(done.stdout)["value"] == 0.6
-    assert done.stderr == "note: commands of tray tray1 go from 0 to 255, and 0.6 was sent; 60 % of this range is 153\n"

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import threading
 from pathlib import Path
 
 import numpy as np
-import pytest
 
-from fantwin.pipeline.cli.watch.child_commands import RECORDING_ONLY, Commands, next_recording_file
+from fantwin.pipeline.cli.watch.child_commands import RECORDING_ONLY, next_recording_file
 from fantwin.pipeline.config.loading import load_config
 from fantwin.pipeline.config.models import TrayConfig
 from fantwin.pipeline.learning.ordinary_operation import OrdinaryOperation
@@ -82,13 +80,6 @@ def test_why_its_doctor_step_fails_is_on_standard_error(tmp_path: Path, endpoint
     assert done.stderr.rstrip().endswith("fantwin: `fantwin doctor` failed (exit code 1) and has said why")
     (line,) = done.stdout.splitlines()
     assert line.startswith("fantwin doctor -c ")
-
-
-def test_what_its_doctor_step_finds_in_order_is_on_standard_output(capfd: pytest.CaptureFixture[str]) -> None:
-    Commands(threading.Event(), print, to_standard_error=False).check("doctor")
-    printed = capfd.readouterr()
-    assert "ok   Python " in printed.out
-    assert printed.err == ""
 
 
 def test_a_site_that_only_records_records_whatever_its_configuration_leaves_out(tmp_path: Path) -> None:

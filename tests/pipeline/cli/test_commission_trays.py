@@ -206,18 +206,6 @@ def test_a_tray_that_fails_leaves_the_others_their_twins(played: Played, command
     assert found["recordings"] == recorded.split(", ")
 
 
-def test_if_every_tray_fails_one_line_names_them_all(played: Played, monkeypatch: pytest.MonkeyPatch) -> None:
-    before = played.configuration.read_text(encoding="utf-8")
-    monkeypatch.setattr(PlayedSite, "silent", ("b",))
-    played.failing = ("train", "a")
-    result = played.commission()
-    assert str(result.exception).startswith(
-        "tray a failed: `fantwin train` failed (exit code 1) and has said why; tray b failed: no sample for 60 s; "
-    )
-    assert played.configuration.read_text(encoding="utf-8") == before
-    assert not list(played.folder.glob("*.onnx"))
-
-
 def test_ctrl_c_keeps_the_twins_that_were_written(played: Played) -> None:
     before = played.configuration.read_text(encoding="utf-8")
     played.stopped = ("calibrate", "b")

@@ -139,28 +139,9 @@ def test_each_failure_is_a_problem_of_the_summary(tmp_path, changes, problem):
     assert problem in Run(tmp_path, **changes).summary().problems
 
 
-def test_without_a_score_there_is_no_latency_and_the_json_is_still_json(tmp_path):
-    def refuse(word: str) -> None:
-        pytest.fail(f"{word} is no JSON")
-
-    reported = json.loads(Run(tmp_path, scored=0).summary().to_json(), parse_constant=refuse)
-    assert reported["latency_ms"] == {"p50": None, "p99": None}
-
-
 def test_an_alarm_while_the_fan_runs_back_is_that_faults_and_not_false(tmp_path):
     summary = Run(tmp_path, alarms=[*RIGHT, (2, True, 16.0), (2, False, 17.0)]).summary()
     assert summary.false_alarms == 0
-
-
-def test_the_parts_of_a_run_are_counted_together(tmp_path):
-    run = Run(tmp_path)
-    run.summary()
-    first = tmp_path / "recording.mcap"
-    run.alarms, run.first = [], SAMPLES
-    second = first.rename(tmp_path / "recording-2.mcap")
-    run.summary()
-    summary = summarise(tmp_path / "truth.json", [first, second], {})
-    assert summary.samples_recorded == 2 * SAMPLES
 
 
 def test_without_the_report_of_the_simulated_tray_there_is_no_summary(tmp_path):

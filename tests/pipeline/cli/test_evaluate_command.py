@@ -12,7 +12,6 @@ from fantwin.twin.errors import TwinError
 from fantwin.twin.evaluation.accuracy import (
     Figures,
     free_run_residuals,
-    healthy_sigma_rad_s,
     one_step_residual,
     sums_of_model,
 )
@@ -24,9 +23,9 @@ from fantwin.twin.models.physical import PhysicalModel
 from fantwin.twin.models.physics import PARAMETER_NAMES
 from fantwin.twin.runs import Array, Run
 from tests.pipeline.cli.conftest import MadeOnce
-from tests.pipeline.cli.test_train_commands import record
 from tests.support import fan_data
 from tests.support.fantwin_command import fantwin
+from tests.support.written_recordings import write_run
 
 
 def parameters_of(**values: float) -> Array:
@@ -95,15 +94,6 @@ def test_a_fan_that_gathers_speed_from_the_first_sample_on_is_not_started_too_fa
     assert figures_on(missing).max_error_rad_s < 0.1
 
 
-def test_a_fan_first_measured_when_its_start_is_long_forgotten_is_still_followed(run: Run) -> None:
-    speed = run.speed_rad_s.copy()
-    speed[:2000] = np.nan
-    late = Run("late", run.t_s, run.command, speed)
-    figures = figures_on(late)
-    assert figures.rmse_rad_s == pytest.approx(fan_data.NOISE_RAD_S, rel=0.06)
-    assert figures.samples == 1000
-
-
 def lossy_and_irregular(samples: int = 400) -> Run:
     rng = np.random.default_rng(5)
     t_s = np.cumsum(rng.choice([0.008, 0.01, 0.013], samples))
@@ -138,16 +128,6 @@ def test_the_one_step_error_takes_speeds_from_the_fan_and_past_commands_from_the
     assert 0.2 < np.mean(np.isfinite(found)) < 0.9
 
 
-def test_the_one_step_error_of_the_true_model_is_the_noise_of_two_samples(run: Run) -> None:
-    figures = figures_on(run)
-    # One noise in the speed it starts from, hardly damped in 10 ms, and one in the speed it is compared with.
-    assert figures.one_step_rmse_rad_s == pytest.approx(np.sqrt(2.0) * fan_data.NOISE_RAD_S, rel=0.05)
-
-
-def test_sigma_is_about_the_twin_so_a_bias_widens_it() -> None:
-    assert healthy_sigma_rad_s(np.array([[3.0, 1.0], [3.0, -1.0], [np.nan, 1.0]])).tolist() == [3.0, 1.0]
-
-
 def test_a_diverging_free_run_is_infinite_not_an_exception(run: Run) -> None:
     runaway = parameters_of(J=0.001, C_D=-1.0)
     figures = figures_on(run, runaway)
@@ -169,7 +149,7 @@ def recorded(made_once: MadeOnce) -> tuple[Path, Path]:
     """A twin and a recording of two fans."""
 
     def make(folder: Path) -> None:
-        recording = record(folder / "two.mcap", fan_data.published_run(4, 15.0, fans=2), unit="rpm")
+        recording = write_run(folder / "two.mcap", fan_data.published_run(4, 15.0, fans=2), unit="rpm")
         trained = fantwin("train", recording, "--model", "narx", "--iterations", 1, "-o", folder / "twin.onnx")
         assert trained.exit_code == 0, trained.output
 
@@ -187,13 +167,8 @@ def test_the_json_of_evaluate_has_other_grids_and_the_residual_analysis(recorded
     for fan in result["fans"]:
         left = fan["residual"]
         assert left["samples"] == 1500 - 300
-        assert len(left["lags_s"]) == len(left["autocorrelation"]) > 100
-        assert len(left["cross_lags_s"]) == len(left["cross_correlation"]) == 2 * len(left["lags_s"]) + 1
+        assert len(left["cross_lags_s"]) == 2 * len(left["lags_s"]) + 1 > 200
         assert left["white"] == (left["ljung_box_p"] >= 0.05)
-        peak = left["cross_over_bound"] * left["cross_bound_95"]
-        at = np.argmin(np.abs(np.array(left["cross_lags_s"]) - left["cross_peak_lag_s"]))
-        assert left["cross_correlation"][at] == pytest.approx(peak)
-        assert left["independent_samples"] <= left["samples"]
 
 
 def test_evaluate_shows_a_row_for_each_fan_and_each_grid_and_warns_as_the_report_does(
@@ -218,8 +193,8 @@ def tray(made_once: MadeOnce) -> Path:
     """A folder with a recording of three fans that differ, and a twin of the first and the last."""
 
     def make(folder: Path) -> None:
-        recording = record(folder / "three.mcap", fan_data.rough_run(5, 15.0, fans=3))
-        record(folder / "two.mcap", fan_data.rough_run(5, 15.0, fans=2))
+        recording = write_run(folder / "three.mcap", fan_data.rough_run(5, 15.0, fans=3))
+        write_run(folder / "two.mcap", fan_data.rough_run(5, 15.0, fans=2))
         made = fantwin("train", recording, "--fans", "0,2", "--model", "physical", "-o", folder / "twin.onnx")
         assert made.exit_code == 0, made.output
 

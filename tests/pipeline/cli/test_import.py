@@ -12,7 +12,7 @@ from fantwin.pipeline.replay.default_config import default_config, first_raw
 from fantwin.schemas.messages import Array, Raw
 from fantwin.schemas.tacho import Tacho
 from fantwin.twin.models.physical import PhysicalModel
-from tests.support.fantwin_command import error_of, fantwin
+from tests.support.fantwin_command import fantwin
 from tests.support.twin_files import write_twin
 
 
@@ -149,14 +149,3 @@ def test_speeds_that_look_counted_are_pointed_out_unless_they_are_declared_so(tm
     assert "hint: fan 0: readings are multiples of 30 rpm and change every 1.00 s: a count over 1 s" in result.stderr
     declared = fantwin(*arguments, "--tacho", "count:window_s=1", "--force")
     assert "hint" not in declared.stderr
-
-
-def test_an_existing_recording_is_replaced_only_when_forced(tmp_path):
-    path, _ = measured(tmp_path)
-    recording = tmp_path / "r.mcap"
-    recording.write_bytes(b"precious")
-    arguments = ("import", path, *ARGUMENTS, "-o", recording)
-    assert error_of(*arguments) == f"{recording}: exists; name another file with -o, or replace it with --force"
-    assert recording.read_bytes() == b"precious"
-    assert fantwin(*arguments, "--force").exit_code == 0
-    assert len(list(read_recording(recording))) == 14

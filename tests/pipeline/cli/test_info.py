@@ -129,13 +129,6 @@ def test_row_18_losses_of_all_sessions_of_a_stage_are_shown_and_what_was_lost_be
     assert shown(path)["lost"] == {"resampler": 2 + 3 + 5}, "a file without an index shows the same"
 
 
-def test_a_session_in_two_parts_counts_once(tmp_path):
-    first, second, third, fourth = healths_of(*SESSIONS)
-    one = with_healths(tmp_path / "r.mcap", (first, second, third))
-    other = with_healths(tmp_path / "r-2.mcap", (fourth,), SequenceLedger())
-    assert shown(one, other)["lost"] == {"resampler": 2 + 3 + 5}
-
-
 def test_row_13_the_last_health_of_a_session_is_found_after_the_host_clock_was_set_back(tmp_path):
     (first, t_ns), (last, _) = healths_of(SESSIONS[0], at_s=3600)
     path = with_healths(tmp_path / "r.mcap", ((first, t_ns), (last, t_ns - 3600 * SECOND_NS)))
@@ -150,17 +143,6 @@ def test_a_file_without_an_index_is_read_in_full_with_the_same_result(tmp_path):
     assert of_truncated["damage"] == ["it has no index"]
     different = {name for name in of_whole if of_whole[name] != of_truncated[name]}
     assert different == {"file", "size_bytes", "damage"}
-
-
-def test_a_truncated_file_is_reported_and_one_that_lacks_only_its_index_has_lost_nothing(tmp_path):
-    path = write(tmp_path / "r.mcap", 300)
-    content = path.read_bytes()
-    path.write_bytes(content[:-50])
-    shown(path, exit_code=0)
-    path.write_bytes(content[:40_000])
-    (found,) = shown(path, exit_code=3)["files"]
-    assert found["damage"][0] == "it is truncated, as after a crash"
-    assert "it is truncated, as after a crash; repair it with `fantwin info --repair`" in fantwin("info", path).stdout
 
 
 def test_a_file_that_is_still_being_written_is_shown_up_to_what_is_on_disk(tmp_path):
@@ -225,16 +207,6 @@ def test_parts_are_added_up_and_checked_for_continuity(tmp_path):
     first.unlink()
     assert shown(second, third, exit_code=3)["continuity"] == [], "the oldest were deleted"
     assert "continues r.mcap" in fantwin("info", second, third).stdout
-
-
-def test_a_part_that_does_not_begin_where_the_one_before_ended_is_reported(tmp_path):
-    place = parts_in(tmp_path)
-    part(place, range(10)).finish()
-    part(place, range(12, 20), SequenceLedger({(RAW_KEY, "acquisition-1"): 12})).finish()
-    found = shown(tmp_path / "r.mcap", tmp_path / "r-2.mcap", exit_code=3)
-    assert found["continuity"] == [
-        f"r-2.mcap starts at message 12 of {RAW_KEY} acquisition-1, but r.mcap ends before 10"
-    ]
 
 
 def test_a_pause_is_shown(tmp_path):

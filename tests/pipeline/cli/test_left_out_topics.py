@@ -83,13 +83,6 @@ def test_a_plot_makes_the_scores_again_and_shows_the_same(lean, whole, tmp_path)
     assert len(paths[0]) > 3 and paths[0] == paths[1], "the curves"
 
 
-def test_a_view_makes_the_scores_again(lean, tmp_path):
-    done = fantwin("view", lean, "-o", tmp_path / "v.rrd", "--json")
-    assert done.exit_code == 0, done.output
-    assert json.loads(done.stdout)["fans"] == 3
-    assert (tmp_path / "v.rrd").stat().st_size > 50_000
-
-
 def test_what_a_view_and_a_plot_lack_is_told_as_by_a_replay(lean, tmp_path, monkeypatch):
     monkeypatch.setattr("fantwin.pipeline.recordings.writing.CHUNK_BYTES", 4096)
     damaged = without_topics(lean, tmp_path / "damaged.mcap", *MADE)

@@ -13,10 +13,10 @@ from fantwin.pipeline.cli import main as command_line
 from fantwin.pipeline.cli.main import COMMANDS
 from fantwin.twin.models.physical import PhysicalModel
 from fantwin.twin.runs import Run
-from tests.pipeline.cli.test_train_commands import record
 from tests.support.fan_data import published_run
 from tests.support.running_chain import DEMO
 from tests.support.twin_files import write_twin
+from tests.support.written_recordings import write_run
 
 LINES = Path(__file__).with_name("refusals.txt").read_text(encoding="utf-8").splitlines()
 ROWS = [line for line in LINES if line and not line.startswith("#")]
@@ -39,10 +39,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "users.toml").write_text(tray.format("a") + '[gateway]\nusers = "none.toml"\n', encoding="utf-8")
     (folder / "table.csv").write_text("t,u,y1,y2\n0,1,2,2\n1,2,3,4\n2,2,2,2\n3,2,2,2\n", encoding="utf-8")
     run = published_run(1, 20.0, fans=2)
-    record(folder / "r.mcap", run)
-    record(folder / "rpm.mcap", published_run(2, 20.0, fans=2), unit="rpm")
-    record(folder / "three.mcap", published_run(3, 20.0, fans=3))
-    record(folder / "still.mcap", Run("still", run.t_s, np.full_like(run.command, 50.0), run.speed_rad_s))
+    write_run(folder / "r.mcap", run)
+    write_run(folder / "rpm.mcap", published_run(2, 20.0, fans=2), unit="rpm")
+    write_run(folder / "three.mcap", published_run(3, 20.0, fans=3))
+    write_run(folder / "still.mcap", Run("still", run.t_s, np.full_like(run.command, 50.0), run.speed_rad_s))
     training = {"trainer": "none", "physics": "fixed", "seed": 0, "iterations": 0, "duration_s": 0.0, "data": []}
     write_twin(folder / "two.onnx", PhysicalModel(), 2)
     write_twin(folder / "of-0-2.onnx", PhysicalModel(), 2, training=training | {"fans": [0, 2]})

@@ -8,9 +8,8 @@ from pathlib import Path
 import pytest
 from mcap.opcode import Opcode
 
-from fantwin.pipeline.recordings.contents import TRUNCATED, contents_of
+from fantwin.pipeline.recordings.contents import contents_of
 from fantwin.pipeline.recordings.records import RecordReader
-from fantwin.pipeline.recordings.repair import repair_in_place
 from fantwin.pipeline.recordings.writing import RecordingWriter
 from fantwin.schemas.health import Output
 from fantwin.schemas.topics import health_key
@@ -40,19 +39,6 @@ def test_a_truncated_file_is_repaired_under_its_name_and_the_loss_reported(tmp_p
     assert "it is truncated, as after a crash: messages of the unfinished chunk may be missing" in done.stdout
     assert len(read_by_others(tmp_path / "r.mcap")) == 20
     assert (tmp_path / "r.mcap.original").exists()
-
-
-def test_the_json_says_the_same(tmp_path, truncated):
-    done = fantwin("info", "--repair", truncated, "-o", tmp_path / "out.mcap", "--json")
-    shown = json.loads(done.stdout)
-    assert done.exit_code == 3
-    assert shown["output"] == str(tmp_path / "out.mcap")
-    assert shown["original"] is None
-    assert shown["messages"] == 20
-    counts = {"messages": 20, "missing": 0, "duplicated": 0, "first_ns": 1000, "last_ns": 1019}
-    assert counts.items() <= shown["topics"][RAW_KEY].items()
-    assert shown["discarded_bytes"] > 0
-    assert truncated.exists(), "with -o the truncated file stays what it is"
 
 
 def test_an_intact_file_is_not_changed_and_one_that_lacks_only_its_index_has_lost_nothing(whole):
@@ -92,17 +78,6 @@ def test_info_reports_the_losses_of_a_repaired_file(tmp_path, number):
     assert contents_of(tmp_path / "out.mcap").next[RAW_KEY, "acquisition-1"] == 15
     assert "repaired earlier: damaged chunks: 1" in fantwin("info", tmp_path / "out.mcap").stdout
     assert fantwin("info", "--repair", tmp_path / "out.mcap").exit_code == 3, "it still is what it is"
-
-
-def test_info_reports_the_possible_losses_of_a_truncated_file_after_its_repair(tmp_path, truncated):
-    assert fantwin("info", "--repair", truncated, "-o", tmp_path / "out.mcap").exit_code == 3
-    repaired = repair_in_place(truncated)
-    assert repaired is not None
-    for path in (tmp_path / "out.mcap", repaired.path):
-        done = fantwin("info", path, "--json")
-        assert done.exit_code == 3
-        (file,) = json.loads(done.stdout)["files"]
-        assert file["recovered"] == [f"{TRUNCATED}: messages of the unfinished chunk may be missing"]
 
 
 def test_messages_that_health_reports_as_published_and_that_are_not_there_are_reported(tmp_path):

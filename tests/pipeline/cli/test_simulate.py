@@ -1,7 +1,5 @@
 import json
-import os
 import signal
-import termios
 import threading
 import time
 from collections.abc import Iterator
@@ -17,9 +15,7 @@ import serial
 from fantwin.pipeline.cli.simulation.simulate import simulate
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.recordings.reading import read_metadata, read_recording
-from fantwin.pipeline.sources.simulated import device as simulated_line
-from fantwin.pipeline.sources.simulated.device import PseudoTerminal, play, wait_for_reader
-from fantwin.pipeline.sources.simulated.table import TableSample
+from fantwin.pipeline.sources.simulated.device import PseudoTerminal
 from fantwin.schemas import wire
 from fantwin.schemas.messages import Raw
 from fantwin.schemas.tacho import Tacho
@@ -141,16 +137,6 @@ def test_a_signal_completes_the_truth_and_removes_the_link(tmp_path: Path) -> No
     assert not (tmp_path / "tray").is_symlink()
 
 
-def test_when_stopped_before_anybody_reads_the_truth_is_that_nothing_happened(tmp_path: Path) -> None:
-    with simulated(tmp_path, fault=["rotor:fan=0,start=0"]) as (stop, _):
-        stop.set()
-    truth = truth_of(tmp_path)
-    assert truth["complete"]
-    assert truth["samples_sent"] == 0
-    assert truth["start_ns"] is None
-    assert truth["faults"][0]["start_ns"] is None
-
-
 def test_unread_samples_are_counted_and_a_later_reader_sees_the_gap(tmp_path: Path) -> None:
     with simulated(tmp_path) as (stop, _):
         first = Reader(tmp_path / "tray")
@@ -192,126 +178,6 @@ def test_commands_and_set_points_show_in_the_samples(tmp_path: Path) -> None:
     assert [counters.uptime_s for counters in reader.counters[:3]] == [0, 1, 2]
     counts = dict(zip(wire.DEVICE_COUNTERS, reader.counters[2].counts, strict=True))
     assert {name: count for name, count in counts.items() if count} == {"frames": 2, "bad_length": 1, "bad_crc": 1}
-
-
-class Burst:
-    """A device whose samples are all due at once."""
-
-    def __init__(self, samples: int, fans: int) -> None:
-        self.fans, self.left = fans, samples
-
-    def due_s(self) -> float | None:
-        return 0.0 if self.left else None
-
-    def take(self) -> TableSample:
-        self.left -= 1
-        return TableSample(0.0, 7, self.left, np.zeros(self.fans), np.ones(self.fans))
-
-    def command(self, values: np.ndarray) -> None:
-        raise AssertionError(values)
-
-    def set_point(self, values_rad_s: np.ndarray) -> None:
-        raise AssertionError(values_rad_s)
-
-
-@pytest.fixture
-def line() -> Iterator[PseudoTerminal]:
-    terminal = PseudoTerminal()
-    yield terminal
-    terminal.close()
-
-
-def test_a_full_line_does_not_block_and_truncates_no_frame(line: PseudoTerminal) -> None:
-    decoder = wire.Decoder("binary", 64)
-    received: list[wire.Frame | wire.Fault] = []
-    port = os.open(line.port, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
-
-    def take_all() -> None:
-        while True:
-            try:
-                data = os.read(port, 65536)
-            except BlockingIOError:
-                return
-            received.extend(decoder.feed(data))
-
-    sent = 0
-    for round_number in range(3):
-        sequence = 1000 * round_number
-        while line.write(wire.encode("binary", wire.Sample(0, sequence, (0.0,) * 64, (1.0,) * 64))):
-            sequence += 1
-            sent += 1
-        assert sequence > 1000 * round_number
-        while True:
-            take_all()
-            if line.flush() and len(received) == sent:
-                break
-    os.close(port)
-    assert all(isinstance(frame, wire.Sample) for frame in received)
-
-
-def test_a_delayed_device_sends_all_it_missed_and_reports_how_late_it_was(line: PseudoTerminal) -> None:
-    port = serial.Serial(line.port, timeout=5.0)
-    bytes_to_come = 30 * len(wire.encode("binary", wire.Sample(7, 1, (0.0,) * 2, (1.0,) * 2)))
-    reader = threading.Thread(target=port.read, args=(bytes_to_come,))
-    reader.start()
-    stop = threading.Event()
-    played = play(Burst(30, fans=2), line, "binary", 1.0, stop, on_start=lambda _: stop.wait(0.05))
-    reader.join(10.0)
-    port.close()
-    assert played.samples_sent == played.samples_late == 30
-    assert played.worst_lateness_s >= 0.05
-
-
-def test_waiting_for_a_reader_ends_when_one_takes_what_is_sent_or_when_stopped(line: PseudoTerminal) -> None:
-    """Opening is not enough: a serial library discards what arrives before it has set up the port."""
-    assert not line.has_reader()
-    stop = threading.Event()
-    waiting = threading.Thread(target=wait_for_reader, args=(line, "binary", stop))
-    waiting.start()
-    port = os.open(line.port, os.O_RDONLY | os.O_NOCTTY)
-    eventually(lambda: simulated_line._readable_bytes(port), "a delimiter has been sent")
-    assert waiting.is_alive()
-    termios.tcflush(port, termios.TCIFLUSH)
-    waiting.join(10.0)
-    assert not waiting.is_alive()
-    assert not stop.is_set()
-    os.close(port)
-    assert not line.has_reader()
-    stop.set()
-    wait_for_reader(line, "binary", stop)
-
-
-def test_a_program_that_opens_the_line_only_for_a_moment_is_not_a_reader(line: PseudoTerminal) -> None:
-    ports = [os.open(line.port, os.O_RDONLY | os.O_NOCTTY)]
-
-    class LeavesAtOnce(threading.Event):
-        """In the first wait the visitor leaves. The second ends the test."""
-
-        def wait(self, timeout: float | None = None) -> bool:
-            if ports:
-                os.close(ports.pop())
-            else:
-                self.set()
-            return self.is_set()
-
-    stop = LeavesAtOnce()
-    wait_for_reader(line, "text", stop)
-    assert stop.is_set()
-
-
-def test_the_end_waits_for_the_reader_and_reports_what_it_did_not_read(
-    line: PseudoTerminal, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    port = os.open(line.port, os.O_RDWR | os.O_NOCTTY)
-    monkeypatch.setattr(simulated_line, "DRAIN_LIMIT_S", 0.05)
-    played = play(Burst(3, fans=2), line, "binary", 1.0, threading.Event())
-    assert played.bytes_unread > 50
-    assert played.samples_sent == 3
-    reader = threading.Thread(target=os.read, args=(port, 4096))
-    reader.start()
-    assert line.drain(limit_s=10.0) == 0
-    reader.join(10.0)
-    os.close(port)
 
 
 def test_a_link_never_replaces_a_file_but_does_replace_a_stale_link(tmp_path: Path) -> None:

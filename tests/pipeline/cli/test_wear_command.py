@@ -83,12 +83,6 @@ def test_people_are_shown_a_table_that_says_when_its_values_hold(tmp_path, notes
     assert "% of the speed, ± 95 %, since commissioning; beside: the change of the fans beside it" in lines[-1]
 
 
-def test_before_a_trend_the_change_is_shown_with_its_interval(tmp_path):
-    path = recording(tmp_path / "r.mcap", [worn_snapshot(TRAY, FANS, WORN, START_NS, 0.3)])
-    assert rows(path)[WORN]["per_day"] is None
-    assert re.search(r"[+-]\d\S* ± \d\S* .* no trend yet +too few points", fantwin("wear", path).stdout)
-
-
 def without_points(note: ScorerSnapshot, *fans: int) -> ScorerSnapshot:
     state = json.loads(note.state_json)
     for fan in fans:
@@ -109,21 +103,6 @@ def test_a_fan_without_points_is_named_below_the_table_and_a_tray_without_is_one
 def test_a_recording_without_wear_is_one_line(tmp_path, notes, state):
     path = recording(tmp_path / "r.mcap", [replace(notes[0], state_json=state)])
     assert error_of("wear", path) == f"no wear in {path}: a scorer records it regularly and when it stops"
-
-
-def test_a_recording_that_cannot_be_read_in_full_is_shown_as_far_as_it_is_readable(tmp_path, notes):
-    path = recording(tmp_path / "r.mcap", notes[:1])
-    whole = path.read_bytes()
-    with RecordingWriter(tmp_path / "truncated.mcap", {}) as writer:
-        writer.add_message(KEY, notes[0], notes[0].t_ns)
-        writer.flush()
-        truncated = (tmp_path / "truncated.mcap.active").read_bytes()
-    path.write_bytes(truncated)
-    assert len(truncated) < len(whole)
-    done = fantwin("wear", path, "--json")
-    assert done.exit_code == 3
-    assert json.loads(done.stdout)["wear"]
-    assert "it is truncated" in done.stderr
 
 
 class SnapshotSender(Core):

@@ -26,10 +26,10 @@ from fantwin.twin.report.recording_sums import common_extent, extent_of, recordi
 from fantwin.twin.report.steady_states import static_curve
 from fantwin.twin.report.timeline import broken_at, kept_samples, timeline
 from fantwin.twin.runs import Run
-from tests.pipeline.cli.test_train_commands import record
 from tests.support.browser import seen_in_browser
 from tests.support.fan_data import PUBLISHED_PARAMETERS, published_run, rough_run
 from tests.support.fantwin_command import error_of, fantwin
+from tests.support.written_recordings import write_run as record
 
 SECTIONS = ["assessment", "figures", "alarms", "parameters", "fan-0", "fan-1", "meaning", "card"]
 TITLES = [
