@@ -19,7 +19,7 @@ from typer.main import get_command
 
 from fantwin.pipeline.cli.main import COMMANDS, PANELS, VARIADIC, app, function_of
 from fantwin.pipeline.cli.simulation.scenario import ClockScenario, FileScenario, Scenario, SurroundingsScenario
-from fantwin.pipeline.config.reference_page import table, tables_within
+from fantwin.pipeline.config.reference_page import table
 from fantwin.pipeline.config.registry import STAGES
 from fantwin.schemas.topics import KIB, MIB, TOPICS
 
@@ -47,12 +47,6 @@ def page() -> str:
         parts.append(f"## {heading}\n")
         for name in (name for name, module in COMMANDS.items() if module.startswith(f"{folder}.")):
             parts += _command(name, commands[name], common)
-    parts += [
-        "### The keys of a scenario\n",
-        f"{inspect.getdoc(Scenario)}\n",
-        table(Scenario),
-        *tables_within(Scenario),
-    ]
     return "\n".join(parts)
 
 
