@@ -13,7 +13,7 @@ import numpy as np
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.recordings.reading import read_recording
 from fantwin.pipeline.replay.offline.alarm_episodes import Episode, episodes
-from fantwin.schemas.messages import Alarm, Array, Grid, Raw, Score
+from fantwin.schemas.messages import Alarm, Raw, Score
 from fantwin.schemas.units import NS_PER_S
 
 SETTLING_NS = 5 * NS_PER_S  # an alarm is attributed to a fault until the fan has settled after its end
@@ -61,11 +61,9 @@ class Summary:
 
 @dataclass
 class _Recorded:
-    """Each sample counted once, by tray and its identifier there, so that a repeated sample hides no lost one."""
+    """Each sample counted once, by tray and number, so that a repeated one hides no lost one."""
 
     samples: set[tuple[str, int]] = field(default_factory=set)
-    grid: set[tuple[str, int]] = field(default_factory=set)
-    scored: set[tuple[str, int]] = field(default_factory=set)
     latencies_ms: list[float] = field(default_factory=list)
     alarms: list[Alarm] = field(default_factory=list)
 
@@ -81,8 +79,7 @@ def summarise(truth_path: Path, recordings: Iterable[Path], lost_by_stage: dict[
     alarms = episodes(recorded.alarms)
     faults = [_match(fault, alarms) for fault in truth["faults"]]
     false_alarms = sum(not any(_explains(fault, alarm) for fault in truth["faults"]) for alarm in alarms)
-    unrecorded = max(0, truth["samples_sent"] - len(recorded.samples))
-    lost = unrecorded + len(recorded.grid - recorded.scored) + sum(lost_by_stage.values())
+    lost = max(0, truth["samples_sent"] - len(recorded.samples)) + sum(lost_by_stage.values())
     latency_ms: dict[str, float | None] = {"p50": None, "p99": None}
     if recorded.latencies_ms:
         percentiles = np.percentile(recorded.latencies_ms, (50, 99))
@@ -112,22 +109,15 @@ def _read_truth(path: Path) -> dict[str, Any]:
 def _read(recordings: Iterable[Path]) -> _Recorded:
     recorded = _Recorded()
     for path in recordings:
-        for entry in read_recording(path, topics=("raw", "grid", "score", "alarm")):
+        for entry in read_recording(path, topics=("raw", "score", "alarm")):
             message = entry.message
             if isinstance(message, Raw):
-                recorded.samples |= _named(message, message.device_sequence)
-            elif isinstance(message, Grid):
-                recorded.grid |= _named(message, message.t_ns)
+                recorded.samples |= {(message.header.tray, number) for number in message.device_sequence.tolist()}
             elif isinstance(message, Score):
-                recorded.scored |= _named(message, message.t_ns)
                 recorded.latencies_ms += ((entry.received_t_ns - message.t_ns) / 1e6).tolist()
             elif isinstance(message, Alarm):
                 recorded.alarms.append(message)
     return recorded
-
-
-def _named(message: Raw | Grid | Score, names: Array) -> set[tuple[str, int]]:
-    return {(message.header.tray, name) for name in names.tolist()}
 
 
 def _match(fault: dict[str, Any], alarms: list[Episode]) -> FaultSeen:
