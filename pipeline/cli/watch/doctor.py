@@ -43,6 +43,7 @@ from fantwin.pipeline.sources.hwmon.config import ROOT
 from fantwin.schemas.topics import sessions_key
 
 _NOT_LISTED = {"all", "dev", "bench"}  # a sum of others, or for tests and benches only
+_GRANTED = "the router grants its rights"
 _NOT_GRANTED = "the router does not grant the rights of its role: restart the router with this configuration"
 _MIN_FREE_BYTES = 1 << 30
 _LOOKS = 4
@@ -229,38 +230,22 @@ def _check_certificates(settings: Config) -> Iterator[tuple[bool, str]]:
     ]
     if not here:
         yield False, f"{security.certificate}: no certificate of any role here: `fantwin certs issue` makes them"
-    problems: list[tuple[str, str]] = []
     for role in here:
         try:
             credentials = credentials_of(settings.bus, (role,))
             assert credentials
             if warning := credentials.warning():
-                problems.append((role, warning))
+                yield False, warning
             elif credentials.role not in site.roles:
-                problems.append(
-                    (role, f"{credentials.certificate}: {credentials.role!r} is no role of this configuration")
-                )
+                yield False, f"{credentials.certificate}: {credentials.role!r} is no role of this configuration"
             elif answers:
                 with join_bus(settings, listens=False, roles=(role,)) as bus:
                     is_granted = bus.has_all_rights_of_its_role(site)
-                if is_granted:
-                    yield True, f"certificate of {role}: the router grants its rights"
-                else:
-                    problems.append((role, f"certificate of {role}: {_NOT_GRANTED}"))
+                yield is_granted, f"certificate of {role}: {_GRANTED if is_granted else _NOT_GRANTED}"
             else:
                 yield True, f"certificate of {role}: until {credentials.own.not_after:%Y-%m-%d}"
         except BusError as error:
-            problems.append((role, str(error)))
-    yield from ((False, line) for line in _of_roles_together(problems))
-
-
-def _of_roles_together(problems: Sequence[tuple[str, str]]) -> Iterator[str]:
-    """The problems, with one line for all roles whose lines differ only in the name of the role."""
-    alike: dict[str, dict[str, str]] = {}
-    for role, line in problems:
-        alike.setdefault(re.sub(rf"\b{re.escape(role)}\b", "ROLE", line), {})[role] = line
-    for line, by_role in alike.items():
-        yield f"{line} (ROLE: {', '.join(by_role)})" if len(by_role) > 1 else next(iter(by_role.values()))
+            yield False, str(error)
 
 
 def running_sessions(settings: Config) -> list[Session]:
