@@ -7,6 +7,8 @@ import secrets
 from contextlib import suppress
 from pathlib import Path
 
+from fantwin.pipeline.errors import UserError
+
 PRIVATE, PUBLIC = 0o600, 0o644
 _AS_THE_USER_WISHES = 0o666
 """less what the umask takes"""
@@ -46,6 +48,31 @@ def replace_file(path: Path, content: bytes, mode: int | None = None) -> None:
         raise
     with suppress(OSError):  # the new file is there; some file systems cannot do it
         sync_folder(path.parent)
+
+
+def write_whole(path: Path, content: bytes, advice: str = "; name another file with -o") -> None:
+    """Put a whole file in its place.
+
+    Raises:
+        UserError: it cannot be written.
+    """
+    try:
+        replace_file(path, content)
+    except OSError as error:
+        raise UserError(f"{path}: cannot be written: {error.strerror}{advice}") from error
+
+
+def make_folder(folder: Path) -> Path:
+    """Create the folder if it is missing.
+
+    Raises:
+        UserError: it cannot be created.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"{folder}: cannot be created: {error.strerror}; name another folder with -o") from error
+    return folder
 
 
 def sync_folder(folder: Path) -> None:

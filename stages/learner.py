@@ -7,7 +7,7 @@ four hours of healthy running since an operator has commissioned fans again. Whi
 that is offered may be made, for most fans have changed alike: that is checked beside alarms as well.
 
 It keeps the healthy history (pipeline.learning.healthy_history) and starts `fantwin twins learn` beside the stages,
-which makes the next version and decides whether it takes over (pipeline.cli.twins.next_version). An operator can change
+which makes the next version and decides whether it takes over (pipeline.learning.next_version). An operator can change
 the version in force: see `fantwin twins`. The learner may drop messages: it must never delay a score.
 """
 
@@ -304,11 +304,11 @@ def _duration(seconds: float) -> str:
 
 def _finds(version: Version) -> str:
     """Drops that the limits of a version find at its middle speed, and their false-alarm rate."""
-    known = [drop for drop in version.drops if drop.within_a_minute is not None]
+    known = [drop for drop in version.drops if drop.within_60_s is not None]
     if not known:
         return version.rate_text
     drop, unit = known[len(known) // 2], version.speed_unit
-    found = f"at {drop.speed:,.0f} {unit} it finds a drop of {drop.within_a_minute:,.0f} {unit} within a minute"
+    found = f"at {drop.speed:,.0f} {unit} it finds a drop of {drop.within_60_s:,.0f} {unit} within a minute"
     return f"{found}; {version.rate_text}"
 
 

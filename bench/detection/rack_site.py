@@ -21,12 +21,12 @@ from bench.detection.plant import START_NS
 from bench.detection.rack_scoring import Episode, episodes
 from bench.detection.racks import DAY_S, RACK_FANS, TACHOS
 from bench.stage_context import stage_context
-from fantwin.pipeline.cli.twins.next_version import make_next_version
 from fantwin.pipeline.config.loading import parse_config
 from fantwin.pipeline.config.models import Config
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.learning.healthy_history import HealthyHistory
 from fantwin.pipeline.learning.learning_process import LearningProcess
+from fantwin.pipeline.learning.next_version import make_next_version
 from fantwin.pipeline.learning.ordinary_operation import OrdinaryOperation
 from fantwin.pipeline.learning.versions import TwinVersions, Version, learning_folder
 from fantwin.pipeline.recordings.metadata import recording_metadata

@@ -19,9 +19,9 @@ from pathlib import Path
 import pandas as pd
 from scipy.io import loadmat
 
-from fantwin.pipeline.cli.in_parallel import RecordingsInParallel
 from fantwin.pipeline.cli.recordings.import_table import write_table
-from fantwin.pipeline.cli.twins.training_data import Part, read_training_data
+from fantwin.pipeline.learning.training_data import Part, read_training_data
+from fantwin.pipeline.replay.offline.healthy_runs import in_this_process
 from fantwin.pipeline.sources.tables.measured_table import RAD_S_PER_TABLE_UNIT, read_table
 from fantwin.twin.runs import Run
 
@@ -139,7 +139,7 @@ def _imported(
 ) -> list[Run]:
     recording = folder / f"{name or table.stem}.mcap"
     write_table(read_table(table, time, command, speed, period=period), recording, "tray1")
-    return read_training_data([recording], Part(), RecordingsInParallel(jobs=1)).runs
+    return read_training_data([recording], Part(), in_this_process).runs
 
 
 def _by_time(

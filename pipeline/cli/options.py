@@ -8,8 +8,7 @@ from typing import Annotated, TypeAlias
 
 import typer
 
-from fantwin.pipeline.errors import UsageError, UserError
-from fantwin.pipeline.files import replace_file
+from fantwin.pipeline.errors import UsageError
 
 ConfigOption: TypeAlias = Annotated[Path, typer.Option("-c", "--config", help="Configuration file (TOML).")]
 SetOption: TypeAlias = Annotated[
@@ -59,28 +58,3 @@ def fan_numbers(text: str | None) -> list[int] | None:
         return numbers
     except ValueError as error:
         raise UsageError(f"--fans {text}: give fan numbers counted from 0, with commas: --fans 2,5") from error
-
-
-def write_whole(path: Path, content: bytes, advice: str = "; name another file with -o") -> None:
-    """Put a whole file in its place.
-
-    Raises:
-        UserError: it cannot be written.
-    """
-    try:
-        replace_file(path, content)
-    except OSError as error:
-        raise UserError(f"{path}: cannot be written: {error.strerror}{advice}") from error
-
-
-def make_folder(folder: Path) -> Path:
-    """Create the folder if it is missing.
-
-    Raises:
-        UserError: it cannot be created.
-    """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UserError(f"{folder}: cannot be created: {error.strerror}; name another folder with -o") from error
-    return folder

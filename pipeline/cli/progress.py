@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
 if TYPE_CHECKING:
-    from fantwin.pipeline.cli.twins.training_data import TrainingData
+    from fantwin.pipeline.learning.training_data import TrainingData
     from fantwin.twin.progress import Progress as ProgressCallback
 
 LINE_PERIOD_S = 5.0

@@ -33,14 +33,26 @@ class _Record(BaseModel):
 
 
 class Drop(_Record):
-    """What the limits find at a speed: the smallest drop that raises an alarm, of the fan with the widest limits.
-
-    In the unit of the tray; None where not even standstill raises one.
+    """What the limits find at a speed: the smallest drops that raise an alarm within a time, of the fan whose readings
+    vary most. In the unit of the tray; None where not even standstill raises one.
     """
 
     speed: float
-    at_once: float | None
-    within_a_minute: float | None
+    within_1_s: float | None
+    within_10_s: float | None
+    within_60_s: float | None
+
+    def line(self, unit: str) -> str:
+        """The same for people."""
+        found = ((self.within_1_s, "1 s"), (self.within_10_s, "10 s"), (self.within_60_s, "60 s"))
+        parts = [f"{_two_digits(value)} {unit} within {time}" for value, time in found if value is not None]
+        drops = f"a drop of {', '.join(parts)}" if parts else "no drop, not even standstill"
+        return f"found at {_two_digits(self.speed)} {unit}: {drops}"
+
+
+def _two_digits(value: float) -> str:
+    """Two digits of a drop are enough."""
+    return f"{value:,.0f}" if value >= 10 else f"{value:.2g}"
 
 
 class Version(_Record):

@@ -16,9 +16,9 @@ from rich.console import Console
 
 from fantwin.pipeline.cli.options import JsonOption
 from fantwin.pipeline.cli.printing import show
-from fantwin.pipeline.cli.twins.training_data import make_folder
 from fantwin.pipeline.errors import UsageError, UserError
 from fantwin.pipeline.extras import require
+from fantwin.pipeline.files import make_folder
 from fantwin.pipeline.recordings.arrays import Block, read_topics
 from fantwin.pipeline.recordings.left_out import left_out_hint
 from fantwin.pipeline.recordings.order import in_order

@@ -22,10 +22,10 @@ from rich.markup import escape
 from rich.table import Table
 
 from fantwin.pipeline.cli.in_parallel import RecordingsInParallel
-from fantwin.pipeline.cli.options import make_folder
 from fantwin.pipeline.cli.printing import table_of
 from fantwin.pipeline.cli.progress import interruptible, show_part
 from fantwin.pipeline.errors import UsageError, UserError
+from fantwin.pipeline.files import make_folder
 from fantwin.pipeline.recordings.dates import format_utc, has_date
 from fantwin.pipeline.recordings.grouping import describe, recordings_of
 from fantwin.pipeline.recordings.records import MADE_BY_KEY, active_path, this_program

@@ -11,12 +11,13 @@ from typing import Annotated, Any
 
 import typer
 
-from fantwin.pipeline.cli.options import JsonOption, ViewLayout, fan_numbers, make_folder
+from fantwin.pipeline.cli.options import JsonOption, ViewLayout, fan_numbers
 from fantwin.pipeline.cli.printing import show
 from fantwin.pipeline.cli.progress import working
 from fantwin.pipeline.cli.recordings.replay_offline import Again, score_again
 from fantwin.pipeline.errors import UsageError, UserError
 from fantwin.pipeline.extras import require
+from fantwin.pipeline.files import make_folder
 from fantwin.pipeline.recordings.left_out import RAW, left_out
 from fantwin.pipeline.recordings.run_recordings import recorded_files
 

@@ -5,41 +5,34 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, replace
-from datetime import UTC, datetime
+from dataclasses import asdict
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Annotated, Any
 
 import typer
 from rich.console import Console
 
 from fantwin.pipeline.cli.in_parallel import JobsOption, RecordingsInParallel, SkipBadOption
-from fantwin.pipeline.cli.options import JsonOption, SetOption, write_whole
+from fantwin.pipeline.cli.options import JsonOption, SetOption
 from fantwin.pipeline.cli.progress import interruptible, show_part
-from fantwin.pipeline.cli.twins.drops_found import drop_lines, drops_found
-from fantwin.pipeline.cli.twins.healthy_evidence import Check, check_declared_rate, marked_running, outlier_warnings
-from fantwin.pipeline.cli.twins.training_data import FromOption, ToOption, twin_errors
+from fantwin.pipeline.cli.twins.data_options import FromOption, ToOption
 from fantwin.pipeline.errors import UsageError, UserError
-from fantwin.pipeline.prediction.tray_twin import load_tray_twin
+from fantwin.pipeline.files import write_whole
+from fantwin.pipeline.learning.calibrating import calibrated_on, with_calibration
+from fantwin.pipeline.learning.drops_found import drops_found
+from fantwin.pipeline.learning.healthy_evidence import Check, check_declared_rate, marked_running, outlier_warnings
 from fantwin.pipeline.recordings.remote import matching, recording_path
 from fantwin.pipeline.replay.offline.calibration_of_twin import (
     LARGEST_PER_DAY,
-    CalibratedTwin,
-    calibrated,
     number_text,
     rate_text,
 )
-from fantwin.pipeline.replay.offline.healthy_runs import HealthyPart, HealthyRuns
-from fantwin.pipeline.replay.offline.kept_bins import KeptBins
+from fantwin.pipeline.replay.offline.healthy_runs import HealthyPart
 from fantwin.schemas.units import RAD_S_PER_UNIT
 from fantwin.scoring.calibration.calibration import Calibration, changed_priors, expected_alarms, needed_fan_hours
 from fantwin.scoring.model.priors import Priors
 
 EXIT_BROKEN = 3
-MOST_KEPT_BYTES = 1 << 30
-"""room for bins on the disk between passes, the same for each recording; a bin takes about 120 for a fan and 30 for a
-sample of it"""
 MEANING = {
     "twin_share": "how far fans and runs differ from the twin in the mean, share of the speed",
     "air": "what the air does within an hour, share of the speed",
@@ -142,16 +135,22 @@ def calibrate(
         if healthy:
             if false_alarms_per_day is None:
                 raise UsageError("declare a rate: --false-alarms-per-day X, for each fan; 0.03 is about one a month")
-            marked = marked_running(healthy, feedback or [], tray, pool)
+            marked = marked_running(healthy, feedback or [], tray, pool.map)
             for line in marked.lines:
                 typer.echo(line, err=True)
             part = HealthyPart(twin, tuple(overrides or ()), from_s, to_s, tray, marked.left_out)
-            found = _calibrated(
-                healthy, part, false_alarms_per_day, pool, extrapolate=extrapolate, alarms_left_out=alarms_left_out
+            found = calibrated_on(
+                healthy,
+                part,
+                false_alarms_per_day,
+                pool.map,
+                extrapolate=extrapolate,
+                alarms_left_out=alarms_left_out,
+                progress=show_part,
             )
             calibration, speed_unit = found.calibration, found.learned[0].tray.speed_unit
             output = output or twin
-            _write(twin, output, calibration)
+            write_whole(output, with_calibration(twin, calibration))
             drops, warnings = drops_found(output, RAD_S_PER_UNIT[speed_unit]), outlier_warnings(found)
             result = {
                 "twin": str(output),
@@ -160,48 +159,21 @@ def calibrate(
                 "is_target": calibration.is_target,
                 "warnings": warnings,
                 "speed_unit": speed_unit,
-                "drops_found": [drop.as_json() for drop in drops],
+                "drops_found": [drop.model_dump() for drop in drops],
             }
             for warning in warnings:
                 typer.echo(warning, err=True)
             if not json_output:
-                _print(output, calibration, drop_lines(drops, speed_unit))
+                _print(output, calibration, [drop.line(speed_unit) for drop in drops])
         if verify:
-            true_ones = marked_running(verify, feedback or [], tray, pool).left_out
-            check = check_declared_rate(output or twin, verify, overrides or [], pool, tray, true_ones)
+            true_ones = marked_running(verify, feedback or [], tray, pool.map).left_out
+            check = check_declared_rate(output or twin, verify, overrides or [], pool.map, tray, true_ones)
             result["verify"] = check.as_json()
     if json_output:
         typer.echo(json.dumps(result | pool.as_json()))
     elif check:
         typer.echo(check.text)
     pool.end(EXIT_BROKEN if check and check.is_broken else 0)
-
-
-def _calibrated(
-    healthy: list[Path],
-    part: HealthyPart,
-    per_day: float,
-    pool: RecordingsInParallel,
-    *,
-    extrapolate: bool,
-    alarms_left_out: int,
-) -> CalibratedTwin:
-    if load_tray_twin(part.twin).card.top_speed_rad_s <= 0.0:
-        raise UserError(f"{part.twin}: its training data have no speed above zero (speed_range_rad_s): train it again")
-    with TemporaryDirectory(prefix="fantwin-calibrate-") as folder:
-        kept = KeptBins(Path(folder), MOST_KEPT_BYTES // len(healthy))
-        runs = HealthyRuns(healthy, part, pool.map, kept, show_part)
-        found = calibrated(runs, per_day, extrapolate=extrapolate, alarms_left_out=alarms_left_out)
-        data = tuple({"name": path.name, "sha256": sha256, **_part(part)} for path, sha256 in runs.sha256().items())
-    created = datetime.now(UTC).isoformat(timespec="seconds")
-    return replace(found, calibration=found.calibration.model_copy(update={"data": data, "created": created}))
-
-
-def _part(part: HealthyPart) -> dict[str, float | str]:
-    """The part of each recording, for the card; empty for the whole."""
-    wanted: dict[str, float | str] = {"from_s": part.from_s} if part.from_s > 0.0 else {}
-    wanted |= {"to_s": part.to_s} if part.to_s < math.inf else {}
-    return wanted | ({"tray": part.tray} if part.tray else {})
 
 
 def _refuse_wrong_arguments(twin: Path, healthy: list[Path], verify: list[Path], overrides: list[str]) -> None:
@@ -235,14 +207,6 @@ def _named_once(recordings: list[Path]) -> None:
         if path.resolve() in seen:
             raise UsageError(f"{path}: named twice: every recording counts once, and --verify takes others")
         seen.add(path.resolve())
-
-
-def _write(twin: Path, output: Path, calibration: Calibration) -> None:
-    with twin_errors():
-        from fantwin.twin.export.card_entries import with_card_entries  # noqa: PLC0415  the command line loads twin only when needed
-
-        content = with_card_entries(twin.read_bytes(), {"calibration": json.loads(calibration.model_dump_json())})
-    write_whole(output, content)
 
 
 def _print(output: Path, calibration: Calibration, drops: Sequence[str]) -> None:

@@ -16,22 +16,24 @@ from fantwin.pipeline.cli.in_parallel import JobsOption, RecordingsInParallel, S
 from fantwin.pipeline.cli.options import JsonOption, fan_numbers
 from fantwin.pipeline.cli.printing import table_of
 from fantwin.pipeline.cli.progress import interruptible
-from fantwin.pipeline.cli.twins.figures import figures_in, sentence, shown
-from fantwin.pipeline.cli.twins.training_data import (
+from fantwin.pipeline.cli.twins.data_options import (
     FansOption,
     FromOption,
-    Part,
     RecordingsArgument,
     ToOption,
-    TrainingData,
     TrayOption,
+    report_damage,
+)
+from fantwin.pipeline.cli.twins.figures import figures_in, sentence, shown
+from fantwin.pipeline.errors import UsageError
+from fantwin.pipeline.learning.training_data import (
+    Part,
+    TrainingData,
     data_cards,
     joined,
     read_recording_data,
-    report_damage,
     twin_errors,
 )
-from fantwin.pipeline.errors import UsageError
 
 if TYPE_CHECKING:
     from fantwin.twin.evaluation.accuracy import Evaluation
@@ -69,7 +71,7 @@ def evaluate(
     Example: fantwin evaluate TWIN.onnx held-out.mcap --rate 20 --rate irregular --json
     """
     grids: list[Grid] = [_grid(text) for text in rate or []]
-    part = Part(tray, fans, from_s, to_s)
+    part = Part(tray, fan_numbers(fans), from_s, to_s)
     pool = RecordingsInParallel(jobs, skip_bad)
     with interruptible("nothing was evaluated"), twin_errors(), pool:
         # The command line loads twin only when it is needed.
@@ -85,7 +87,7 @@ def evaluate(
         work = partial(_sums_of, part=part, twin=twin, extent=extent, grids=grids)
         sums, *on_grids = reduce(_added, pool.map(work, recordings, "evaluating"))
         unit = SpeedUnit(about.speed_unit, about.rad_s_per_unit)
-        summary = summary_of(loaded, sums, extent, data_cards(about), unit, fan_numbers(fans))
+        summary = summary_of(loaded, sums, extent, data_cards(about), unit, part.fans)
         assessment = assess(summary)
     result = as_json(
         summary, assessment, [(grid, of.evaluation()) for grid, of in zip(grids, on_grids, strict=True)], about
@@ -111,11 +113,10 @@ def _sums_of(path: Path, part: Part, twin: Path, extent: Extent, grids: Sequence
     from fantwin.twin.export.onnx_twin import OnnxTwin  # noqa: PLC0415
     from fantwin.twin.report.recording_sums import recording_sums  # noqa: PLC0415
 
-    numbers = fan_numbers(part.fans)
     with twin_errors():
         loaded, runs = OnnxTwin(twin), read_recording_data(path, part).runs
-        on_grids = [evaluation_sums(loaded, on_grid(runs, grid), numbers) for grid in grids]
-        return [recording_sums(runs_of_twin(loaded, runs, numbers), extent), *on_grids]
+        on_grids = [evaluation_sums(loaded, on_grid(runs, grid), part.fans) for grid in grids]
+        return [recording_sums(runs_of_twin(loaded, runs, part.fans), extent), *on_grids]
 
 
 def _added(sums: list[Any], others: list[Any]) -> list[Any]:

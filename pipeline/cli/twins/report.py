@@ -11,35 +11,32 @@ import typer
 from rich.table import Table
 
 from fantwin.pipeline.cli.in_parallel import JobsOption, RecordingsInParallel, SkipBadOption
-from fantwin.pipeline.cli.options import JsonOption, fan_numbers, write_whole
+from fantwin.pipeline.cli.options import JsonOption, fan_numbers
 from fantwin.pipeline.cli.printing import table_of
 from fantwin.pipeline.cli.progress import interruptible, training_progress, working
-from fantwin.pipeline.cli.twins.drops_found import drop_lines, drops_found
-from fantwin.pipeline.cli.twins.figures import figures_in, sentence
-from fantwin.pipeline.cli.twins.training_data import (
+from fantwin.pipeline.cli.twins.data_options import (
     FansOption,
     FromOption,
     IgnoreOption,
-    Part,
     ToOption,
-    TrainingData,
     TrayOption,
     WindowOption,
     check_writable,
-    data_cards,
     ignored_columns,
-    read_training_data,
+    report_damage,
     show_hints,
-    twin_errors,
 )
+from fantwin.pipeline.cli.twins.figures import figures_in, sentence
 from fantwin.pipeline.errors import UsageError
 from fantwin.pipeline.extras import require
+from fantwin.pipeline.files import write_whole
+from fantwin.pipeline.learning.drops_found import drops_found
+from fantwin.pipeline.learning.training_data import Part, TrainingData, data_cards, read_training_data, twin_errors
 from fantwin.pipeline.recordings.remote import matching, recording_path
 
 if TYPE_CHECKING:
     from fantwin.twin.fitting.identification import Identification
     from fantwin.twin.fitting.reference_choice import AtReference
-    from fantwin.twin.runs import Array
 
 
 def report(
@@ -83,7 +80,7 @@ def report(
     twins = [file for file in files if file.suffix == ".onnx"]
     if not recordings or len(twins) > 1:
         raise UsageError("name recordings, and at most one twin: fantwin report [TWIN.onnx] REC.mcap...")
-    part = Part(tray, fans, from_s, to_s, tuple(window_s or ()), ignored_columns(ignore))
+    part = Part(tray, fan_numbers(fans), from_s, to_s, tuple(window_s or ()), ignored_columns(ignore))
     pool = RecordingsInParallel(jobs, skip_bad)
     if twins:
         if window_s or ignore:
@@ -108,15 +105,14 @@ def _write_page(
         loaded = OnnxTwin(twin)
         check_writable(output, ".html")
         with pool:
-            training_data = read_training_data(recordings, part, pool)
+            training_data = read_training_data(recordings, part, pool.map)
+        report_damage(training_data)
         unit = SpeedUnit(training_data.speed_unit, training_data.rad_s_per_unit)
         with working(f"drawing {output}"):
-            content = report_content(
-                loaded, training_data.runs, data_cards(training_data), unit, fan_numbers(part.fans)
-            )
+            content = report_content(loaded, training_data.runs, data_cards(training_data), unit, part.fans)
             assessment = assess(content)
             drops = drops_found(twin, training_data.rad_s_per_unit)
-            alarms = drop_lines(drops, unit.name) or ["alarms are not calibrated: fantwin calibrate"]
+            alarms = [drop.line(unit.name) for drop in drops] or ["alarms are not calibrated: fantwin calibrate"]
             page = report_page(content, assessment, alarms)
     write_whole(output, page.encode())
     warnings = [*training_data.outliers, *assessment.warnings]
@@ -132,7 +128,7 @@ def _write_page(
     ]
     found = {"report": str(output), "bytes": len(page.encode()), "assessment": assessment.level}
     found |= {"headline": assessment.headline, **pooled, "speed_unit": unit.name, "fans": by_fan}
-    found |= {"drops_found": [drop.as_json() for drop in drops], "warnings": warnings}
+    found |= {"drops_found": [drop.model_dump() for drop in drops], "warnings": warnings}
     lines = (f"{output}: {assessment.headline}", *(f"  {line}" for line in (sentence(pooled, unit.name), *alarms)))
     pool.end_with(found, *lines, warnings=warnings, json_output=json_output)
 
@@ -160,7 +156,8 @@ def show_fans(recordings: Sequence[Path], part: Part, pool: RecordingsInParallel
         from fantwin.twin.fitting.reference_choice import identify_at_reference  # noqa: PLC0415  loads twin only when it is needed
 
         with pool:
-            training_data = read_training_data(recordings, part, pool)
+            training_data = read_training_data(recordings, part, pool.map)
+        report_damage(training_data)
         if not json_output:
             show_hints(training_data.hints)
         with training_progress(training_data) as start:
@@ -174,8 +171,7 @@ def show_fans(recordings: Sequence[Path], part: Part, pool: RecordingsInParallel
 def fans_as_json(at_reference: AtReference, training_data: TrainingData) -> dict[str, Any]:
     """The result as JSON fields; None where a figure is undefined.
 
-    Rows and columns of covariance and correlation are in the order of `parameters`; those of a lag that was not found
-    are zero, and undefined.
+    Rows and columns of a covariance are in the order of `parameters`; those of a lag that was not found are zero.
     """
     from fantwin.twin.models.physics import PARAMETER_NAMES  # noqa: PLC0415
 
@@ -186,7 +182,6 @@ def fans_as_json(at_reference: AtReference, training_data: TrainingData) -> dict
             **dict(zip(PARAMETER_NAMES, found.parameters[fan].tolist(), strict=True)),
             **{f"{name}_95": _interval(found, fan, k) for k, name in enumerate(PARAMETER_NAMES)},
             "covariance": found.covariance[fan].tolist(),
-            "correlation": _correlation(found.covariance[fan]),
             "time_constant_s": float(found.time_constant_s[fan]),
             "lambda_per_s": float(found.lambda_per_s[fan]),
             "rmse": float(found.rmse_rad_s[fan]) / training_data.rad_s_per_unit,
@@ -208,16 +203,6 @@ def fans_as_json(at_reference: AtReference, training_data: TrainingData) -> dict
 def _interval(found: Identification, fan: int, index: int) -> list[float] | None:
     """None for a parameter that was not estimated: a lag that was not found."""
     return found.interval_95[fan, index].tolist() if found.covariance[fan, index, index] > 0.0 else None
-
-
-def _correlation(covariance: Array) -> list[list[float | None]]:
-    errors = [math.sqrt(covariance[k, k]) for k in range(len(covariance))]
-
-    def between(row: int, column: int) -> float | None:
-        product = errors[row] * errors[column]
-        return min(max(float(covariance[row, column]) / product, -1.0), 1.0) if product > 0.0 else None
-
-    return [[between(row, column) for column in range(len(errors))] for row in range(len(errors))]
 
 
 def _table(result: dict[str, Any]) -> Table:

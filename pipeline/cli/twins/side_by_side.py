@@ -11,12 +11,12 @@ from rich.markup import escape
 from rich.table import Table
 
 from fantwin.pipeline.cli.in_parallel import RecordingsInParallel
-from fantwin.pipeline.cli.options import make_folder, write_whole
 from fantwin.pipeline.cli.printing import table_of
 from fantwin.pipeline.cli.progress import training_progress
 from fantwin.pipeline.cli.twins.figures import figures_in, shown
-from fantwin.pipeline.cli.twins.training_data import TrainingData, data_cards
 from fantwin.pipeline.errors import UsageError
+from fantwin.pipeline.files import make_folder, write_whole
+from fantwin.pipeline.learning.training_data import TrainingData, data_cards
 
 if TYPE_CHECKING:
     from fantwin.twin.comparison import Candidate, Contender

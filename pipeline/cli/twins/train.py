@@ -4,69 +4,50 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from fantwin.pipeline.cli.in_parallel import JobsOption, NetworksInParallel, RecordingsInParallel, SkipBadOption
-from fantwin.pipeline.cli.options import JsonOption
+from fantwin.pipeline.cli.options import JsonOption, fan_numbers
 from fantwin.pipeline.cli.progress import interruptible, training_progress
-from fantwin.pipeline.cli.twins.figures import figures_in, sentence, shown
-from fantwin.pipeline.cli.twins.side_by_side import Data, train_side_by_side
-from fantwin.pipeline.cli.twins.training_data import (
+from fantwin.pipeline.cli.twins.data_options import (
     FansOption,
     FromOption,
     IgnoreOption,
-    Part,
     RecordingsArgument,
     TestOption,
     ToOption,
-    TrainingData,
     TrayOption,
     ValidateOption,
     WindowOption,
     check_writable,
-    data_cards,
     ignored_columns,
-    read_held_out,
-    read_training_data,
+    report_damage,
     show_hints,
-    twin_errors,
 )
+from fantwin.pipeline.cli.twins.figures import figures_in, sentence, shown
+from fantwin.pipeline.cli.twins.side_by_side import Data, train_side_by_side
 from fantwin.pipeline.errors import UsageError
 from fantwin.pipeline.extras import require_torch
+from fantwin.pipeline.learning.fitting import DEFAULT_SETTINGS, NETWORKS, Trainer, TrainingSettings, fit_twin
+from fantwin.pipeline.learning.training_data import (
+    Part,
+    TrainingData,
+    data_cards,
+    read_held_out,
+    read_training_data,
+    twin_errors,
+)
 
 if TYPE_CHECKING:
     from fantwin.schemas.reference_conditions import ReferenceConditions
     from fantwin.twin.comparison import Candidate
-    from fantwin.twin.each_network import ForEachNetwork
     from fantwin.twin.finishing import TrainedTwin
     from fantwin.twin.progress import Progress
-
-
-Trainer: TypeAlias = Literal["levenberg-marquardt", "adam"]
-"""written again, since twin takes a while to load"""
-NETWORKS = 4
-"""with so many, twins hardly depend on the seed: docs/reference/benchmarks.md"""
-
-
-@dataclass(frozen=True)
-class TrainingSettings:
-    """How a twin is trained; see the options of the command. network_inputs: None for those of the kind of model."""
-
-    model: str = "hybrid"
-    seed: int = 0
-    trainer: Trainer = "levenberg-marquardt"
-    iterations: int | None = None
-    network_inputs: tuple[str, ...] | None = None
-    networks: int | None = None
-    command_unit: str = ""
-
-
-DEFAULT_SETTINGS = TrainingSettings()
 
 
 def train(
@@ -135,7 +116,7 @@ def train(
     Example: fantwin train new-tray.mcap --type type.onnx -o new-tray.onnx
     """
     given = TrainingSettings(model, seed, trainer, iterations, None, networks, command_unit)
-    part = Part(tray, fans, from_s, to_s, tuple(window_s or ()), ignored_columns(ignore))
+    part = Part(tray, fan_numbers(fans), from_s, to_s, tuple(window_s or ()), ignored_columns(ignore))
     if type_twin and (given != DEFAULT_SETTINGS or window_s or ignore):
         raise UsageError("--type keeps the network of the type: leave out the options of a model and of its training")
     not_written = "no twin was written; --iterations N ends after N iterations of each network and writes one"
@@ -188,8 +169,10 @@ def _read(
 ) -> Data:
     """The data of training, of validation and of a test of several models."""
     with pool:
-        training_data = read_training_data(recordings, part, pool)
-        others = [read_held_out(training_data, paths, part, pool) if paths else None for paths in (validate, test)]
+        training_data = read_training_data(recordings, part, pool.map)
+        others = [read_held_out(training_data, paths, part, pool.map) if paths else None for paths in (validate, test)]
+    for data in filter(None, (training_data, *others)):
+        report_damage(data)
     return training_data, others[0], others[1]
 
 
@@ -232,45 +215,6 @@ def _lines(
     if conditions:
         columns = f"column{'s' * (len(conditions.needed) > 1)} {' and '.join(conditions.needed)}"
         yield f"  allows for {conditions.in_words}, and needs the {columns}"
-
-
-def fit_twin(
-    training_data: TrainingData,
-    held_out: TrainingData | None,
-    name: str,
-    settings: TrainingSettings = DEFAULT_SETTINGS,
-    progress: Progress | None = None,
-    each_network: ForEachNetwork | None = None,
-) -> TrainedTwin:
-    """A twin of what was read. held_out: on which its weights are chosen and its band is measured. each_network: who
-    trains its networks; None: this process, one after another.
-
-    Raises:
-        TwinError: the data do not suffice.
-    """
-    from fantwin.twin.build import train_twin  # noqa: PLC0415  the command line loads twin only when it is needed
-    from fantwin.twin.each_network import one_after_another  # noqa: PLC0415
-    from fantwin.twin.kinds import BOTH_INPUTS, find_kind  # noqa: PLC0415
-    from fantwin.twin.progress import unreported  # noqa: PLC0415
-
-    can_average = find_kind(settings.model).averages_networks and settings.trainer == DEFAULT_SETTINGS.trainer
-    return train_twin(
-        training_data.runs,
-        held_out.runs if held_out else [],
-        settings.model,
-        name=name,
-        seed=settings.seed,
-        max_iterations=settings.iterations,
-        trainer=settings.trainer,
-        network_inputs=settings.network_inputs or BOTH_INPUTS,
-        networks=settings.networks if settings.networks is not None else NETWORKS if can_average else 1,
-        each_network=each_network or one_after_another,
-        command_unit=settings.command_unit,
-        fan_numbers=training_data.fans,
-        data=data_cards(training_data),
-        validation_data=data_cards(held_out) if held_out else (),
-        progress=progress or unreported,
-    )
 
 
 def balance_sentence(result: dict[str, Any]) -> str:

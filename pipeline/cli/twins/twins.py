@@ -110,7 +110,7 @@ def _learn(settings: Config, of: TrayConfig, *, only_if_changed: bool, json_outp
         UserError: none can be made, for example because of too little history.
         typer.Exit: Ctrl-C.
     """
-    from fantwin.pipeline.cli.twins.next_version import make_next_version  # noqa: PLC0415  loads scoring
+    from fantwin.pipeline.learning.next_version import make_next_version  # noqa: PLC0415  loads scoring
 
     folder, rate = learning_folder(settings.run_folder, of.name), settings.sections["learner"].false_alarms_per_day  # type: ignore[attr-defined]
     doing = f"{'checking' if only_if_changed else 'learning'} the twin of {of.name}"
@@ -230,7 +230,7 @@ def version_lines(version: Version, listed: VersionList) -> list[str]:
         f"{version.name}: {state}: {version.how}; {_limits_from(version)}",
         f"  why: {version.why}",
         f"  error {version.error:.3g} {unit}; {version.rate_text}",
-        *(f"  found at {drop.speed:,.0f} {unit}: {_found(drop, unit)}" for drop in version.drops),
+        *(f"  {drop.line(unit)}" for drop in version.drops),
         f"  speed of the fans relative to the prediction of {version.reference}: {_percents(version.change)}",
     ]
 
@@ -251,18 +251,17 @@ def offer_lines(listed: VersionList) -> list[str]:
         ("learned up to", format_local(now.made_t_ns), format_local(offered.made_t_ns)),
         ("error over the newest recording", error_before, f"{offered.error:.3g} {unit}"),
         ("limits from", f"{now.hours:.3g} h", f"{offered.hours:.3g} h"),
-        *(_drops_beside(before, after, unit) for before, after in zip(now.drops, offered.drops, strict=False)),
+        *(
+            ("drop found within a minute", _drop_of(before, unit), _drop_of(after, unit))
+            for before, after in zip(now.drops, offered.drops, strict=False)
+        ),
     ]
     widths = [max(len(row[column]) for row in rows) for column in range(3)]
     return ["", *("  " + "   ".join(map(str.ljust, row, widths)).rstrip() for row in rows), ""]
 
 
-def _drops_beside(before: Drop, after: Drop, unit: str) -> tuple[str, str, str]:
-    return "drop found within a minute", _drop_of(before, unit), _drop_of(after, unit)
-
-
 def _drop_of(drop: Drop, unit: str) -> str:
-    found = "none" if drop.within_a_minute is None else f"{drop.within_a_minute:,.0f}"
+    found = "none" if drop.within_60_s is None else f"{drop.within_60_s:,.0f}"
     return f"{found} of {drop.speed:,.0f} {unit}"
 
 
@@ -277,10 +276,3 @@ def _not_compared(change: Sequence[float | None], reference: str) -> str:
         return ""
     named = f"fan{'s' * (len(fans) > 1)} {', '.join(map(str, fans))}"
     return f"; {named}: too few readings at commands that {reference} was trained on"
-
-
-def _found(drop: Drop, unit: str) -> str:
-    if drop.within_a_minute is None:
-        return "no drop, not even standstill"
-    within = f"a drop of {drop.within_a_minute:,.0f} {unit} within a minute"
-    return within if drop.at_once is None else f"a drop of {drop.at_once:,.0f} {unit} at once, {within[10:]}"

@@ -7,6 +7,13 @@ from typing import Annotated
 
 import typer
 
+from fantwin.pipeline.acquisition.commanding import (
+    CommandSender,
+    chosen_tray,
+    command_of,
+    require_commandable,
+    share_note,
+)
 from fantwin.pipeline.bus.session import join_bus
 from fantwin.pipeline.cli.options import (
     DEFAULT_CONFIG,
@@ -19,13 +26,6 @@ from fantwin.pipeline.cli.options import (
     SetOption,
 )
 from fantwin.pipeline.cli.printing import show
-from fantwin.pipeline.cli.watch.commanding import (
-    CommandSender,
-    chosen_tray,
-    command_of,
-    require_commandable,
-    share_note,
-)
 from fantwin.pipeline.config.loading import load_config
 from fantwin.pipeline.config.roles import OPERATOR
 from fantwin.pipeline.errors import UsageError

@@ -13,6 +13,7 @@ from typing import Annotated, Any
 
 import typer
 
+from fantwin.pipeline.acquisition.commanding import require_commandable
 from fantwin.pipeline.bus.endpoint import accepts_connections
 from fantwin.pipeline.cli.options import (
     DEFAULT_CONFIG,
@@ -25,9 +26,8 @@ from fantwin.pipeline.cli.options import (
     SetOption,
 )
 from fantwin.pipeline.cli.progress import EXIT_INTERRUPTED
-from fantwin.pipeline.cli.twins.training_data import check_writable
+from fantwin.pipeline.cli.twins.data_options import check_writable
 from fantwin.pipeline.cli.watch.child_commands import Commands, Stopped
-from fantwin.pipeline.cli.watch.commanding import require_commandable
 from fantwin.pipeline.cli.watch.commissioning import Commissioning, Plan, TrayWork
 from fantwin.pipeline.cli.watch.doctor import running_sessions
 from fantwin.pipeline.cli.watch.sweep import range_within

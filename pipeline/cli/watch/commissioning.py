@@ -8,13 +8,13 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from fantwin.pipeline.cli.in_parallel import RecordingsInParallel
-from fantwin.pipeline.cli.twins.training_data import Part, read_training_data
 from fantwin.pipeline.cli.watch.child_commands import RECORDING_ONLY, Commands, RecordingSite, Stopped
 from fantwin.pipeline.config.models import Config, TrayConfig
 from fantwin.pipeline.config.twin_entry import write_twin
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.learning.ordinary_operation import OrdinaryOperation
+from fantwin.pipeline.learning.training_data import Part, read_training_data
+from fantwin.pipeline.replay.offline.healthy_runs import in_this_process
 
 SHOWN_EVERY_S = 60.0
 
@@ -228,5 +228,5 @@ class Commissioning:
 
 def _check_tachos(work: TrayWork) -> None:
     """Raises UserError if the readings for training are not those of the declared tachos."""
-    if hints := read_training_data(work.training, Part(work.name), RecordingsInParallel(jobs=1)).hints:
+    if hints := read_training_data(work.training, Part(work.name), in_this_process).hints:
         raise UserError(f"{hints[0]}: declare the tacho that was found, then start again")

@@ -11,19 +11,19 @@ from contextlib import suppress
 import numpy as np
 import typer
 
-from fantwin.pipeline.bus.session import Bus, join_bus
-from fantwin.pipeline.cli.printing import show
-from fantwin.pipeline.cli.watch.commanding import (
+from fantwin.pipeline.acquisition.commanding import (
     CommandSender,
     NotReceivedError,
     command_of,
     require_commandable,
     require_within_limits,
 )
-from fantwin.pipeline.cli.watch.excitation import Excitation, Observed, StoppedError
+from fantwin.pipeline.bus.session import Bus, join_bus
+from fantwin.pipeline.cli.printing import show
 from fantwin.pipeline.config.models import Config, TrayConfig
 from fantwin.pipeline.config.roles import OPERATOR
 from fantwin.pipeline.errors import UsageError, UserError
+from fantwin.pipeline.learning.excitation import Excitation, Observed, StoppedError
 from fantwin.pipeline.runtime.signals import stop_on_signals
 from fantwin.schemas.codec import CodecError, decode
 from fantwin.schemas.messages import Raw

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from fantwin.pipeline.cli.twins import drops_found
+from fantwin.pipeline.learning import drops_found
 from tests.support.fantwin_command import fantwin
 from tests.support.healthy_site import EPOCH_NS, PER_DAY, recorded
 

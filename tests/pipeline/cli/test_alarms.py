@@ -17,10 +17,7 @@ import pytest
 
 from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.cli.watch.scorers import wait_for_stages
-from fantwin.pipeline.config.loading import load_config
-from fantwin.pipeline.runtime.runner import Runner
-from fantwin.pipeline.runtime.stage import BuiltStage, Core, Stage
-from fantwin.pipeline.tray_scoring.healthy_twin import ScorerConfig
+from fantwin.pipeline.runtime.stage import Core
 from fantwin.schemas.codec import decode, encode, type_name
 from fantwin.schemas.enums import InvalidReason, Severity, StageStatus, Transition
 from fantwin.schemas.header import Header
@@ -31,9 +28,15 @@ from fantwin.scoring.alarms.fan_condition import AlarmState, ConditionSettings
 from fantwin.scoring.alarms.tray_conditions import Decided, TrayConditions
 from tests.support.fantwin_command import error_of, fantwin
 from tests.support.running_chain import DEMO, FANTWIN, SITE, TRAY, eventually
+from tests.support.running_scorer import RunningScorer
 from tests.support.score_data import one_sample
 
 FANS = 8
+FLAGS = (
+    *("active", "severity", "onset_t_ns", "acknowledged", "confirmed", "latched", "shelved_until_t_ns", "suppressed"),
+    *("out_of_service", "feedback", "feedback_by", "feedback_reason"),
+)
+"""of a message about an alarm, and of its state in the scorer"""
 CAUSES = (
     Diagnosis(cause="drag_up", probability=0.83, evidence="drag +50 %"),
     Diagnosis(cause="friction_up", probability=0.1),
@@ -49,11 +52,7 @@ class AlarmOnRequestScorer(Core):
         self._raised_t_ns = np.zeros(FANS, np.int64)
         self.deaf = False
         self.not_judged: tuple[InvalidReason, ...] = ()
-        self.noted: list[str] = []
         self._now_ns = 0
-
-    def notes(self) -> list[str]:
-        return self.noted
 
     def tick(self, now_ns: int) -> Sequence[Message]:
         self._now_ns = now_ns
@@ -86,24 +85,13 @@ class AlarmOnRequestScorer(Core):
         return Alarm(
             header=Header(),
             fan=fan,
-            active=standing.active,
-            severity=standing.severity,
             t_ns=self._now_ns,
-            onset_t_ns=standing.onset_t_ns,
             residual_rad_s=0.0,
             residual_std_rad_s=1.0,
             message=message,
             transition=transition,
-            acknowledged=standing.acknowledged,
-            confirmed=standing.confirmed,
-            latched=standing.latched,
-            shelved_until_t_ns=standing.shelved_until_t_ns,
-            suppressed=standing.suppressed,
-            out_of_service=standing.out_of_service,
             causes=CAUSES if transition == Transition.RAISED else (),
-            feedback=standing.feedback,
-            feedback_by=standing.feedback_by,
-            feedback_reason=standing.feedback_reason,
+            **{name: getattr(standing, name) for name in FLAGS},
         )
 
 
@@ -111,33 +99,12 @@ def _in_words(fan: int, transition: Transition, why: str) -> str:
     return f"fan {fan}: refused: {why}" if why else f"fan {fan}: {transition.name.lower()}"
 
 
-class Site:
-    """The scorer in a thread, and the words that lead a command to its bus."""
+class Site(RunningScorer):
+    """The scorer, and a command that asks it."""
 
     def __init__(self, endpoint: str) -> None:
         self.core = AlarmOnRequestScorer()
-        self.words = ("-c", DEMO / "demo.toml", "--set", f"bus.endpoint='{endpoint}'")
-        stage = Stage(
-            name="scorer",
-            about="",
-            reads=("prediction", "request"),
-            writes=("alarm", "score"),
-            config=ScorerConfig,
-            build=lambda _context: BuiltStage(self.core),
-        )
-        self._stop = threading.Event()
-        self.config = load_config(DEMO / "demo.toml", [f"bus.endpoint='{endpoint}'"])
-        self.runner = Runner(stage, self.config, None, self._stop)
-        self.last: Any = None
-        self._thread = threading.Thread(target=self._run)
-        self._thread.start()
-
-    def _run(self) -> None:
-        self.last = self.runner.run()
-
-    def end(self) -> None:
-        self._stop.set()
-        self._thread.join(20)
+        super().__init__(endpoint, self.core)
 
     def raise_alarm(self, fan: int) -> None:
         self.core.has_alarm = {*self.core.has_alarm, fan}

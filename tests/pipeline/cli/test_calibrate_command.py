@@ -13,7 +13,7 @@ import onnx
 import pytest
 
 from fantwin.pipeline.cli.main import expand_variadic
-from fantwin.pipeline.cli.twins.healthy_evidence import Check
+from fantwin.pipeline.learning.healthy_evidence import Check
 from fantwin.pipeline.prediction.tray_twin import load_tray_twin
 from fantwin.pipeline.recordings.reading import read_recording
 from fantwin.pipeline.recordings.writing import RecordingWriter

@@ -11,43 +11,14 @@ import pytest
 
 from fantwin.pipeline.cli.in_parallel import RecordingsInParallel
 from fantwin.pipeline.cli.main import expand_variadic
-from fantwin.pipeline.cli.twins.healthy_evidence import check_declared_rate, marked_running
-from fantwin.pipeline.recordings.writing import RecordingWriter
-from fantwin.pipeline.replay.offline.marked_alarms import LeftOut, alarms_in, concerning, marked_alarms
-from fantwin.pipeline.site.alarm_history import AlarmHistory
-from fantwin.schemas.enums import Action, Severity, Transition
-from fantwin.schemas.header import Header
+from fantwin.pipeline.learning.healthy_evidence import check_declared_rate
+from fantwin.pipeline.replay.offline.marked_alarms import alarms_in, marked_alarms
+from fantwin.schemas.enums import Action
 from fantwin.schemas.messages import Alarm
-from fantwin.schemas.topics import tray_key
-from fantwin.schemas.units import NS_PER_S
-from fantwin.scoring.alarms.fan_condition import GIVES_FEEDBACK
 from fantwin.scoring.model.priors import Priors
+from tests.pipeline.learning.test_healthy_evidence import with_alarm
 from tests.support.fantwin_command import fantwin
-from tests.support.healthy_site import FANS, FAULT_S, PER_DAY, start_ns
-
-FAULTY_NS = start_ns(5)
-ONSET_NS = FAULTY_NS + FAULT_S[0] * NS_PER_S
-DAY_NS = 86_400 * NS_PER_S
-
-
-def with_alarm(path: Path, action: Action | None) -> Path:
-    """A recording that has nothing but the alarm of the fault, and what an operator says of it."""
-    onset_t_ns, cleared_t_ns = (FAULTY_NS + second * NS_PER_S for second in FAULT_S)
-    state: dict[str, Any] = {"fan": 1, "severity": Severity.ALARM, "onset_t_ns": onset_t_ns, "message": "slow"}
-    state |= {"residual_rad_s": 1.0, "residual_std_rad_s": 1.0}
-    alarms = [
-        Alarm(**state, active=True, t_ns=onset_t_ns + NS_PER_S, transition=Transition.RAISED),
-        Alarm(**state, active=False, t_ns=cleared_t_ns + NS_PER_S, transition=Transition.CLEARED),
-    ]
-    if action is not None:
-        said = {"transition": GIVES_FEEDBACK[action][0], "marked_onset_t_ns": onset_t_ns, "operator_name": "ann"}
-        alarms.append(Alarm(**state, **said, active=False, t_ns=cleared_t_ns + 60 * NS_PER_S, comment="door"))
-    path.unlink(missing_ok=True)
-    with RecordingWriter(path, {"site": "plant", "trays": "tray1"}) as writer:
-        for number, alarm in enumerate(alarms):
-            message = replace(alarm, header=Header("scorer-1", number, "tray1"))
-            writer.add_message(tray_key("plant", "tray1", "alarm"), message, message.t_ns)
-    return path
+from tests.support.healthy_site import FANS, FAULT_S, PER_DAY
 
 
 def calibrated(folder: Path, action: Action, place: Path) -> tuple[dict[str, Any], list[str]]:
@@ -88,7 +59,7 @@ def test_a_true_alarm_is_no_false_one_when_the_declared_rate_is_tested(healthy: 
     assert span is not None
     with RecordingsInParallel() as pool:
         found = check_declared_rate(
-            healthy / "calibrated.onnx", [healthy / "faulty.mcap"], [], pool, left_out=[replace(span, path=None)]
+            healthy / "calibrated.onnx", [healthy / "faulty.mcap"], [], pool.map, left_out=[replace(span, path=None)]
         )
     assert found.alarms == 0
     assert found.fan_hours == pytest.approx((FANS * 60 - FAULT_S[1]) / 3600, rel=0.1)
@@ -96,57 +67,3 @@ def test_a_true_alarm_is_no_false_one_when_the_declared_rate_is_tested(healthy: 
 
 def _marked(folder: Path, action: Action | None) -> tuple[Path, list[tuple[str, Alarm]]]:
     return folder, alarms_in(with_alarm(folder / "alarms.mcap", action))
-
-
-def test_an_alarm_that_nobody_has_marked_leaves_nothing_out(tmp_path: Path) -> None:
-    path = with_alarm(tmp_path / "alarms.mcap", None)
-    with RecordingsInParallel() as pool:
-        found = marked_running([path], [], None, pool)
-        assert found.lines == ["1 alarm in the recordings is not marked as true or false: used as healthy running"]
-        assert found.left_out == ()
-        assert marked_running([path], [], "tray2", pool).lines == []
-
-
-def test_what_a_gateway_has_kept_counts_for_the_times_of_the_recordings(tmp_path: Path) -> None:
-    recording = with_alarm(tmp_path / "alarms.mcap", None)
-    store = AlarmHistory(tmp_path / "alarms.sqlite")
-    alarms = [alarm for _, alarm in alarms_in(with_alarm(tmp_path / "marked.mcap", Action.TRUE_ALARM))]
-    long_ago = [
-        replace(each, header=replace(each.header, producer="s0"), t_ns=each.t_ns - DAY_NS, onset_t_ns=5 * NS_PER_S)
-        for each in alarms[:2]
-    ]
-    for alarm in [*long_ago, *alarms]:
-        store.add(alarm)
-    store.close()
-    with RecordingsInParallel() as pool:
-        found = marked_running([recording], [tmp_path / "alarms.sqlite"], None, pool)
-    (span,) = found.left_out
-    assert (span.site, span.path, span.tray, span.fan) == ("plant", None, "tray1", 1)
-    assert span.from_t_ns == ONSET_NS - 600 * NS_PER_S
-    assert len(found.alarms) == 1, "that of long ago is of no recording here"
-
-
-def test_a_time_is_left_out_of_its_own_tray_site_and_recording() -> None:
-    span = LeftOut("a", None, "t1", 1, 0, 1)
-    for more, is_meant in (
-        *(({}, True), ({"site": ""}, True)),
-        *(({"site": "b"}, False), ({"tray": "t2"}, False), ({"path": Path("x")}, False)),
-    ):
-        assert bool(concerning([replace(span, **more)], Path("r"), "a", "t1")) == is_meant, more
-
-
-def test_where_times_are_no_dates_an_alarm_belongs_to_its_recording_alone(tmp_path: Path) -> None:
-    alarms = alarms_in(with_alarm(tmp_path / "alarms.mcap", Action.TRUE_ALARM))
-    undated = [
-        (
-            site,
-            replace(
-                alarm, t_ns=alarm.t_ns - FAULTY_NS, onset_t_ns=alarm.onset_t_ns - FAULTY_NS,
-                marked_onset_t_ns=max(0, alarm.marked_onset_t_ns - FAULTY_NS),
-            ),
-        )
-        for site, alarm in alarms
-    ]  # fmt: skip
-    paths = Path("one"), Path("two")
-    found = marked_alarms([(path, undated) for path in paths])
-    assert [span.path for each in found if (span := each.left_out)] == list(paths)

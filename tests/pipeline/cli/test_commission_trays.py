@@ -18,11 +18,11 @@ import numpy as np
 import pytest
 from typer.testing import Result
 
-from fantwin.pipeline.cli.twins.training_data import Part
 from fantwin.pipeline.cli.watch import commission, commissioning
 from fantwin.pipeline.cli.watch.child_commands import Commands, Stopped
 from fantwin.pipeline.config.models import TrayConfig
 from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.learning.training_data import Part
 from fantwin.pipeline.recordings.writing import RecordingWriter
 from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Raw
@@ -42,7 +42,6 @@ class PlayedSite:
     now_s = 0.0
     still: Sequence[str] = ()
     """trays whose commands stay"""
-    silent: Sequence[str] = ()
     count = 0
 
     def __init__(self, _commands: Commands, config: Any, _words: list[str], _log: Path, trays: Sequence[TrayConfig]):
@@ -67,10 +66,10 @@ class PlayedSite:
 
     def wait(self, seconds: float) -> list[Raw]:
         PlayedSite.now_s += seconds
-        return [self.sample(tray.name) for tray in self.trays if tray.name not in self.silent]
+        return [self.sample(tray.name) for tray in self.trays]
 
-    def silence_of(self, tray: str) -> str:
-        return "no sample for 60 s" if tray in self.silent else ""
+    def silence_of(self, _tray: str) -> str:
+        return ""
 
     def sample(self, tray: str) -> Raw:
         level = 0.5 if tray in self.still else LEVELS[int(self.now_s // HELD_S) % len(LEVELS)]
@@ -127,7 +126,7 @@ def played(tmp_path: Path, endpoint: str, monkeypatch: pytest.MonkeyPatch) -> Pl
     for tray in ("a", "b"):
         text += f'[[tray]]  # {tray}, upper shelf\nname = "{tray}"\nfans = 1\nport = "{tray}"\n'
     played.configuration.write_text(text, encoding="utf-8")
-    for name, value in (("now_s", 0.0), ("count", 0), ("still", ()), ("silent", ())):
+    for name, value in (("now_s", 0.0), ("count", 0), ("still", ())):
         monkeypatch.setattr(PlayedSite, name, value)
     monkeypatch.setattr(commission, "stop_on_signals", lambda _stop: None)  # this process has its own
     monkeypatch.setattr(commissioning, "RecordingSite", PlayedSite)

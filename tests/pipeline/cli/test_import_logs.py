@@ -81,21 +81,6 @@ def test_electrical_speeds_and_the_tacho_that_is_declared(tmp_path: Path) -> Non
     assert read_runs(recording).tacho == (Tacho(kind="count", window_s=0.02),) * 2
 
 
-def test_the_table_that_blackbox_decode_writes(tmp_path: Path) -> None:
-    table, recording = tmp_path / "flight.csv", tmp_path / "r.mcap"
-    rows = [
-        f"{k}, {round(1e6 * t)}, {1000 + k}, {s:.0f}" for k, (t, s) in enumerate(zip(T_S, SPEEDS[:, 0], strict=True))
-    ]
-    table.write_text("\n".join(["loopIteration, time (us), motor[0], eRPM[0]", *rows]))
-    words = ("--time", "time (us):us", "--command", "motor[0]", "--speed", "eRPM[0]:rpm", "-o", recording)
-    result = fantwin("import", table, *words)
-    assert result.exit_code == 0, result.output
-    t_ns, command, speed = samples(recording)
-    np.testing.assert_array_equal(t_ns - t_ns[0], np.rint(1e6 * T_S).astype(np.int64) * 1000)
-    np.testing.assert_array_equal(command[:, 0], 1000 + np.arange(len(T_S)))
-    np.testing.assert_allclose(speed[:, 0], SPEEDS[:, 0], rtol=1e-12)
-
-
 @pytest.mark.parametrize("storage", ["sqlite3", "mcap"])
 def test_a_ros_bag_with_times_of_its_messages(tmp_path: Path, storage: str) -> None:
     bag, recording = tmp_path / "bag", tmp_path / "r.mcap"

@@ -6,8 +6,7 @@ import os
 import threading
 import time
 import tty
-from collections.abc import Iterable
-from itertools import count, repeat
+from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +17,7 @@ from fantwin.pipeline.cli.watch.line_check import _findings, check_line, refusal
 from fantwin.pipeline.config.loading import parse_config
 from fantwin.pipeline.config.models import Config
 from fantwin.pipeline.runtime.stage import Context
-from fantwin.schemas.messages import Raw
+from fantwin.schemas.messages import Array, Raw
 from fantwin.schemas.units import NS_PER_S
 from tests.support.running_acquisition import SITE, acquisition, push_config
 
@@ -35,21 +34,29 @@ def config_of(**keys: object) -> Config:
     return parse_config(TOML, Path("fantwin.toml"), overrides, ("acquisition", "resampler"))
 
 
-def samples(rate_hz: float, command: float, speed_rad_s: float, fans: int = 2) -> list[Raw]:
+def context_of(config: Config) -> Context:
+    """Of acquisition and its one tray."""
+    section = config.sections["acquisition"]
+    return Context("site", config.trays, section, folder=Path(), run_folder=Path(), started_t_ns=0)
+
+
+def line_of(at_s: Array, speed_rad_s: Array, fans: int = 2) -> list[Raw]:
+    """A sample at each time, of fans of one speed."""
     return [
         Raw(
             fans=fans,
-            host_receive_t_ns=np.array([round((1e9 + k / rate_hz) * NS_PER_S)]),
-            command=np.full((1, fans), command),
-            speed_rad_s=np.full((1, fans), speed_rad_s + k),
+            host_receive_t_ns=np.array([round((1e9 + second) * NS_PER_S)]),
+            command=np.full((1, fans), 0.5),
+            speed_rad_s=np.full((1, fans), speed),
         )
-        for k in range(max(3, round(2 * rate_hz)))
+        for second, speed in zip(at_s, speed_rad_s, strict=True)
     ]
 
 
-def found(rate_hz: float, command: float = 0.5, speed_rad_s: float = 300.0, fans: int = 2, **keys: object) -> list:
-    config = config_of(**keys)
-    return list(_findings(samples(rate_hz, command, speed_rad_s, fans), config.trays[0], config, None))
+def found(rate_hz: float, speed_rad_s: float = 300.0, fans: int = 2, **keys: object) -> list[tuple[bool, str]]:
+    config, numbers = config_of(**keys), np.arange(max(3, round(2 * rate_hz)))
+    line = line_of(numbers / rate_hz, speed_rad_s + numbers, fans)
+    return list(_findings(line, config.trays[0], config, None))
 
 
 @pytest.mark.parametrize(("line_hz", "grid_hz", "gap_s"), [(1, 1, "5"), (10, 10, "0.5"), (100, 100, "0.1")])
@@ -61,39 +68,26 @@ def test_a_line_that_fits_is_shown_with_its_grid_and_ranges(line_hz: float, grid
 
 
 @pytest.mark.parametrize(
-    ("tacho", "said"),
+    ("tacho", "is_fine", "said"),
     [
         (
             None,
-            (
-                False,
-                '(`tacho = { kind = "count", pulses = 2, window_s = 1.0 }` in [[tray]]); declared is instantaneous',
-            ),
+            False,
+            '(`tacho = { kind = "count", pulses = 2, window_s = 1.0 }` in [[tray]]); declared is instantaneous',
         ),
-        ('{kind="count", window_s=1.0}', (True, "tachos of fans 0, 1: they read as declared")),
+        ('{kind="count", window_s=1.0}', True, "tachos of fans 0, 1: they read as declared"),
     ],
 )
-def test_tachos_that_count_are_found_in_what_a_line_sends(tacho: str | None, said: tuple[bool, str]) -> None:
+def test_tachos_that_count_are_found_in_what_a_line_sends(tacho: str | None, is_fine: bool, said: str) -> None:
     """A minute of fans that speed up and slow down, counted over a second and sent ten times a second."""
     config = config_of(**({"tray__0__tacho": tacho} if tacho else {}))
-    count_rad_s = 2.0 * np.pi / 2.0
     at_s = np.arange(600) / 10.0
     speed = 150.0 + 100.0 * np.sin(2.0 * np.pi * np.floor(at_s) / 31.0)
-    line = [
-        Raw(
-            fans=2,
-            host_receive_t_ns=np.array([round((1e9 + second) * NS_PER_S)]),
-            command=np.full((1, 2), 0.5),
-            speed_rad_s=np.full((1, 2), count_rad_s * np.floor(now / count_rad_s)),
-        )
-        for second, now in zip(at_s, speed, strict=True)
-    ]
+    line = line_of(at_s, np.pi * np.floor(speed / np.pi))
     *_, (ok, text) = _findings(line, config.trays[0], config, None)
-    assert ok == said[0]
-    assert said[1] in text
-    *_, (is_fine, short) = _findings(line[:20], config.trays[0], config, None)
-    assert is_fine
-    assert short.startswith("commands" if tacho else "fans 0, 1: not shown whether the tacho counts; listen")
+    assert ok == is_fine and said in text
+    *_, (ok, short) = _findings(line[:20], config.trays[0], config, None)
+    assert ok and short.startswith("commands" if tacho else "fans 0, 1: not shown whether the tacho counts; listen")
 
 
 @pytest.mark.parametrize(
@@ -115,39 +109,27 @@ def test_what_does_not_fit_is_one_line_that_says_what_to_do(line: dict, words: s
     assert words in problems[0]
 
 
-def listened(sent: Iterable[tuple[float, bytes]], seconds: float) -> list:
-    """What is found of a device that sends these lines, each so many seconds after the one before."""
+def test_a_port_is_listened_to_as_acquisition_does() -> None:
     master, slave = os.openpty()
     tty.setraw(slave)
     stop = threading.Event()
 
     def device() -> None:
-        for pause_s, line in sent:
-            if stop.wait(pause_s):
+        for number in count():
+            if stop.wait(0.02):
                 return
-            os.write(master, line)
+            os.write(master, f"S {20_000 * number} {number} 117 1200 117 1200\n".encode())
 
     sender = threading.Thread(target=device)
     sender.start()
     try:
-        port, unit = {"tray__0__port": f"'{os.ttyname(slave)}'"}, {"tray__0__speed_unit": "rpm"}
-        config = config_of(**port, **unit)
-        context = Context(
-            site="site", trays=config.trays, config=config.sections["acquisition"], folder=Path(), run_folder=Path(),
-            started_t_ns=0,
-        )  # fmt: skip
-        return check_line(context, config, seconds, is_running=False)
+        config = config_of(tray__0__port=f"'{os.ttyname(slave)}'", tray__0__speed_unit="rpm")
+        ((is_fine, line),) = check_line(context_of(config), config, 1.0, is_running=False)
     finally:
         stop.set()
         sender.join()
         os.close(slave)
         os.close(master)
-
-
-def test_a_port_is_listened_to_as_acquisition_does() -> None:
-    clock_us = count(20_000, 20_000)
-    each = (f"S {us} {us // 20_000} 117 1200 117 1200\n".encode() for us in clock_us)
-    ((is_fine, line),) = listened(zip(repeat(0.02), each, strict=False), 1.0)
     assert not is_fine
     assert "command 117 is outside command_min = 0 to command_max = 1" in line
 
@@ -171,19 +153,11 @@ def test_a_line_that_was_cut_once_is_no_fault_of_the_configuration(counters: dic
     assert words in said if words else not said
 
 
-def of_push(config: Config, *, is_running: bool) -> list:
-    """What is found of a tray whose samples are pushed."""
-    context = Context(
-        site=SITE, trays=config.trays, config=config.sections["acquisition"], folder=Path(), run_folder=Path(),
-        started_t_ns=0,
-    )  # fmt: skip
-    return check_line(context, config, 1.0, is_running=is_running)
-
-
 def test_before_a_site_runs_pushed_samples_are_no_problem_and_are_said_to_be_checked_later(
     endpoint: str, tmp_path: Path
 ) -> None:
-    ((is_fine, line),) = of_push(push_config(endpoint, tmp_path), is_running=False)
+    config = push_config(endpoint, tmp_path)
+    ((is_fine, line),) = check_line(context_of(config), config, 1.0, is_running=False)
     assert is_fine
     assert line.startswith("tray1: clients push its samples: they are checked only while `fantwin up` runs;")
 
@@ -199,7 +173,7 @@ def test_while_a_site_runs_pushed_samples_are_listened_to(endpoint: str, tmp_pat
         sender = threading.Thread(target=push, args=(client.tray("tray1", speed_unit="rpm"),))
         sender.start()
         try:
-            lines = of_push(config, is_running=True)
+            lines = check_line(context_of(config), config, 1.0, is_running=True)
         finally:
             stop.set()
             sender.join()

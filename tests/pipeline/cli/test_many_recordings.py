@@ -19,8 +19,8 @@ from threadpoolctl import threadpool_info, threadpool_limits
 from typer.testing import Result
 
 from fantwin.pipeline.cli.in_parallel import RecordingsInParallel
-from fantwin.pipeline.cli.twins.training_data import Part, read_recording_data
 from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.learning.training_data import Part, read_recording_data
 from fantwin.twin.evaluation.resampling import thinned
 from tests.pipeline.cli.conftest import MadeOnce
 from tests.support.but_for_times import but_for_times, content_of

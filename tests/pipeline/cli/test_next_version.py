@@ -10,13 +10,13 @@ from pathlib import Path
 
 import pytest
 
-from fantwin.pipeline.cli.twins import next_version
-from fantwin.pipeline.cli.twins.next_version import make_next_version
-from fantwin.pipeline.cli.twins.train import TrainingSettings, fit_twin
-from fantwin.pipeline.cli.twins.version_data import newest_recordings
 from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.learning import next_version
+from fantwin.pipeline.learning.fitting import TrainingSettings, fit_twin
 from fantwin.pipeline.learning.healthy_history import healthy_recordings
 from fantwin.pipeline.learning.history_recordings import HistoryRecording
+from fantwin.pipeline.learning.next_version import make_next_version
+from fantwin.pipeline.learning.version_data import newest_recordings
 from fantwin.pipeline.learning.versions import TwinVersions, Version
 from fantwin.pipeline.prediction.tray_twin import load_tray_twin
 from fantwin.pipeline.replay.offline.calibration_of_twin import calibration_in
@@ -119,7 +119,7 @@ def test_the_first_version_is_a_target_only_and_the_next_is_from_more_healthy_ru
     assert first.error < 10.0, "rad/s; the noise is sqrt(10)"
     assert second.outcome == "taken"
     assert second.hours > 2.0 * first.hours
-    within = [[drop.within_a_minute for drop in each.drops] for each in (first, second)]
+    within = [[drop.within_60_s for drop in each.drops] for each in (first, second)]
     assert all(drop for drops in within for drop in drops)
     assert sum(drop or 0.0 for drop in within[1]) <= sum(drop or 0.0 for drop in within[0])
     assert load_tray_twin(two_versions / "tray1-2.onnx", FANS).card.name == "tray1-2"

@@ -12,7 +12,7 @@ import typer
 from fantwin.pipeline.cli import progress
 
 if TYPE_CHECKING:
-    from fantwin.pipeline.cli.twins.training_data import TrainingData
+    from fantwin.pipeline.learning.training_data import TrainingData
 
 TRAINING_DATA = cast("TrainingData", SimpleNamespace(rad_s_per_unit=0.1, speed_unit="rpm"))
 

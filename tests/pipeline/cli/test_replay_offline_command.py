@@ -242,7 +242,7 @@ def test_an_attachment_is_written_nowhere_else(tmp_path):
 def test_damaged_metadata_are_one_line(tmp_path):
     head = read_metadata(GOLDEN)
     path = tmp_path / "[odd].mcap"
-    with RecordingWriter(path, head.metadata | {"overrides": "{broken"}, head.attachments) as writer:
+    with RecordingWriter(path, {**head.metadata, "overrides": "{broken"}, head.attachments) as writer:
         for entry in read_recording(GOLDEN, ("raw",)):
             writer.add_message(entry.key, entry.message, entry.received_t_ns)
     assert "[odd].mcap: its metadata are damaged" in error(path)

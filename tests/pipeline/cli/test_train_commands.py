@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fantwin.pipeline.cli.twins.training_data import TrainingData
+from fantwin.pipeline.learning.training_data import TrainingData
 from fantwin.schemas.tacho import INSTANTANEOUS, Tacho
 from fantwin.twin.export.onnx_twin import OnnxTwin
 from fantwin.twin.runs import Run

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
@@ -13,11 +13,8 @@ from typing import Any
 
 import pytest
 
-from fantwin.pipeline.config.loading import load_config
 from fantwin.pipeline.recordings.writing import RecordingWriter
-from fantwin.pipeline.runtime.runner import Runner
-from fantwin.pipeline.runtime.stage import BuiltStage, Core, Stage
-from fantwin.pipeline.tray_scoring.healthy_twin import ScorerConfig
+from fantwin.pipeline.runtime.stage import Core
 from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Message, ScorerSnapshot
 from fantwin.schemas.topics import tray_key
@@ -25,6 +22,7 @@ from fantwin.scoring.wear.recorded_wear import shown
 from fantwin.scoring.wear.trend import NS_PER_DAY, WearSeries
 from tests.support.fantwin_command import error_of, fantwin
 from tests.support.running_chain import DEMO, SITE, TRAY
+from tests.support.running_scorer import RunningScorer
 from tests.support.wear_data import LOSS, START_NS, worn_snapshot
 
 KEY = tray_key(SITE, TRAY, "snapshot")
@@ -122,37 +120,22 @@ class SnapshotSender(Core):
         return notes
 
 
-@pytest.fixture
-def site(endpoint: str, request: pytest.FixtureRequest, notes: list[ScorerSnapshot]) -> Iterator[tuple[object, ...]]:
-    """A scorer in a thread; the words that lead to its bus."""
-    core = SnapshotSender(notes if request.param else [])
-    stage = Stage(
-        name="scorer",
-        about="",
-        reads=("prediction", "request"),
-        writes=("snapshot",),
-        config=ScorerConfig,
-        build=lambda _context: BuiltStage(core),
-    )
-    stop = threading.Event()
-    words = ("-c", DEMO / "demo.toml", "--set", f"bus.endpoint='{endpoint}'")
-    runner = Runner(stage, load_config(DEMO / "demo.toml", [f"bus.endpoint='{endpoint}'"]), None, stop)
-    thread = threading.Thread(target=runner.run)
-    thread.start()
-    assert core.has_sent.wait(20)
-    yield words
-    stop.set()
-    thread.join(20)
-
-
-@pytest.mark.parametrize("site", [True], indirect=True)
-def test_a_running_site_reports_the_same(site, tmp_path, notes):
-    assert rows(*site) == rows(recording(tmp_path / "r.mcap", notes))
-
-
-@pytest.mark.parametrize("site", [False], indirect=True)
-def test_a_scorer_that_has_noted_nothing_yet_is_one_line(site):
-    assert error_of("wear", *site) == "no scorer has recorded wear so far: it does so regularly; try again later"
+def test_a_running_site_reports_the_same_and_one_whose_scorer_has_noted_nothing_says_so(
+    endpoint, tmp_path, notes, monkeypatch
+):
+    monkeypatch.setattr("fantwin.pipeline.runtime.runner.HEALTH_PERIOD_S", 0.05)  # every command waits for the next one
+    for noted in ([], notes):
+        core = SnapshotSender(noted)
+        scorer = RunningScorer(endpoint, core)
+        try:
+            assert core.has_sent.wait(20)
+            if noted:
+                assert rows(*scorer.words) == rows(recording(tmp_path / "r.mcap", notes))
+            else:
+                expected = "no scorer has recorded wear so far: it does so regularly; try again later"
+                assert error_of("wear", *scorer.words) == expected
+        finally:
+            scorer.end()
 
 
 def test_without_a_scorer_one_line_says_that_nothing_is_known(endpoint, monkeypatch):

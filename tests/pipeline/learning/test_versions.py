@@ -27,7 +27,7 @@ def version(name: str, day: int, **other: Any) -> Version:
         "error": 10.0,
         "change": (0.0, 0.01),
         "reference": name,
-        "drops": (Drop(speed=1000.0, at_once=90.0, within_a_minute=40.0),),
+        "drops": (Drop(speed=1000.0, within_1_s=90.0, within_10_s=50.0, within_60_s=40.0),),
         "declared_per_day": 1.0,
         "is_target": False,
         "outcome": "taken",

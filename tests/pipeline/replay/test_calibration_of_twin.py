@@ -9,8 +9,8 @@ from typing import cast
 import numpy as np
 import pytest
 
-from fantwin.pipeline.cli.twins.healthy_evidence import outlier_warnings
 from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.learning.healthy_evidence import outlier_warnings
 from fantwin.pipeline.replay.offline.calibration_of_twin import CalibratedTwin, calibrated
 from fantwin.pipeline.replay.offline.healthy_runs import (
     DecidedRun,

@@ -1,4 +1,4 @@
-"""pipeline.cli.twins.drops_found: a drop that is said to be found is found in noise, and a much smaller one is not."""
+"""pipeline.learning.drops_found: a drop that is said to be found is found in noise, and a much smaller one is not."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fantwin.pipeline.cli.twins import drops_found as module
-from fantwin.pipeline.cli.twins.drops_found import drop_lines, dropping, drops_found
+from fantwin.pipeline.learning import drops_found as module
+from fantwin.pipeline.learning.drops_found import dropping, drops_found
 from fantwin.pipeline.prediction.tray_twin import load_tray_twin
 from fantwin.pipeline.tray_scoring.modelled_fans import modelled_fans
 from fantwin.schemas.messages import Array
@@ -63,7 +63,7 @@ def test_most_fans_show_a_drop_in_the_time_in_which_it_is_said_to_be_found_and_a
         assert drop.within_1_s and drop.within_10_s and drop.within_60_s and larger.within_10_s
         assert drop.speed > drop.within_1_s > drop.within_10_s > drop.within_60_s
         assert larger.within_10_s > drop.within_10_s
-    assert drop_lines(by_theory, "rpm")[0].startswith("found at 1,250 rpm: a drop of ")
+    assert by_theory[0].line("rpm").startswith("found at 1,250 rpm: a drop of ")
     assert drops_found(write_twin(tmp_path / "none.onnx"), RAD_S_PER_UNIT) == [], "it is not calibrated"
 
     half = by_theory[1]

@@ -7,6 +7,7 @@ that is rare counts.
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -14,17 +15,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-import typer
 from numpy.typing import NDArray
 
-from fantwin.pipeline.cli.twins.training_data import TrainingData, joined, training_data_of, twin_errors
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.learning.history_recordings import HistoryRecording
+from fantwin.pipeline.learning.training_data import TrainingData, joined, training_data_of, twin_errors
 from fantwin.pipeline.recordings.excerpts import ExcerptReader
 
 if TYPE_CHECKING:
     from fantwin.schemas.messages import Array
 
+_LOG = logging.getLogger(__name__)
 MOST_HZ = 100.0
 """samples of faster lines are thinned to at most about this rate, that of the fastest grid by default"""
 NEARLY = 0.05
@@ -41,7 +42,7 @@ class Excerpt:
 
 
 def read_excerpts(excerpts: Iterable[Excerpt]) -> TrainingData:
-    """The samples of excerpts together, those of fast lines thinned. Damage is reported on stderr.
+    """The samples of excerpts together, those of fast lines thinned. Damage is logged.
 
     Raises:
         UserError: they cannot be read, or are not in one unit.
@@ -57,7 +58,7 @@ def each_excerpt(excerpts: Iterable[Excerpt]) -> Iterator[TrainingData]:
             path, reader = excerpt.path, ExcerptReader(excerpt.path)
         found = reader.read(excerpt.from_s, excerpt.to_s)
         if found.damage:
-            typer.echo(found.damage, err=True)
+            _LOG.warning("%s", found.damage)
         yield _thinned(training_data_of(found))
 
 

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fantwin.pipeline.cli.twins.training_data import TrainingData, twin_errors
-from fantwin.pipeline.cli.twins.version_data import Excerpt, each_excerpt
+from fantwin.pipeline.learning.training_data import TrainingData, twin_errors
+from fantwin.pipeline.learning.version_data import Excerpt, each_excerpt
 
 if TYPE_CHECKING:
     from fantwin.schemas.messages import Array

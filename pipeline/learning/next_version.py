@@ -12,19 +12,19 @@ from __future__ import annotations
 import hashlib
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from io import StringIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
-from fantwin.pipeline.cli.options import write_whole
-from fantwin.pipeline.cli.twins.calibrate import calibrate
-from fantwin.pipeline.cli.twins.drops_found import drops_found
-from fantwin.pipeline.cli.twins.fan_changes import (
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.files import write_whole
+from fantwin.pipeline.learning.calibrating import calibrated_on, with_calibration
+from fantwin.pipeline.learning.drops_found import drops_found
+from fantwin.pipeline.learning.fan_changes import (
     changed_fans,
     changes_from_list,
     changes_to_list,
@@ -32,9 +32,11 @@ from fantwin.pipeline.cli.twins.fan_changes import (
     mean_changes,
     residual_of,
 )
-from fantwin.pipeline.cli.twins.train import fit_twin
-from fantwin.pipeline.cli.twins.training_data import TrainingData, twin_errors
-from fantwin.pipeline.cli.twins.version_data import (
+from fantwin.pipeline.learning.fitting import fit_twin
+from fantwin.pipeline.learning.healthy_history import healthy_recordings, recordings_near_alarms
+from fantwin.pipeline.learning.history_recordings import HistoryRecording
+from fantwin.pipeline.learning.training_data import TrainingData, twin_errors
+from fantwin.pipeline.learning.version_data import (
     Split,
     newest_long,
     newest_recordings,
@@ -42,13 +44,9 @@ from fantwin.pipeline.cli.twins.version_data import (
     split,
     spread_parts,
 )
-from fantwin.pipeline.errors import UserError
-from fantwin.pipeline.learning.healthy_history import healthy_recordings, recordings_near_alarms
-from fantwin.pipeline.learning.history_recordings import HistoryRecording
 from fantwin.pipeline.learning.versions import Check, Drop, Outcome, TwinVersions, Version, VersionList, overlap
-from fantwin.pipeline.prediction.tray_twin import load_tray_twin
 from fantwin.pipeline.recordings.excerpts import ExcerptReader
-from fantwin.pipeline.replay.offline.calibration_of_twin import calibration_in
+from fantwin.pipeline.replay.offline.healthy_runs import HealthyPart, in_this_process
 from fantwin.pipeline.sources.tacho_evidence import tacho_hints
 from fantwin.scoring.calibration.calibration import Calibration, needed_fan_hours
 
@@ -345,17 +343,15 @@ class _Work:
 
             named.write_bytes(with_card_entries(twin.read_bytes(), {"name": self._name}))
         self._say(f"{self._name}: calibrating on {_hours(sum(each.seconds for each in of))} of healthy running")
-        with _quietly():
-            left_out = self._alarms_since(of[0].span[0])
-            paths = [each.path for each in of]
-            calibrate(named, paths, self._per_day, extrapolate=True, alarms_left_out=left_out, output=done, jobs="1")
-        calibration = calibration_in(done, load_tray_twin(done))
-        assert calibration
-        drops = (
-            Drop(speed=drop.speed, at_once=drop.within_1_s, within_a_minute=drop.within_60_s)
-            for drop in drops_found(done, test.rad_s_per_unit)
-        )
-        return _CalibratedFile(done.read_bytes(), calibration, tuple(drops))
+        left_out = self._alarms_since(of[0].span[0])
+        paths, part = [each.path for each in of], HealthyPart(named)
+        with threadpool_limits(1):  # with more threads linear algebra rounds in another order
+            found = calibrated_on(
+                paths, part, self._per_day, in_this_process, extrapolate=True, alarms_left_out=left_out
+            )
+        done.write_bytes(with_calibration(named, found.calibration))
+        drops = tuple(drops_found(done, test.rad_s_per_unit))
+        return _CalibratedFile(done.read_bytes(), found.calibration, drops)
 
 
 @dataclass(frozen=True)
@@ -381,10 +377,3 @@ def _error(twin: Path, data: TrainingData) -> float:
 
 def _hours(seconds: float) -> str:
     return f"{seconds / 60.0:.3g} min" if seconds < 2 * 3600.0 else f"{seconds / 3600.0:.3g} h"
-
-
-@contextmanager
-def _quietly() -> Iterator[None]:
-    """What other commands print is not shown; their warnings are about data that nobody chose."""
-    with redirect_stdout(StringIO()), redirect_stderr(StringIO()):
-        yield

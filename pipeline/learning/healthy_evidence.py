@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 
-from fantwin.pipeline.cli.in_parallel import RecordingsInParallel
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.prediction.tray_twin import TrayTwin, load_tray_twin
 from fantwin.pipeline.recordings.checksum import sha256_of
@@ -22,7 +21,7 @@ from fantwin.pipeline.recordings.clips.clip import require_no_clip
 from fantwin.pipeline.recordings.contents import contents_of
 from fantwin.pipeline.replay.offline.alarm_episodes import episodes
 from fantwin.pipeline.replay.offline.calibration_of_twin import CalibratedTwin, calibration_in, number_text
-from fantwin.pipeline.replay.offline.healthy_runs import DecidedRun, HealthyPart, LearnedRun
+from fantwin.pipeline.replay.offline.healthy_runs import DecidedRun, HealthyPart, LearnedRun, MapRecordings
 from fantwin.pipeline.replay.offline.marked_alarms import LeftOut, MarkedAlarm, alarms_in, concerning, marked_alarms
 from fantwin.pipeline.replay.offline.rescoring import rescore
 from fantwin.schemas.enums import Feedback
@@ -59,19 +58,19 @@ class MarkedRunning:
 
 
 def marked_running(
-    recordings: Sequence[Path], feedback: Sequence[Path], tray: str | None, pool: RecordingsInParallel
+    recordings: Sequence[Path], feedback: Sequence[Path], tray: str | None, each: MapRecordings
 ) -> MarkedRunning:
     """What operators said of the alarms in recordings. feedback: other files in which they said it. tray: the only one
-    that is used.
+    that is used. each: does the work on each recording.
 
     Raises:
         UserError: one cannot be read, or a recording is the clip of an alarm.
     """
-    found = [*pool.map(_of_recording, recordings, "looking for alarms in recordings"), *map(_named, feedback)]
-    alarms = [each for each in marked_alarms(found) if tray in (None, each.alarm.tray)]
+    found = [*each(_of_recording, recordings, "looking for alarms in recordings"), *map(_named, feedback)]
+    alarms = [marked for marked in marked_alarms(found) if tray in (None, marked.alarm.tray)]
     if feedback:
         spans = [(contents.first_ns or 0, contents.last_ns or 0) for contents in map(contents_of, recordings)]
-        alarms = [each for each in alarms if each.first_file in recordings or _is_within(each, spans)]
+        alarms = [marked for marked in alarms if marked.first_file in recordings or _is_within(marked, spans)]
     return MarkedRunning(tuple(alarms))
 
 
@@ -197,7 +196,7 @@ def check_declared_rate(
     twin: Path,
     recordings: Sequence[Path],
     overrides: Sequence[str],
-    pool: RecordingsInParallel,
+    each: MapRecordings,
     tray: str | None = None,
     left_out: Sequence[LeftOut] = (),
 ) -> Check:
@@ -214,9 +213,9 @@ def check_declared_rate(
     if calibration is None:
         raise UserError(f"{twin}: its alarms were never calibrated: give healthy recordings and --false-alarms-per-day")
     made_from = _made_from(twin, loaded, calibration)
-    list(pool.map(partial(_refuse_its_own, made_from=made_from), recordings, "looking for its own recordings"))
+    list(each(partial(_refuse_its_own, made_from=made_from), recordings, "looking for its own recordings"))
     count = partial(_count_alarms, twin=twin, overrides=tuple(overrides), tray=tray, left_out=tuple(left_out))
-    counts = list(pool.map(count, recordings, "scoring other healthy recordings"))
+    counts = list(each(count, recordings, "scoring other healthy recordings"))
     return Check(
         sum(alarms for alarms, _ in counts), sum(hours for _, hours in counts), calibration.false_alarms_per_day
     )

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fantwin.pipeline.cli.twins.fan_changes import (
+from fantwin.pipeline.cli.twins.twins import check_line
+from fantwin.pipeline.learning.fan_changes import (
     changed_fans,
     changes_from_list,
     changes_to_list,
@@ -16,9 +17,8 @@ from fantwin.pipeline.cli.twins.fan_changes import (
     have_most_changed_alike,
     mean_changes,
 )
-from fantwin.pipeline.cli.twins.twins import check_line
-from fantwin.pipeline.cli.twins.version_data import Excerpt
 from fantwin.pipeline.learning.healthy_history import healthy_recordings
+from fantwin.pipeline.learning.version_data import Excerpt
 from fantwin.pipeline.learning.versions import Check
 from fantwin.twin.models.physical import PhysicalModel
 from tests.support.commanded_fans import moving, recorded

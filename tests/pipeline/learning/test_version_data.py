@@ -8,8 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fantwin.pipeline.cli.twins.train import TrainingSettings, fit_twin
-from fantwin.pipeline.cli.twins.version_data import (
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.learning.fitting import TrainingSettings, fit_twin
+from fantwin.pipeline.learning.healthy_history import healthy_recordings
+from fantwin.pipeline.learning.history_recordings import HistoryRecording
+from fantwin.pipeline.learning.version_data import (
     CHECKED_PART_S,
     CHECKED_PARTS,
     Excerpt,
@@ -19,9 +22,6 @@ from fantwin.pipeline.cli.twins.version_data import (
     spread_parts,
     windows_of,
 )
-from fantwin.pipeline.errors import UserError
-from fantwin.pipeline.learning.healthy_history import healthy_recordings
-from fantwin.pipeline.learning.history_recordings import HistoryRecording
 from fantwin.schemas.units import NS_PER_S
 from tests.support.commanded_fans import HELD, RATE_HZ, held, moving, recorded
 

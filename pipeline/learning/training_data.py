@@ -1,4 +1,4 @@
-"""Shared by the commands that train and evaluate twins: recordings as runs, and errors in one line."""
+"""Recordings as the runs that twins are trained and evaluated on, and errors of the model maker in one line."""
 
 from __future__ import annotations
 
@@ -9,82 +9,22 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, TypeAlias
+from typing import TYPE_CHECKING
 
-import typer
 from pydantic import ValidationError
 
-from fantwin.pipeline.cli.in_parallel import RecordingsInParallel
-from fantwin.pipeline.cli.options import fan_numbers, make_folder
 from fantwin.pipeline.errors import UsageError, UserError
 from fantwin.pipeline.recordings.checksum import sha256_of
-from fantwin.pipeline.recordings.remote import matching, recording_path
 from fantwin.pipeline.recordings.runs import RecordedRun, RecordedTray, read_runs
+from fantwin.pipeline.replay.offline.healthy_runs import MapRecordings
 from fantwin.pipeline.sources.tables.measured_table import RAD_S_PER_TABLE_UNIT
 from fantwin.pipeline.sources.tacho_evidence import tacho_hints
-from fantwin.schemas.reference_conditions import HOLD_S
 from fantwin.schemas.tacho import Tacho
 
 if TYPE_CHECKING:
     from fantwin.schemas.twin_card import DataCard
     from fantwin.twin.runs import Run
 
-RecordingsArgument: TypeAlias = Annotated[
-    list[Path],
-    typer.Argument(
-        parser=recording_path,
-        callback=matching,
-        metavar="REC.mcap...",
-        help="Recordings, also at URLs; each counts its seconds from its own start.",
-    ),
-]
-FromOption: TypeAlias = Annotated[
-    float, typer.Option("--from", min=0.0, help="Use each recording from this second on.")
-]
-ToOption: TypeAlias = Annotated[float, typer.Option("--to", min=0.0, help="Use each recording up to this second.")]
-TrayOption: TypeAlias = Annotated[str | None, typer.Option(help="Which tray, where a recording has several.")]
-WindowOption: TypeAlias = Annotated[
-    list[float] | None,
-    typer.Option(
-        "--window",
-        metavar="S",
-        help="Seconds over which tachos count two pulses a revolution, in place of what the recordings say: one for "
-        "all fans, or one for each. Repeatable.",
-    ),
-]
-IgnoreOption: TypeAlias = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--ignore",
-        metavar="COLUMN",
-        help=f"Leave out a column that is bad: {' or '.join(HOLD_S)}. Repeatable.",
-    ),
-]
-ValidateOption: TypeAlias = Annotated[
-    list[Path] | None,
-    typer.Option(
-        parser=recording_path,
-        callback=matching,
-        metavar="REC.mcap...",
-        help="Held-out healthy recordings: evaluated, not fitted. Of one that is also trained on, what --to, or else "
-        "--from, leaves out.",
-    ),
-]
-TestOption: TypeAlias = Annotated[
-    list[Path] | None,
-    typer.Option(
-        parser=recording_path,
-        callback=matching,
-        metavar="REC.mcap...",
-        help="Several models: healthy recordings that decide which is the best, and take no part in training.",
-    ),
-]
-FansOption: TypeAlias = Annotated[str | None, typer.Option(help="Only these fans, counted from 0, e.g. 0,2.")]
-
-TACHO_ADVICE = "see `tacho` in [[tray]], or --window for recordings that do not say"
-TACHO_CONSEQUENCE = (
-    "hint: if so, the delay of the tacho is taken for inertia, and what follows, warnings too, may come from that"
-)
 MANY_OUTLIERS = 0.001
 _NUMBER = r"\d[\d.]*(?:e[+-]\d+)?"
 
@@ -145,39 +85,31 @@ def _rounded(value: float) -> str:
 
 @dataclass(frozen=True)
 class Part:
-    """Which part of each recording is read; see the options. windows_s: of tachos, in place of the recordings' own.
-    ignored: columns that a twin can use, and that are left out."""
+    """Which part of each recording is read. windows_s: of tachos, in place of the recordings' own. ignored: columns
+    that a twin can use, and that are left out."""
 
     tray: str | None = None
-    fans: str | None = None
+    fans: Sequence[int] | None = None
     from_s: float = 0.0
     to_s: float = math.inf
     windows_s: tuple[float, ...] = ()
     ignored: tuple[str, ...] = ()
 
 
-def read_training_data(recordings: Sequence[Path], part: Part, pool: RecordingsInParallel) -> TrainingData:
-    """The runs of several recordings, their outliers left out. Damage in a recording is reported on stderr.
+def read_training_data(recordings: Sequence[Path], part: Part, each: MapRecordings) -> TrainingData:
+    """The runs of several recordings, their outliers left out. each: does the work on each recording.
 
     All samples of the part are in memory, 16 bytes for each of a fan: a fit needs them all.
 
     Raises:
         UserError: a recording cannot be used, or they are not in one unit.
     """
-    data = joined(list(pool.map(partial(read_recording_data, part=part), recordings, "reading")))
-    report_damage(data)
-    return data
-
-
-def report_damage(data: TrainingData) -> None:
-    """Say on stderr what could not be read."""
-    for line in data.damage:
-        typer.echo(line, err=True)
+    return joined(list(each(partial(read_recording_data, part=part), recordings, "reading")))
 
 
 def read_recording_data(path: Path, part: Part) -> TrainingData:
     """The runs of one recording. Raises as `read_training_data`."""
-    found = read_runs(path, part.tray, fan_numbers(part.fans), part.from_s, part.to_s)
+    found = read_runs(path, part.tray, part.fans, part.from_s, part.to_s)
     found = replace(found, runs=tuple(_without(run, part.ignored) for run in found.runs))
     data = training_data_of(found, part.fans, part.windows_s)
     longest, tacho = max(
@@ -188,23 +120,13 @@ def read_recording_data(path: Path, part: Part) -> TrainingData:
     return replace(data, hints=tuple(hints), sha256={path: sha256_of(path)})
 
 
-def ignored_columns(names: Sequence[str] | None) -> tuple[str, ...]:
-    """The names of the columns to leave out, as given.
-
-    Raises:
-        UsageError: there is no such column, or no twin uses it.
-    """
-    for name in names or ():
-        if name not in HOLD_S:
-            raise UsageError(f"--ignore {name}: known are {', '.join(HOLD_S)}, the columns that a twin can use")
-    return tuple(names or ())
-
-
 def _without(run: RecordedRun, ignored: Sequence[str]) -> RecordedRun:
     return replace(run, auxiliary={name: of for name, of in run.auxiliary.items() if name not in ignored})
 
 
-def training_data_of(found: RecordedTray, fans: str | None = None, windows_s: Sequence[float] = ()) -> TrainingData:
+def training_data_of(
+    found: RecordedTray, fans: Sequence[int] | None = None, windows_s: Sequence[float] = ()
+) -> TrainingData:
     """The runs of what was read of a recording, their outliers left out. fans, windows_s: as of `Part`.
 
     Raises:
@@ -215,7 +137,7 @@ def training_data_of(found: RecordedTray, fans: str | None = None, windows_s: Se
 
     path = found.runs[0].path
     tacho = counting_tachos(windows_s) if windows_s else found.tacho
-    numbers = fan_numbers(fans) or list(range(found.runs[0].command.shape[1]))
+    numbers = list(fans or range(found.runs[0].command.shape[1]))
     with twin_errors():
         cleaned = [
             without_outliers(Run(path.stem, run.t_s, run.command, run.speed_rad_s, tacho, run.auxiliary))
@@ -273,14 +195,6 @@ def common_unit(found: Sequence[tuple[str, Path]]) -> str:
     return unit
 
 
-def show_hints(hints: Sequence[str]) -> None:
-    """Say on stderr, before the work, what the declared tachos may spoil."""
-    for hint in hints:
-        typer.secho(f"hint: {hint}; {TACHO_ADVICE}", fg=typer.colors.YELLOW, err=True)
-    if hints:
-        typer.secho(TACHO_CONSEQUENCE, fg=typer.colors.YELLOW, err=True)
-
-
 def counting_tachos(windows_s: Sequence[float]) -> tuple[Tacho, ...]:
     """Tachos that count the usual two pulses a revolution over these windows.
 
@@ -318,7 +232,7 @@ def data_cards(data: TrainingData) -> list[DataCard]:
 
 
 def read_held_out(
-    training_data: TrainingData, recordings: Sequence[Path], part: Part, pool: RecordingsInParallel
+    training_data: TrainingData, recordings: Sequence[Path], part: Part, each: MapRecordings
 ) -> TrainingData:
     """Recordings for evaluation, which take no part in the fit; of one that is fitted in part, the rest.
 
@@ -329,8 +243,7 @@ def read_held_out(
     """
     trained_on = frozenset(source.path for source in training_data.sources)
     read = partial(_read_held_out, part=part, trained_on=trained_on)
-    held_out = joined(list(pool.map(read, recordings, "reading")))
-    report_damage(held_out)
+    held_out = joined(list(each(read, recordings, "reading")))
     if held_out.speed_unit != training_data.speed_unit:
         raise UserError(
             f"{recordings[0]}: speeds in {held_out.speed_unit}, the training data are in {training_data.speed_unit}: "
@@ -351,21 +264,3 @@ def _read_held_out(path: Path, part: Part, trained_on: frozenset[Path]) -> Train
         return read_recording_data(path, whole)
     rest = replace(whole, from_s=part.to_s) if part.to_s < math.inf else replace(whole, to_s=part.from_s or math.inf)
     return read_recording_data(path, rest)
-
-
-def check_writable(output: Path, suffix: str) -> None:
-    """Check before long work that its result can be written, under a name with this suffix.
-
-    Raises:
-        UserError: it cannot be written, or the name has another suffix.
-    """
-    if output.suffix != suffix:
-        raise UsageError(f"{output}: name a file that ends in {suffix} with -o")
-    make_folder(output.parent)
-    existed = output.exists()
-    try:
-        output.open("ab").close()
-        if not existed:
-            output.unlink()
-    except OSError as error:
-        raise UserError(f"{output}: cannot be written: {error.strerror}; name another file with -o") from error

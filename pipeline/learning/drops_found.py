@@ -5,12 +5,12 @@ The scorer itself is asked, without noise: fans run steadily, then each drops by
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from fantwin.pipeline.learning.versions import Drop
 from fantwin.pipeline.prediction.tray_twin import TrayTwin, load_tray_twin
 from fantwin.pipeline.replay.offline.calibration_of_twin import calibration_in
 from fantwin.pipeline.replay.offline.healthy_runs import FreeLimit
@@ -27,22 +27,9 @@ SPEEDS = (0.25, 0.5, 0.75, 1.0)
 DROPS = np.geomspace(0.002, 1.0, 11)
 """shares of the speed"""
 WITHIN_S = (1.0, 10.0, 60.0)
+_TIMES = ("within_1_s", "within_10_s", "within_60_s")
 STEADY_S = 60.0
 """time before the drop; a fan that has run for longer is known better"""
-
-
-@dataclass(frozen=True)
-class Drop:
-    """The smallest drops found at a speed, in its unit; None: not even standstill is found in that time."""
-
-    speed: float
-    within_1_s: float | None
-    within_10_s: float | None
-    within_60_s: float | None
-
-    def as_json(self) -> dict[str, float | None]:
-        """The same for --json."""
-        return dict(vars(self))
 
 
 def drops_found(path: Path, rad_s_per_unit: float) -> list[Drop]:
@@ -58,7 +45,10 @@ def drops_found(path: Path, rad_s_per_unit: float) -> list[Drop]:
         return []
     speeds = [share * twin.card.top_speed_rad_s / rad_s_per_unit for share in SPEEDS]
     return [
-        Drop(speed, *(share * speed if np.isfinite(share) else None for share in shares))
+        Drop.model_validate(
+            {"speed": speed}
+            | {name: share * speed if np.isfinite(share) else None for name, share in zip(_TIMES, shares, strict=True)}
+        )
         for speed, shares in zip(speeds, smallest_drops(twin, calibration).tolist(), strict=True)
     ]
 
@@ -116,19 +106,3 @@ def dropping(twin: TrayTwin, fans: Fans, speed_rad_s: Array, drop: Array) -> Pre
         torque_balance_sigma_command=fans.balance_noise,
         reading_range_rad_s=np.broadcast_to(0.5 * fans.pulse_rad_s, shape),
     )
-
-
-def drop_lines(drops: Sequence[Drop], unit: str) -> list[str]:
-    """One line for each speed."""
-    return [f"found at {_of(drop.speed)} {unit}: {_found(drop, unit)}" for drop in drops]
-
-
-def _found(drop: Drop, unit: str) -> str:
-    found = ((drop.within_1_s, "1 s"), (drop.within_10_s, "10 s"), (drop.within_60_s, "60 s"))
-    parts = [f"{_of(value)} {unit} within {time}" for value, time in found if value is not None]
-    return f"a drop of {', '.join(parts)}" if parts else "no drop, not even standstill"
-
-
-def _of(value: float) -> str:
-    """Two digits of a drop are enough."""
-    return f"{value:,.0f}" if value >= 10 else f"{value:.2g}"

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fantwin.pipeline.cli.twins import next_version
-from fantwin.pipeline.cli.twins.fan_changes import changes_to_list, mean_changes
-from fantwin.pipeline.cli.twins.next_version import make_next_version
-from fantwin.pipeline.cli.twins.version_data import spread_parts
+from fantwin.pipeline.learning import next_version
+from fantwin.pipeline.learning.fan_changes import changes_to_list, mean_changes
 from fantwin.pipeline.learning.healthy_history import healthy_recordings, recordings_near_alarms
+from fantwin.pipeline.learning.next_version import make_next_version
+from fantwin.pipeline.learning.version_data import spread_parts
 from fantwin.pipeline.learning.versions import Check, TwinVersions
 from fantwin.schemas.messages import Array
 from fantwin.schemas.units import NS_PER_S

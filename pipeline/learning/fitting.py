@@ -1,0 +1,73 @@
+"""How a twin is trained of what was read of recordings."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal, TypeAlias
+
+from fantwin.pipeline.learning.training_data import TrainingData, data_cards
+
+if TYPE_CHECKING:
+    from fantwin.twin.each_network import ForEachNetwork
+    from fantwin.twin.finishing import TrainedTwin
+    from fantwin.twin.progress import Progress
+
+Trainer: TypeAlias = Literal["levenberg-marquardt", "adam"]
+"""written again, since twin takes a while to load"""
+NETWORKS = 4
+"""with so many, twins hardly depend on the seed: docs/reference/benchmarks.md"""
+
+
+@dataclass(frozen=True)
+class TrainingSettings:
+    """How a twin is trained; see the options of the command. network_inputs: None for those of the kind of model."""
+
+    model: str = "hybrid"
+    seed: int = 0
+    trainer: Trainer = "levenberg-marquardt"
+    iterations: int | None = None
+    network_inputs: tuple[str, ...] | None = None
+    networks: int | None = None
+    command_unit: str = ""
+
+
+DEFAULT_SETTINGS = TrainingSettings()
+
+
+def fit_twin(
+    training_data: TrainingData,
+    held_out: TrainingData | None,
+    name: str,
+    settings: TrainingSettings = DEFAULT_SETTINGS,
+    progress: Progress | None = None,
+    each_network: ForEachNetwork | None = None,
+) -> TrainedTwin:
+    """A twin of what was read. held_out: on which its weights are chosen and its band is measured. each_network: who
+    trains its networks; None: this process, one after another.
+
+    Raises:
+        TwinError: the data do not suffice.
+    """
+    from fantwin.twin.build import train_twin  # noqa: PLC0415  the command line loads twin only when it is needed
+    from fantwin.twin.each_network import one_after_another  # noqa: PLC0415
+    from fantwin.twin.kinds import BOTH_INPUTS, find_kind  # noqa: PLC0415
+    from fantwin.twin.progress import unreported  # noqa: PLC0415
+
+    can_average = find_kind(settings.model).averages_networks and settings.trainer == DEFAULT_SETTINGS.trainer
+    return train_twin(
+        training_data.runs,
+        held_out.runs if held_out else [],
+        settings.model,
+        name=name,
+        seed=settings.seed,
+        max_iterations=settings.iterations,
+        trainer=settings.trainer,
+        network_inputs=settings.network_inputs or BOTH_INPUTS,
+        networks=settings.networks if settings.networks is not None else NETWORKS if can_average else 1,
+        each_network=each_network or one_after_another,
+        command_unit=settings.command_unit,
+        fan_numbers=training_data.fans,
+        data=data_cards(training_data),
+        validation_data=data_cards(held_out) if held_out else (),
+        progress=progress or unreported,
+    )

@@ -1,0 +1,42 @@
+"""A scorer in a thread whose core a test gives, and the words that lead a command to its bus."""
+
+from __future__ import annotations
+
+import threading
+from typing import Any
+
+from fantwin.pipeline.config.loading import load_config
+from fantwin.pipeline.runtime.runner import Runner
+from fantwin.pipeline.runtime.stage import BuiltStage, Core, Stage
+from fantwin.pipeline.tray_scoring.healthy_twin import ScorerConfig
+from tests.support.running_chain import DEMO
+
+
+class RunningScorer:
+    """The one of the demo's tray; it runs until `end`."""
+
+    def __init__(self, endpoint: str, core: Core) -> None:
+        setting = f"bus.endpoint='{endpoint}'"
+        self.words = ("-c", DEMO / "demo.toml", "--set", setting)
+        self.config = load_config(DEMO / "demo.toml", [setting])
+        stage = Stage(
+            name="scorer",
+            about="",
+            reads=("prediction", "request"),
+            writes=("alarm", "score", "snapshot"),
+            config=ScorerConfig,
+            build=lambda _context: BuiltStage(core),
+        )
+        self._stop = threading.Event()
+        self.runner = Runner(stage, self.config, None, self._stop)
+        self.last: Any = None
+        """its health at the end"""
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def _run(self) -> None:
+        self.last = self.runner.run()
+
+    def end(self) -> None:
+        self._stop.set()
+        self._thread.join(20)
