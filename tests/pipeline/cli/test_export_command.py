@@ -2,7 +2,6 @@
 
 import json
 import re
-import tracemalloc
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
@@ -147,21 +146,18 @@ def test_parts_become_one_table_under_the_name_of_the_first(tmp_path):
     assert table(tmp_path / "b.tray1.raw.csv")["host_receive_t_ns"].is_monotonic_increasing
 
 
-@pytest.mark.parametrize("form", FORMS)
-def test_the_readable_part_of_a_truncated_recording_is_exported_with_exit_code_3(tmp_path, form):
+def test_the_readable_part_of_a_truncated_recording_is_exported_with_exit_code_3(tmp_path):
     whole = write(tmp_path / "whole.mcap", (raw(n) for n in range(3000)))
     path = tmp_path / "truncated.mcap.active"
     path.write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])
-    result = fantwin("export", path, "--to", form, "-o", tmp_path, "--json")
+    result = fantwin("export", path, "--to", "parquet", "-o", tmp_path, "--json")
     assert result.exit_code == 3
     assert result.stderr == f"{path}: it is truncated, as after a crash; read up to that point\n"
     report = json.loads(result.stdout)
     assert report["damage"] == [result.stderr.strip()]
-    frame = table(tmp_path / f"truncated.tray1.raw.{form}")
-    assert 0 < len(frame) == report["tables"][0]["rows"] < 3000 * 20
-    if form == "parquet":
-        metadata = pq.read_metadata(tmp_path / "truncated.tray1.raw.parquet").metadata
-        assert metadata[b"fantwin.damage"].decode() == report["damage"][0]
+    table_file = tmp_path / "truncated.tray1.raw.parquet"
+    assert 0 < len(table(table_file)) == report["tables"][0]["rows"] < 3000 * 20
+    assert pq.read_metadata(table_file).metadata[b"fantwin.damage"].decode() == report["damage"][0]
 
 
 def test_an_existing_table_is_replaced_only_with_force_and_only_by_a_complete_one(tmp_path):
@@ -223,16 +219,3 @@ def test_every_topic_has_a_table_of_plain_columns_and_enums_are_names():
         assert all(column.dtype.kind in "iufbO" for column in found.values())
         enums = {f.name for f in proto_type(kind).DESCRIPTOR.fields if f.enum_type}
         assert {name for name, column in found.items() if column.enum} == enums
-
-
-def test_memory_does_not_grow_with_the_recording(tmp_path):
-    def peak(messages: int) -> int:
-        path = write(tmp_path / "r.mcap", (raw(n, samples=1000, fans=1) for n in range(messages)))
-        tracemalloc.start()
-        assert fantwin("export", path, "--to", "csv", "-o", tmp_path / "t.csv", "--force").exit_code == 0
-        most = tracemalloc.get_traced_memory()[1]
-        tracemalloc.stop()
-        return most
-
-    peak(1)  # what is imported and cached on first use
-    assert peak(36) < 1.5 * peak(9)

@@ -54,17 +54,6 @@ def test_whoever_may_not_command_is_told_the_role_that_may_in_words_of_the_docum
     )
 
 
-def test_a_stage_that_the_router_lets_read_nothing_ends_with_1_and_one_line(site):
-    """It publishes its health alone, which the router accepts: what it reads is declared later."""
-    roles = dict(site.site.roles)
-    deaf = SiteRoles(SITE, {**roles, "recorder": replace(roles["recorder"], reads=())})
-    with open_router(site.endpoint, site.credentials("router"), deaf):
-        done = fantwin("up", "--only", "recorder", "-c", site.config.path)
-    assert done.returncode == 1
-    (line,) = [line for line in done.stderr.splitlines() if line.startswith("fantwin: ")]
-    assert line.startswith("fantwin: the router does not let 'recorder' read raw of ")
-
-
 def examined(site: SecuredSite) -> tuple[list[str], list[str]]:
     """The lines of doctor about certificates: good ones and problems."""
     done = called("doctor", "-c", site.config.path, "--listen-s", 0, "--json")

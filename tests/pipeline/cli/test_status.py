@@ -18,14 +18,12 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from fantwin.pipeline import extras
 from fantwin.pipeline.bus.publisher import Publisher
 from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.cli.watch import status as status_command
 from fantwin.pipeline.cli.watch.status import as_json, loss_lines, not_judged, stage_table
 from fantwin.pipeline.config.loading import load_config
 from fantwin.pipeline.config.models import BusConfig
-from fantwin.pipeline.launch.this_host import load_for_this_host
 from fantwin.pipeline.site.site_state import StageState, StageView, Word
 from fantwin.pipeline.site.site_watcher import SiteWatcher
 from fantwin.schemas.codec import encode, type_name
@@ -206,15 +204,6 @@ def test_alarms_are_shown_with_their_states_and_probable_causes(site):
     reported = {alarm["fan"]: alarm for alarm in document(watcher)["alarms"]}
     assert (reported[2]["acknowledged"], reported[2]["causes"][0]["cause"]) == (True, "drag_up")
     assert (reported[3]["retained"], reported[4]["presented"]) == (False, False)
-
-
-def test_a_viewer_that_is_left_out_for_want_of_its_extra_is_not_missing(site, monkeypatch):
-    monkeypatch.setattr(extras, "is_installed", lambda module: module != "rerun")
-    watcher = site.watcher()
-    here = load_for_this_host(DEMO / "demo.toml", stages=()).config
-    seen: Any = as_json(watcher, here)
-    stages = [stage["stage"] for stage in seen["stages"]]
-    assert "recorder" in stages and "viewer" not in stages
 
 
 def test_row_01_a_missing_stage_has_a_row_and_no_alarms_is_not_said_while_a_fan_is_not_judged(site):

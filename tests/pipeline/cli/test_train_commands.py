@@ -165,19 +165,6 @@ def test_a_part_of_a_recording_and_some_of_its_fans_can_be_used(folder, twin, tm
     assert (result["evaluated_on"], result["samples"]) == ("held-out", 2000)
 
 
-def test_train_reports_the_healthy_torque_balance_and_that_nothing_was_held_out(folder, tmp_path):
-    twin = tmp_path / "t.onnx"
-    command = ("train", folder / "two.mcap", "--model", "physical", "--command-unit", "%", "-o", twin)
-    lines = fantwin(*command).stdout.splitlines()
-    balance = OnnxTwin(twin).card.balance
-    assert balance and balance.source == ("physics",) * 2
-    low, high = sorted(balance.sigma_command)
-    implied = PUBLISHED_PARAMETERS[0] * 3.0 * NOISE_RAD_S
-    assert (low, high) == (pytest.approx(implied, rel=0.1), pytest.approx(implied, rel=0.1))
-    assert f"  torque balance: healthy sigma {low:.4g} to {high:.4g} %; coefficients of 2 fan(s) by physics" in lines
-    assert any(line.startswith("  training data, free run: rmse") for line in lines)
-
-
 def test_outliers_are_left_out_in_every_evaluation_of_a_twin(tmp_path):
     run = published_run(7)
     speed = run.speed_rad_s.copy()

@@ -33,11 +33,3 @@ def test_no_reference_is_named_before_a_version_was_learned_from_24_hours(tmp_pa
     assert [each["reference"] for each in after["versions"]] == [None, "tray1-2", "tray1-2"]
     assert after["check"]["reference"] == "tray1-2"
     assert after["in_force"] == "tray1-3"
-
-
-def test_a_reference_that_was_learned_from_a_faulty_time_is_not_named(tmp_path: Path) -> None:
-    versions = TwinVersions(learning_folder(tmp_path / "runs", "tray1"), "tray1")
-    versions.add(version("tray1-1", 3))
-    assert printed(tmp_path)["versions"][0]["reference"] == "tray1-1"
-    versions.mark_faulty((DAY_NS, 2 * DAY_NS))
-    assert printed(tmp_path)["versions"][0]["reference"] is None
