@@ -28,7 +28,7 @@ FANS = 20
 
 def twin_with(path: Path, limit_factor: float) -> Path:
     entry = json.loads(CALIBRATION.model_copy(update={"limit_factor": limit_factor}).model_dump_json())
-    return write_twin(path, fans=1, calibration=entry)
+    return write_twin(path, fans=1, calibration=entry, rate_hz=20.0)
 
 
 def found_after_s(path: Path, drops: Array) -> Array:
