@@ -68,8 +68,8 @@ def remade(lean: Path, whole: Path) -> Comparison:
     """What a replay of the recording `lean` makes, compared with the scores and alarms of the recording `whole`."""
     with open_replay_input([lean], None, (), None) as given, open_replay_input([whole], None, (), None) as wanted:
         (tray,) = given.trays
-        plan, recorded_alarms, why_none = given.read_plan(tray.name)
-        assert plan, why_none
+        plan, recorded_alarms, why_not_verified = given.read_plan(tray.name)
+        assert not why_not_verified
         pipeline = given.pipeline(tray.name, plan)
         verifier = TrayVerifier(tray.name, lambda topic: wanted.envelopes(tray.name, (topic,)), pipeline.limit_of)
         alarms: list[Alarm] = []

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import NamedTuple
 
 from fantwin.pipeline.config.loading import load_config
 from fantwin.pipeline.config.models import Config, TrayConfig
@@ -30,6 +31,17 @@ from fantwin.pipeline.runtime.stage import Context
 from fantwin.pipeline.timebase.stage_clock import is_of_replay
 from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.messages import Alarm, Message, ModelCard
+
+
+class ReadPlan(NamedTuple):
+    """How a tray was decided, as its recording says it."""
+
+    plan: TrayPlan
+    """one session of each stage, where the recording does not say it, or another grid or only a part is replayed"""
+    alarms: list[Alarm]
+    """those recorded, each once"""
+    why_not_verified: str = ""
+    """why what this plan makes cannot be compared with the recording; empty if it can"""
 
 
 @dataclass
@@ -80,12 +92,8 @@ class ReplayInput:
             if reading.damage:
                 self.damage[path] = reading.damage
 
-    def read_plan(self, tray: str, *, verify: bool = False) -> tuple[TrayPlan | None, list[Alarm], str]:
-        """What each session of a tray's stages consumed; the recorded alarms, each once; why there is no plan.
-
-        The plan is None if the recording does not contain it, if another grid or only a part is replayed, or to verify
-        a clip.
-        """
+    def read_plan(self, tray: str) -> ReadPlan:
+        """What each session of a tray's stages consumed, and the recorded alarms."""
         left_out = self.metadata.left_out
         recorded = [topic for topic in self.stages.outputs if topic not in left_out]
         reader = PlanReader(self.stages, left_out)
@@ -95,34 +103,25 @@ class ReplayInput:
             line = f"{self.paths[0]}: messages left out that cannot be decoded: {reader.undecodable}"
             self.damage[self.paths[0]] = line
         alarms, snapshot = list(reader.alarms.values()), reader.first_snapshot
+        twins = reader.twins if self.twins[tray] is None else []
         if CLIP_SNAPSHOT_KEY in self.metadata.metadata and snapshot:
-            twins = reader.twins if self.twins[tray] is None else []
-            plan = None if verify else plan_from_snapshot(self.stages, snapshot, twins, reader.answered_requests)
-            return plan, alarms, NOT_VERIFIED
+            plan = plan_from_snapshot(self.stages, snapshot, twins, reader.answered_requests)
+            return ReadPlan(plan, alarms, NOT_VERIFIED)
         plan = reader.plan() if self.is_same_grid and not self.is_part else None
-        if plan:
-            plan.uses_recorded_snapshots = self.is_as_recorded
-            if self.twins[tray] is not None:
-                plan.without_learned_twins()
-        return plan, alarms, reader.no_plan_reason
-
-    def learned_twins(self, tray: str) -> list[ModelCard]:
-        """Those that replace one another in the recording, each with its first sample; none if another twin is used."""
+        if plan is None:
+            return ReadPlan(undisturbed_plan(self.stages, twins), alarms, reader.no_plan_reason)
+        plan.uses_recorded_snapshots = self.is_as_recorded
         if self.twins[tray] is not None:
-            return []
-        reader = PlanReader(self.stages)
-        for envelope in self.envelopes(tray, ("twin",)):
-            reader.add(envelope)
-        return reader.twins
+            plan.without_learned_twins()
+        return ReadPlan(plan, alarms)
 
     def pipeline(
         self, tray: str, plan: TrayPlan | None = None, observe: Callable[[Message], None] = lambda _message: None
     ) -> OfflinePipeline:
-        """The stages of a tray, ready to run. Without a plan, one session of each processes everything."""
+        """The stages of a tray, ready to run. Without a plan, one session of each processes all, by the twin given."""
         raw = RawBlocks(lambda: self.envelopes(tray, ("raw",)), observe, (self.start_s, self.end_s))
         contexts = self.contexts(self.config.tray(tray))
-        plan = plan or undisturbed_plan(self.stages, self.learned_twins(tray))
-        return OfflinePipeline(self.stages, contexts, raw, plan, observe)
+        return OfflinePipeline(self.stages, contexts, raw, plan or undisturbed_plan(self.stages), observe)
 
     def contexts(self, tray: TrayConfig) -> list[Context]:
         """What each stage of a tray is built from, in the order of the chain."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -14,8 +14,8 @@ from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.recordings.writing import RecordingWriter
 from fantwin.pipeline.replay.offline.comparison import CannotCompareError, Comparison
 from fantwin.pipeline.replay.offline.output_recording import TrayOutput, output_writer
-from fantwin.pipeline.replay.offline.plan import RAW_MISSING, TrayPlan, undisturbed_plan
-from fantwin.pipeline.replay.offline.replay_input import ReplayInput
+from fantwin.pipeline.replay.offline.plan import RAW_MISSING, TrayPlan
+from fantwin.pipeline.replay.offline.replay_input import ReadPlan, ReplayInput
 from fantwin.pipeline.replay.offline.verify import TrayVerifier
 from fantwin.schemas.codec import CodecError
 from fantwin.schemas.enums import InvalidReason
@@ -111,21 +111,30 @@ def rescore(
         raise CannotCompareError(
             f"{replay_input.paths[0]}: a part of a run cannot be compared: leave out --start and --end"
         )
+    plans = {tray.name: replay_input.read_plan(tray.name) for tray in replay_input.trays}
+    if verify and all(found.why_not_verified for found in plans.values()):
+        raise _cannot_compare(replay_input, [f"{tray}: {found.why_not_verified}" for tray, found in plans.items()])
     with output_writer(replay_input, output) if output else nullcontext() as writer:
-        trays = [_rescore_tray(replay_input, tray.name, verify, writer, progress) for tray in replay_input.trays]
+        trays = [_rescore_tray(replay_input, tray, found, verify, writer, progress) for tray, found in plans.items()]
     compared = [tray.comparison for tray in trays if tray.comparison]
     if verify and not any(found.has_content for found in compared):
-        reasons = "; ".join(reason for found in compared for reason in found.reasons)
-        raise CannotCompareError(f"{replay_input.paths[0]}: {reasons}")
+        raise _cannot_compare(replay_input, [reason for found in compared for reason in found.reasons])
     return trays
 
 
+def _cannot_compare(replay_input: ReplayInput, reasons: Iterable[str]) -> CannotCompareError:
+    return CannotCompareError(f"{replay_input.paths[0]}: {'; '.join(reasons)}")
+
+
 def _rescore_tray(
-    replay_input: ReplayInput, tray: str, verify: bool, writer: RecordingWriter | None, progress: Progress
+    replay_input: ReplayInput,
+    tray: str,
+    found: ReadPlan,
+    verify: bool,
+    writer: RecordingWriter | None,
+    progress: Progress,
 ) -> RescoredTray:
-    plan, recorded_alarms, no_plan_reason = replay_input.read_plan(tray, verify=verify)
-    plan_used = plan or undisturbed_plan(replay_input.stages, replay_input.learned_twins(tray))
-    rescored = RescoredTray(tray, plan_used, recorded_alarms=recorded_alarms)
+    rescored = RescoredTray(tray, found.plan, recorded_alarms=found.alarms)
     output = TrayOutput(writer, replay_input.config.site, tray) if writer else None
     verifier: TrayVerifier | None = None
 
@@ -135,7 +144,7 @@ def _rescore_tray(
         if verifier and isinstance(message, Grid | Prediction):
             verifier.add_input(message)
 
-    pipeline = replay_input.pipeline(tray, rescored.plan, observe)
+    pipeline = replay_input.pipeline(tray, found.plan, observe)
     verifier = (
         TrayVerifier(
             tray,
@@ -143,7 +152,7 @@ def _rescore_tray(
             pipeline.limit_of,
             replay_input.metadata.left_out,
         )
-        if verify and plan
+        if verify and not found.why_not_verified
         else None
     )
     try:
@@ -160,11 +169,11 @@ def _rescore_tray(
         raise UserError(f"{replay_input.paths[0]}: a message cannot be decoded: {error}; see `fantwin info`") from error
     rescored.counts, rescored.raw_missing = pipeline.counts, pipeline.raw_missing
     if verifier:
-        rescored.comparison = found = verifier.finish(rescored.plan.last, rescored.alarms, recorded_alarms)
-        found.reasons = [reason.replace(RAW_MISSING, str(rescored.raw_missing)) for reason in found.reasons]
-        if not (found.has_content or found.reasons):
-            what = "scores" if found.has_scores else "alarms or snapshots"
-            found.reasons.append(f"{tray}: no {what} in the recording: nothing to compare with")
+        rescored.comparison = compared = verifier.finish(found.plan.last, rescored.alarms, found.alarms)
+        compared.reasons = [reason.replace(RAW_MISSING, str(rescored.raw_missing)) for reason in compared.reasons]
+        if not (compared.has_content or compared.reasons):
+            what = "scores" if compared.has_scores else "alarms or snapshots"
+            compared.reasons.append(f"{tray}: no {what} in the recording: nothing to compare with")
     elif verify:
-        rescored.comparison = Comparison(tray, reasons=[f"{tray}: {no_plan_reason}"])
+        rescored.comparison = Comparison(tray, reasons=[f"{tray}: {found.why_not_verified}"])
     return rescored

@@ -74,20 +74,24 @@ def differences(one: Any, other: Any, note: Callable[[Apart], None], path: tuple
             note(apart)
 
 
+def unequal(name: str, one: Array, other: Array) -> tuple[Array, Array]:
+    """Which values of two arrays of one form are not equal, where all NaN are equal; and the share of the tolerance of
+    each of these, infinite for what is no float."""
+    differs = one != other
+    if one.dtype.kind != "f":
+        return differs, np.full(int(differs.sum()), math.inf)
+    differs &= ~(np.isnan(one) & np.isnan(other))
+    return differs, shares(name, one[differs], other[differs])
+
+
 def _arrays_apart(name: str, one: Array, other: Array) -> Apart:
     if one.shape != other.shape or one.dtype != other.dtype:
         return Apart(math.inf)
-    differs = one != other
-    if one.dtype.kind == "f":
-        differs &= ~(np.isnan(one) & np.isnan(other))
-    if not differs.any():
+    differs, share = unequal(name, one, other)
+    if not share.size:
         return Apart()
-    if one.dtype.kind != "f":
-        return Apart(math.inf)
-    one, other = one[differs], other[differs]
-    share = shares(name, one, other)
     largest = int(np.argmax(share))
-    return Apart(float(share[largest]), name, abs(float(one[largest]) - float(other[largest])))
+    return Apart(float(share[largest]), name, abs(float(one[differs][largest]) - float(other[differs][largest])))
 
 
 def _apart(path: tuple[str, ...], one: Any, other: Any) -> Apart:

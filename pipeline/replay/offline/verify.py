@@ -17,7 +17,7 @@ from fantwin.pipeline.recordings.dates import format_utc
 from fantwin.pipeline.replay.offline.compare_snapshots import SnapshotVerifier
 from fantwin.pipeline.replay.offline.comparison import Comparison
 from fantwin.pipeline.replay.offline.plan import UNLIMITED, Limit, Session
-from fantwin.pipeline.replay.offline.tolerance import Apart, differences, shares
+from fantwin.pipeline.replay.offline.tolerance import Apart, differences, unequal
 from fantwin.schemas.blocks import cut
 from fantwin.schemas.enums import Transition
 from fantwin.schemas.envelope import Envelope
@@ -230,15 +230,12 @@ def _compare_samples(
 
 def _differ(name: str, one: Array, other: Array, found: Comparison) -> Array:
     """(n, fans) which values differ: decisions at all, numbers by more than the tolerance. All NaN are equal."""
-    differs = one != other
-    if one.dtype.kind == "f":
-        differs &= ~(np.isnan(one) & np.isnan(other))
-        one, other = one[differs], other[differs]
-        share = shares(name, one, other)
-        differs[differs] = share > 1.0
-        if (allowed := share <= 1.0).any():
-            largest = int(np.argmax(np.where(allowed, share, 0.0)))
-            found.note(Apart(float(share[largest]), name, abs(float(one[largest]) - float(other[largest]))))
+    differs, share = unequal(name, one, other)
+    if (allowed := share <= 1.0).any():
+        largest = int(np.argmax(np.where(allowed, share, 0.0)))
+        difference = abs(float(one[differs][largest]) - float(other[differs][largest]))
+        found.note(Apart(float(share[largest]), name, difference))
+    differs[differs] = share > 1.0
     return differs
 
 

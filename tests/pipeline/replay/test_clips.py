@@ -14,6 +14,7 @@ from fantwin.pipeline.recordings.reading import read_metadata, read_recording
 from fantwin.pipeline.recordings.records import active_path
 from fantwin.pipeline.recordings.writing import RecordingWriter
 from fantwin.pipeline.replay.offline.comparison import CannotCompareError
+from fantwin.pipeline.replay.offline.offline_pipeline import OfflinePipeline
 from fantwin.pipeline.replay.offline.replay_input import open_replay_input
 from fantwin.pipeline.replay.offline.rescoring import RescoredTray, rescore
 from fantwin.schemas.enums import Action, Transition
@@ -112,7 +113,8 @@ def test_a_clip_of_the_time_before_the_clock_was_set_back_is_cut_from_the_part_o
     assert recorded(tmp_path / "clips" / clip.name, "raw")
 
 
-def test_a_clip_is_not_verified_and_why_is_said(clip):
+def test_a_clip_is_not_verified_and_why_is_said_before_it_is_scored(clip, monkeypatch):
+    monkeypatch.setattr(OfflinePipeline, "run", lambda _pipeline: pytest.fail("it is scored"))
     with pytest.raises(CannotCompareError, match="without --verify .* or verify the recording that it was cut from"):
         verified(clip)
 
