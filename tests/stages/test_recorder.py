@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import errno
 import json
 import logging
-import os
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
@@ -322,53 +320,20 @@ def test_after_a_clock_is_set_back_flushes_disk_checks_and_parts_continue(monkey
     assert len(disk.parts) == 3
 
 
-def test_messages_of_a_failed_flush_are_recorded_again_in_the_next_part(tmp_path, monkeypatch):
-    run = context(tmp_path, min_free_bytes=0)
-    core, start_ns = STAGE.build(run).core, context(tmp_path).started_t_ns
-    sync, failures = os.fdatasync, iter([OSError(errno.EIO, "Input/output error")])
-
-    def fail_once(descriptor: int) -> None:
-        for error in failures:
-            raise error
-        sync(descriptor)
-
-    monkeypatch.setattr(os, "fdatasync", fail_once)
-    for second in range(4):
-        core.step(envelope(raw(second), "raw", start_ns + second * SECOND_NS))
-        core.tick(start_ns + second * SECOND_NS)
-    core.close()
-    found = [
-        [envelope.message.header.sequence for envelope in read_recording(run.run_folder / name)]
-        for name in ("recording.mcap", "recording-2.mcap")
-    ]
-    assert found == [[], [0, 1, 2, 3]]
-    assert core.counters() == {"recorded_raw": 4, "lost_unwritten": 0, "parts": 2, "pauses": 1}
+def unsaved(core: Recorder) -> list[int]:
+    return [each.message.header.sequence for each in core.unsaved()]
 
 
-def test_what_is_not_flushed_is_reported_as_unsaved():
-    disk = Disk()
-    core = recorder(disk)
-    record(core, range(3))
-    core.tick(NOW_NS + SECOND_NS)
-    record(core, range(3, 5))
-    assert [each.message.header.sequence for each in core.unsaved()] == [3, 4]
-    disk.refuses = True
-    core.tick(NOW_NS + 3 * SECOND_NS)
-    record(core, [5])
-    assert [each.message.header.sequence for each in core.unsaved()] == [3, 4, 5], "they are kept in memory"
-    disk.refuses = False
-    core.close()
-    assert not core.unsaved()
-
-
-def test_messages_that_come_while_the_disk_refuses_are_kept_and_recorded_later():
+def test_messages_that_come_while_the_disk_refuses_are_kept_reported_as_unsaved_and_recorded_later():
     disk = Disk()
     core = recorder(disk)
     record(core, range(5))
+    assert unsaved(core) == list(range(5))
     core.tick(NOW_NS + SECOND_NS)
-    assert core.problem() == ""
+    assert core.problem() == "" and not unsaved(core)
     disk.room, disk.refuses = 7, True
     record(core, range(5, 20))
+    assert unsaved(core) == list(range(5, 20))
     assert core.problem().startswith("NOTHING IS RECORDED: r.mcap: cannot be written any more: No space left")
     core.tick(NOW_NS + 3 * SECOND_NS)
     assert core.problem(), "it is still full"
@@ -457,23 +422,6 @@ def test_without_enough_free_space_it_pauses_and_finishes_the_part():
     core.tick(NOW_NS + 3 * SECOND_NS)
     assert core.problem() == ""
     assert len(disk.parts) == 2
-
-
-def test_on_a_full_disk_the_oldest_parts_but_the_last_are_deleted_one_at_a_time(caplog):
-    disk = Disk()
-    disk.old, disk.freed_by_each = old_parts("r.mcap", "r-2.mcap", "r-3.mcap"), 10_000_000
-    core = recorder(disk, min_free_bytes=50_000_000)
-    disk.free = 35_000_000
-    with caplog.at_level(logging.WARNING):
-        for second in range(1, 6):
-            core.tick(NOW_NS + second * SECOND_NS)
-    assert disk.old_names == ["r-3.mcap"]
-    assert core.counters()["parts_deleted"] == 2
-    assert "r-2.mcap, the oldest part, was deleted: the disk runs short" in caplog.text
-    assert core.problem() == ""
-    disk.free = 1
-    core.tick(NOW_NS + 7 * SECOND_NS)
-    assert core.problem().startswith("NOTHING IS RECORDED") and disk.old_names == ["r-3.mcap"], "the last part is kept"
 
 
 def test_a_new_part_begins_at_the_limits_of_size_and_time(monkeypatch):

@@ -34,6 +34,12 @@ def chain(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return recording_of(tmp_path_factory.mktemp("chain"), 1, 400)
 
 
+@pytest.fixture(autouse=True)
+def patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A recorder that stops waits for its clips however busy the machine is."""
+    monkeypatch.setattr("fantwin.pipeline.recordings.clips.alarm_clips.CLOSE_S", 300.0)
+
+
 class Cutter:
     """Cuts clips of a stated size, and knows which."""
 
@@ -122,16 +128,6 @@ def test_an_alarm_of_which_only_the_recording_knows_after_a_crash_gets_its_clip(
     core.tick(2 * 10**18)
     core.close()
     assert len(kept_clips(tmp_path / "clips")) == 1
-
-
-def test_no_clip_is_cut_where_that_would_fill_the_disk_and_the_recorder_says_so(chain, tmp_path):
-    recording = tmp_path / "recording.mcap"
-    clips = clips_of(recording, free=2000)
-    core = record(chain, recording, clips=clips)
-    core.tick(2 * 10**18)
-    core.close()
-    assert "cannot be cut yet" in core.problem() and "are free on the disk" in core.problem()
-    assert not kept_clips(tmp_path / "clips") and listed_clips(recording)[0].is_due
 
 
 def test_the_disk_guard_takes_what_is_oldest_but_no_unacknowledged_clip_and_last_what_a_clip_needs(tmp_path):

@@ -22,16 +22,21 @@ def ten_days_of_parts() -> list[StoredPart]:
     return [StoredPart(NOW_NS + number * DAY_NS, number, Path(f"r-{number}.mcap")) for number in range(1, 11)]
 
 
-def test_a_disk_that_others_fill_costs_no_recording_second_by_second():
+def test_on_a_full_disk_the_oldest_parts_go_one_at_a_time_and_what_others_take_costs_no_more(caplog):
     disk = Disk()
-    disk.old = old_parts("history-1.mcap", "history-2.mcap")
-    core = recorder(disk)
-    disk.free = 1  # others take all that a deletion makes free
-    for second in range(1, 11):
+    disk.old, disk.freed_by_each = old_parts("oldest.mcap", "history-1.mcap", "history-2.mcap"), 10_000_000
+    core = recorder(disk, min_free_bytes=50_000_000)
+    disk.free = 45_000_000
+    for second in range(1, 4):
+        core.tick(NOW_NS + second * SECOND_NS)
+    assert disk.old_names == ["history-1.mcap", "history-2.mcap"] and core.problem() == ""
+    assert "oldest.mcap, the oldest part, was deleted: the disk runs short" in caplog.text
+    disk.free, disk.freed_by_each = 1, 0  # others take all that a deletion makes free
+    for second in range(4, 11):
         core.step(envelope(raw(second), "raw", NOW_NS))
         core.tick(NOW_NS + second * SECOND_NS)
     assert disk.parts[0].closed and len(disk.stored().parts) == 2, "the pause has ended a part"
-    assert disk.old_names == ["history-2.mcap"] and core.counters()["parts_deleted"] == 1
+    assert disk.old_names == ["history-2.mcap"] and core.counters()["parts_deleted"] == 2
     assert core.problem().startswith("NOTHING IS RECORDED")
     disk.free = 1 << 40
     core.tick(NOW_NS + 11 * SECOND_NS)

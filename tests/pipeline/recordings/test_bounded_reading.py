@@ -19,7 +19,6 @@ from fantwin.pipeline.recordings.records import (
     LARGEST_RECORD_BYTES,
     RECORD,
     RecordReader,
-    chunk_data,
     record_bytes,
 )
 
@@ -65,14 +64,6 @@ def test_row_17_a_chunk_that_expands_without_limit_is_not_expanded(tmp_path: Pat
     assert peak_bytes < 16 << 20
     assert (found.messages, envelopes) == (0, [])
     assert found.damage
-
-
-@pytest.mark.parametrize(
-    ("compression", "compress"), [("zstd", zstd), ("zstd", zstd_without_size), ("lz4", lz4.frame.compress)]
-)
-def test_a_chunk_within_the_limit_is_expanded(compression, compress):
-    records = record_bytes(*[Header(profile="", library=str(number)) for number in range(1000)])
-    assert chunk_data(chunk(compression, compress(records), len(records))) == records
 
 
 def test_row_17_a_record_as_long_as_a_sparse_file_is_not_read(tmp_path: Path):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from fantwin.pipeline.recordings.clips.clip import Clip, clip_lines, clips_as_text, clips_in, kept_clips
+from fantwin.pipeline.recordings.clips.clip import Clip, clip_lines, clips_as_text, kept_clips
 from fantwin.pipeline.recordings.clips.tracker import JUDGED_NS, LONGEST_NS, ClipTracker, CutResult
 from fantwin.schemas.enums import Severity, Transition
 from fantwin.schemas.header import Header
@@ -144,22 +144,6 @@ def test_a_clock_that_is_set_back_does_not_make_a_clip_wait():
     assert of.due(T0 + 30 * S) == []
     (due,) = of.due(T0 - 3600 * S)
     assert due.until_ns == T0 + 30 * S
-
-
-def test_clips_survive_a_restart_in_their_list_and_what_was_cut_short_is_cut_again(tmp_path):
-    of = tracker()
-    follow(of, alarm(), alarm(1, 200.0))
-    cut(of, 70)
-    (running,) = of.unfinished()
-    of.cut(CutResult(running.name, 50))
-    path = tmp_path / "recording.json"
-    path.write_text(clips_as_text(of.clips))
-    after = tracker(*clips_in(path))
-    assert after.clips == of.clips
-    follow(after, alarm(1, 200.0), alarm(2, 230.0))
-    (longer,) = after.unfinished()
-    assert (longer.name, longer.until_ns) == (running.name, T0 + 290 * S)
-    assert cut(after, 292) == [running.name]
 
 
 def test_only_clips_with_a_file_are_listed_and_damaged_lists_have_none(tmp_path: Path):

@@ -31,11 +31,7 @@ SCORE = "fantwin/plant/tray1/score"
 RAWS = 400
 
 RERUN = shutil.which("rerun", path=Path(sys.executable).parent)
-MCAP = shutil.which("mcap")
 needs_rerun = pytest.mark.skipif(RERUN is None, reason="the extra `view` is not installed")
-needs_mcap = pytest.mark.skipif(
-    MCAP is None, reason="the mcap command line (a Go program, on no package index) is not installed"
-)
 
 
 @dataclass(frozen=True)
@@ -148,15 +144,6 @@ def test_mcap_protobuf_support_decodes_without_our_code(files):
             assert line["state"] == message.state.ravel().tolist()
         else:
             assert (line["t_ns"], line["message"]) == (message.t_ns, message.message)
-
-
-# ---- the mcap command line
-
-
-@needs_mcap
-def test_the_mcap_command_line_finds_nothing_wrong(files):
-    assert str(files.in_whole.total()) in run(MCAP, "info", files.whole)
-    run(MCAP, "doctor", files.whole)
 
 
 # ---- Rerun

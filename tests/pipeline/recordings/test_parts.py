@@ -106,15 +106,6 @@ def test_what_other_recorders_wrote_counts_and_what_recorders_did_not_write_is_n
     assert names(tmp_path) == ["clips", "dated.mcap", "import.mcap", "kept-by-me.mcap", "r-2.mcap"]
 
 
-def test_a_part_that_could_not_be_read_for_a_while_counts_again(tmp_path, monkeypatch):
-    part(parts_in(tmp_path), [0]).finish()
-    place = parts_in(tmp_path)
-    with monkeypatch.context() as busy:
-        busy.setattr(Path, "open", refuse)
-        assert place.stored().parts == ()
-    assert [each.path.name for each in place.stored().parts] == ["r.mcap"] and place.stored().finished_bytes > 0
-
-
 def test_a_new_recorder_takes_a_number_above_all_existing_ones(tmp_path):
     for name in ("r.mcap", "r-7.mcap", "r-9.mcap.original"):
         (tmp_path / name).touch()
@@ -168,12 +159,18 @@ def damage_a_chunk(path: Path, number: int) -> None:
     path.write_bytes(content)
 
 
-def test_an_active_file_whose_only_chunk_is_damaged_is_renamed_and_not_deleted(tmp_path):
-    kill_a_recorder(tmp_path / "r.mcap", flushed=5)
-    damage_a_chunk(tmp_path / "r.mcap.active", 0)
-    content = (tmp_path / "r.mcap.active").read_bytes()
-    assert list(parts_in(tmp_path).unreadable) == [tmp_path / "r.mcap.original"]
+@pytest.mark.parametrize("content", [b"something else", bytes(5000), None])
+def test_an_active_file_that_is_not_a_recording_or_of_which_nothing_is_intact_is_renamed(tmp_path, content):
+    active = tmp_path / "r.mcap.active"
+    kill_a_recorder(tmp_path / "r.mcap", flushed=5) if content is None else active.write_bytes(content)
+    if content is None:
+        damage_a_chunk(active, 0)
+        content = active.read_bytes()
+    place = parts_in(tmp_path)
+    assert list(place.unreadable) == [tmp_path / "r.mcap.original"]
     assert (tmp_path / "r.mcap.original").read_bytes() == content
+    part(place).finish()
+    assert names(tmp_path) == ["r-2.mcap", "r.mcap.original"]
 
 
 def test_a_damaged_active_file_that_a_full_disk_keeps_from_being_repaired_is_continued(tmp_path):
@@ -190,13 +187,16 @@ def test_a_damaged_active_file_that_a_full_disk_keeps_from_being_repaired_is_con
     assert parts_in(tmp_path, "s3").repaired[0].path == tmp_path / "r.mcap"
 
 
-def test_an_active_file_that_cannot_be_read_for_a_while_is_repaired_later(tmp_path, monkeypatch):
-    kill_with_a_part_open(part(parts_in(tmp_path), [0]))
+def test_files_that_cannot_be_read_for_a_while_count_and_are_repaired_later(tmp_path, monkeypatch):
+    part(parts_in(tmp_path), [0]).finish()
+    kill_with_a_part_open(part(parts_in(tmp_path), [1]))
     with monkeypatch.context() as busy:
         busy.setattr(Path, "open", refuse)
         place = parts_in(tmp_path, "s2")
-    assert (place.unrepaired, place.unreadable) == ([tmp_path / "r.mcap.active"], {})
-    assert parts_in(tmp_path, "s3").repaired[0].path == tmp_path / "r.mcap"
+        assert place.stored().parts == ()
+    assert (place.unrepaired, place.unreadable) == ([tmp_path / "r-2.mcap.active"], {})
+    assert [each.path.name for each in place.stored().parts] == ["r.mcap"] and place.stored().finished_bytes > 0
+    assert parts_in(tmp_path, "s3").repaired[0].path == tmp_path / "r-2.mcap"
 
 
 def test_recorders_killed_before_they_recorded_anything_do_not_hide_the_last_message(tmp_path):
@@ -217,16 +217,6 @@ def test_a_recording_that_is_being_written_is_not_touched(tmp_path):
         parts_in(tmp_path)
     writer.finish()
     assert sequences(tmp_path / "r.mcap") == [0]
-
-
-@pytest.mark.parametrize("content", [b"something else", bytes(5000)])
-def test_an_active_file_that_is_not_a_recording_is_renamed(tmp_path, content):
-    (tmp_path / "r.mcap.active").write_bytes(content)
-    place = parts_in(tmp_path)
-    assert list(place.unreadable) == [tmp_path / "r.mcap.original"]
-    assert (tmp_path / "r.mcap.original").read_bytes() == content
-    part(place).finish()
-    assert names(tmp_path) == ["r-2.mcap", "r.mcap.original"]
 
 
 def test_a_folder_that_disappears_is_made_again(tmp_path):

@@ -4,8 +4,6 @@ from importlib.metadata import version
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 from mcap.writer import Writer
 
 from fantwin.pipeline.recordings.contents import contents_of
@@ -15,7 +13,7 @@ from fantwin.pipeline.recordings.scan import scan
 from fantwin.pipeline.recordings.writing import RecordingWriter
 from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.header import Header
-from fantwin.schemas.messages import Message, Raw
+from fantwin.schemas.messages import Raw
 from tests.support.written_recordings import ALARM_KEY, RAW_KEY, raw, sequences, write
 
 
@@ -117,21 +115,6 @@ def test_a_finished_recording_is_never_overwritten_unasked(tmp_path):
     assert len(sequences(path)) == 5
 
 
-@settings(deadline=None, max_examples=50, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(data=st.data())
-def test_changed_bytes_anywhere_never_make_a_reader_crash(tmp_path, data):
-    path = tmp_path / "r.mcap"
-    if not path.exists():
-        write(path, 300)
-    content = bytearray(path.read_bytes())
-    for _ in range(data.draw(st.integers(1, 4))):
-        content[data.draw(st.integers(8, len(content) - 1))] = data.draw(st.integers(0, 255))
-    broken = tmp_path / "broken.mcap"
-    broken.write_bytes(content)
-    assert len(list(read_recording(broken))) <= 301
-    read_metadata(broken)
-
-
 def test_a_payload_that_cannot_be_decoded_is_skipped_and_counted(tmp_path):
     with RecordingWriter(tmp_path / "r.mcap", {}) as writer:
         writer.add(Envelope(RAW_KEY, "raw", b"\xff\xff\xff", 0, raw(0)))
@@ -151,19 +134,3 @@ def test_a_file_that_is_no_recording_or_is_not_there_is_reported_in_one_line(tmp
             read(path)
     with pytest.raises(RecordingError, match=r"r\.mcap: cannot read the recording: No such file"):
         read_recording(tmp_path / "r.mcap")
-
-
-def test_a_message_on_which_the_writer_crashes_is_not_counted_as_recorded(tmp_path, monkeypatch):
-    def fails(_message: Message) -> int:
-        raise ZeroDivisionError("on purpose")
-
-    writer = RecordingWriter(tmp_path / "r.mcap", {})
-    writer.add_message(RAW_KEY, raw(0), 1000)
-    with monkeypatch.context() as patch:
-        patch.setattr("fantwin.schemas.envelope.newest_t_ns", fails)
-        with pytest.raises(ZeroDivisionError):
-            writer.add_message(RAW_KEY, raw(1), 1001)
-    writer.finish()
-    assert writer.written == {"raw": 1}
-    assert [counts.messages for counts in contents_of(writer.path).streams.values()] == [1]
-    assert len(list(read_recording(writer.path))) == 1

@@ -92,7 +92,7 @@ def test_a_command_works_on_recordings_in_s3_as_on_files(store: str, tmp_path: P
         write_run(tmp_path / name, published_run(seed, 10.0))
         pipes.put(str(tmp_path / name), f"fleet/{name}")
     of_files = fantwin("report", *(tmp_path / name for name in names), "--json", "--jobs", 1)
-    in_store = fantwin("report", f"{store}/*.mcap", "--json", "--jobs", 2)
+    in_store = fantwin("report", f"{store}/*.mcap", "--json", "--jobs", 1)
     assert (in_store.exit_code, in_store.stdout) == (0, of_files.stdout), in_store.output
     error = error_of("report", f"{store}/a.mcap", f"{store}/c.mcap", "--jobs", 1)
     assert error == f"{store}/c.mcap: cannot read the recording: there is no such file"

@@ -80,7 +80,7 @@ SIZE = 15_000
 """More than the file has: what is drawn beyond it is the whole file."""
 
 
-@settings(max_examples=60, suppress_health_check=NO_CHECK)
+@settings(max_examples=30, suppress_health_check=NO_CHECK)
 @given(size=st.integers(0, SIZE))
 def test_a_file_truncated_at_any_byte_is_recovered_up_to_its_last_intact_chunk_as_a_copy_and_in_place(
     tmp_path, whole, size
@@ -128,25 +128,19 @@ def test_a_kill_at_any_byte_of_a_repair_loses_nothing(tmp_path, whole):
         again.path.unlink()
 
 
-def test_without_an_output_the_original_is_kept_beside_the_repaired_file(tmp_path, whole):
+def test_the_original_is_kept_beside_the_repaired_file_which_has_the_name_of_a_recording(tmp_path, whole):
     truncated = tmp_path / "r.mcap"
-    truncated.write_bytes(whole.read_bytes()[:-300])
-    before = truncated.read_bytes()
-    recovery = recover(truncated)
-    assert (recovery.path, recovery.original) == (truncated, tmp_path / "r.mcap.original")
-    assert recovery.original is not None and recovery.original.read_bytes() == before
-    assert len(read_by_others(truncated)) == 41
-    truncated.write_bytes(before)
-    assert recover(truncated).original == tmp_path / "r.mcap.original-2"
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["r.mcap", "r.mcap.original", "r.mcap.original-2"]
-
-
-def test_an_active_file_gets_the_name_of_a_recording(tmp_path, whole):
-    (tmp_path / "r.mcap").write_bytes(whole.read_bytes())
-    (tmp_path / "r.mcap.active").write_bytes(whole.read_bytes()[:-300])
-    recovery = recover(tmp_path / "r.mcap.active")
-    assert recovery.path == tmp_path / "r-2.mcap"
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["r-2.mcap", "r-2.mcap.original", "r.mcap"]
+    before = whole.read_bytes()[:-300]
+    for name in ("r.mcap.original", "r.mcap.original-2"):
+        truncated.write_bytes(before)
+        recovery = recover(truncated)
+        assert (recovery.path, recovery.original) == (truncated, tmp_path / name)
+        assert (tmp_path / name).read_bytes() == before
+        assert len(read_by_others(truncated)) == 41
+    (tmp_path / "r.mcap.active").write_bytes(before)
+    assert recover(tmp_path / "r.mcap.active").path == tmp_path / "r-2.mcap"
+    names = ["r-2.mcap", "r-2.mcap.original", "r.mcap", "r.mcap.original", "r.mcap.original-2"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == names
 
 
 @pytest.mark.parametrize("less", [0, 300])
@@ -204,7 +198,7 @@ def test_the_ledger_of_a_file_that_lacks_only_its_index_is_kept_and_else_gaps_ar
     assert contents_of(recovery.path).streams[STREAM] == StreamCounts(3, 3, 0, 0, 5, 1000, 1005)
 
 
-@settings(max_examples=40, suppress_health_check=NO_CHECK)
+@settings(max_examples=30, suppress_health_check=NO_CHECK)
 @example(at=0.0, value=0)
 @example(at=0.009765625, value=0)  # in the name of the format number
 @given(at=st.floats(0, 1), value=st.integers(0, 255))
@@ -218,6 +212,9 @@ def test_a_changed_byte_costs_at_most_its_record(tmp_path, whole, at, value):
     path, output = tmp_path / "r.mcap", tmp_path / "out.mcap"
     path.write_bytes(content)
     output.unlink(missing_ok=True)
+    with suppress(RecordingError):  # its format may be unknown now
+        assert len(list(read_recording(path))) <= 41
+        read_metadata(path)
     recover(path, output)
     messages = read_by_others(output)
     assert len(messages) >= 41 - 6, "at most one chunk"
@@ -236,7 +233,7 @@ def test_a_damaged_metadata_record_is_left_out(tmp_path):
     assert len(read_by_others(path)) == 1
 
 
-def test_two_repairs_do_not_write_the_same_file(tmp_path, whole):
+def test_what_exists_is_written_or_is_repaired_by_another_is_not_touched(tmp_path, whole):
     path = tmp_path / "r.mcap"
     path.write_bytes(whole.read_bytes()[:-300])
     other = AtomicAppendFile(tmp_path / "r.mcap.recovering")
@@ -245,7 +242,14 @@ def test_two_repairs_do_not_write_the_same_file(tmp_path, whole):
         recover(path)
     assert (tmp_path / "r.mcap.recovering").read_bytes() == b"of the other"
     other.close()
+    with pytest.raises(RecordingError, match=r"r\.mcap: exists; name another file with -o"):
+        recover(whole, path)
     assert len(read_by_others(recover(path).path)) == 41
+    with RecordingWriter(tmp_path / "open.mcap", {}) as writer:
+        writer.add_message(RAW_KEY, raw(0), 0)
+        writer.flush()
+        with pytest.raises(RecordingError, match="a recorder is writing it; stop it first"):
+            recover(tmp_path / "open.mcap.active")
 
 
 @pytest.mark.parametrize("room", [0, 10_000])
@@ -267,20 +271,6 @@ def test_a_full_disk_costs_the_file_of_a_killed_recorder_only_its_index(tmp_path
     assert len(list(read_recording(repaired.path))) == 26
     recover(repaired.path)
     assert len(read_by_others(repaired.path)) == 26
-
-
-def test_a_file_that_is_being_written_is_not_touched(tmp_path):
-    with RecordingWriter(tmp_path / "r.mcap", {}) as writer:
-        writer.add_message(RAW_KEY, raw(0), 0)
-        writer.flush()
-        with pytest.raises(RecordingError, match="a recorder is writing it; stop it first"):
-            recover(tmp_path / "r.mcap.active")
-
-
-def test_an_output_that_exists_is_not_overwritten(tmp_path, whole):
-    (tmp_path / "out.mcap").touch()
-    with pytest.raises(RecordingError, match="out.mcap: exists; name another file with -o"):
-        recover(whole, tmp_path / "out.mcap")
 
 
 @pytest.mark.parametrize(
