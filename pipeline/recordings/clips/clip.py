@@ -9,6 +9,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from fantwin.pipeline.recordings.dates import format_utc
 from fantwin.pipeline.recordings.reading import read_metadata
 from fantwin.pipeline.recordings.records import RecordingError
 from fantwin.pipeline.recordings.run_recordings import CLIPS
@@ -130,13 +131,9 @@ def clip_lines(metadata: Mapping[str, str]) -> list[str]:
         if about is None:
             return []
         tray = about["tray"]
-        return [f"alarm clip: {tray} fan {each['fan']}, raised {_utc(each['t_ns'])}" for each in about["alarms"]]
+        return [f"alarm clip: {tray} fan {each['fan']}, raised {format_utc(each['t_ns'])}" for each in about["alarms"]]
     except (ValueError, TypeError, KeyError, OverflowError):
         return ["alarm clip, whose metadata are damaged"]
-
-
-def _utc(t_ns: int) -> str:
-    return datetime.fromtimestamp(t_ns / NS_PER_S, UTC).isoformat(sep=" ", timespec="milliseconds")
 
 
 def require_no_clip(path: Path, why: str) -> None:
