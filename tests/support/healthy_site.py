@@ -23,10 +23,18 @@ def start_ns(seed: int) -> int:
     return EPOCH_NS + seed * 1_000 * NS_PER_S
 
 
-def recorded(path: Path, seed: int, seconds: float, *, fans: int = FANS, has_fault: bool = False) -> Path:
+def recorded(
+    path: Path,
+    seed: int,
+    seconds: float,
+    *,
+    fans: int = FANS,
+    has_fault: bool = False,
+    fault_s: tuple[int, int] = FAULT_S,
+) -> Path:
     """Published fans under stairs, the last of which turns at 0.4 of its speed during a fault."""
     run = thinned(published_run(seed, seconds, fans), 5)  # 20 Hz, which is scored in a fifth of the time
     speed_rad_s = run.speed_rad_s.copy()
     if has_fault:
-        speed_rad_s[(run.t_s >= FAULT_S[0]) & (run.t_s < FAULT_S[1]), -1] *= 0.4
+        speed_rad_s[(run.t_s >= fault_s[0]) & (run.t_s < fault_s[1]), -1] *= 0.4
     return write_run(path, Run(run.name, run.t_s + start_ns(seed) / NS_PER_S, run.command, speed_rad_s))

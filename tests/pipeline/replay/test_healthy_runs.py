@@ -12,16 +12,15 @@ from typing import Any, NoReturn
 
 import pytest
 
-from fantwin.pipeline.cli.in_parallel import RecordingsInParallel
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.replay.offline import healthy_runs, kept_bins
 from fantwin.pipeline.replay.offline.healthy_runs import DecidedRun, HealthyPart, HealthyRuns, LearnedRun, Limit
 from fantwin.pipeline.replay.offline.kept_bins import KeptBins
-from fantwin.scoring.model.learned import learned_priors
 from fantwin.scoring.model.priors import Priors
 from tests.support.healthy_site import recorded, start_ns
 from tests.support.twin_files import write_twin
 
+SECONDS = 10.0
 ROOM_BYTES = 10_000_000
 LIMIT = Limit(Priors(), 60.0)
 
@@ -29,7 +28,9 @@ LIMIT = Limit(Priors(), 60.0)
 @pytest.fixture(scope="module")
 def recordings(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     folder = tmp_path_factory.mktemp("healthy")
-    return [recorded(folder / f"{seed}.mcap", seed, 20.0 + seed, has_fault=seed == 3) for seed in range(1, 4)]
+    return [
+        recorded(folder / f"{seed}.mcap", seed, SECONDS, has_fault=seed == 2, fault_s=(5, 10)) for seed in range(1, 3)
+    ]
 
 
 @pytest.fixture(scope="module")
@@ -49,8 +50,12 @@ def told(run: LearnedRun | DecidedRun) -> Any:
     return run.tray, [values.tolist() for values in vars(run.sums).values()]
 
 
+def learned(runs: HealthyRuns) -> list[Any]:
+    return [told(run) for run in runs.learned()]
+
+
 def of_both_passes(runs: HealthyRuns) -> list[Any]:
-    return [told(run) for run in (*runs.learned(), *runs.decided(LIMIT))]
+    return [*learned(runs), *map(told, runs.decided(LIMIT))]
 
 
 def counted_openings(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
@@ -65,36 +70,16 @@ def counted_openings(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
     return opened
 
 
-def test_several_processes_that_keep_bins_find_what_one_does_that_keeps_none(
-    recordings: list[Path], part: HealthyPart, tmp_path: Path
-) -> None:
-    alone = HealthyRuns(recordings, part)
-    with RecordingsInParallel(jobs=2) as pool:
-        together = HealthyRuns(recordings, part, pool.map, kept_in(tmp_path / "kept"))
-        assert of_both_passes(together) == of_both_passes(alone)
-        priors = [learned_priors([run.sums for run in runs.learned()]) for runs in (alone, together)]
-    assert priors[0] == priors[1]
-    assert {run.alarms for run in alone.decided(LIMIT)} != {(0, 0)}, "or there was nothing to compare"
-    assert [run.tray.path for run in together.learned()] == recordings
-
-
-def test_bins_are_computed_once_and_then_read_from_the_folder(
+def test_bins_are_computed_once_and_then_read_from_the_folder_where_they_are_compact(
     recordings: list[Path], part: HealthyPart, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    whole = of_both_passes(HealthyRuns(recordings, part))
+    assert whole[-1].alarms != (0, 0), "or there was nothing to compare"
     monkeypatch.setattr(kept_bins, "AT_ONCE", 17)
-    opened = counted_openings(monkeypatch)
-    runs = HealthyRuns(recordings, part, kept=kept_in(tmp_path / "kept"))
-    first = of_both_passes(runs)
+    opened, kept = counted_openings(monkeypatch), kept_in(tmp_path / "kept")
+    assert of_both_passes(HealthyRuns(recordings, part, kept=kept)) == whole
     assert opened == recordings
-    assert of_both_passes(runs) == first
-    assert opened == recordings
-
-
-def test_what_is_kept_is_compact(recordings: list[Path], part: HealthyPart, tmp_path: Path) -> None:
-    kept = kept_in(tmp_path / "kept")
-    HealthyRuns(recordings, part, kept=kept).learned()
-    size = sum(file.stat().st_size for file in kept.folder.iterdir())
-    bins_of_fans = 2 * 10 * sum(20 + seed for seed in range(1, 4))
+    size, bins_of_fans = sum(file.stat().st_size for file in kept.folder.iterdir()), 2 * 2 * 10 * SECONDS
     assert size / bins_of_fans < 120 + 10 * 30, "of a bin of ten samples, as at MOST_KEPT_BYTES of `calibrate`"
 
 
@@ -102,10 +87,10 @@ def test_where_room_or_the_disk_is_full_bins_are_computed_again(
     recordings: list[Path], part: HealthyPart, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     opened = counted_openings(monkeypatch)
-    whole = of_both_passes(HealthyRuns(recordings[:1], part))
-    short = kept_in(tmp_path / "short", 1000)
-    assert of_both_passes(HealthyRuns(recordings[:1], part, kept=short)) == whole
-    assert len(opened) == 4
+    runs = HealthyRuns(recordings[:1], part, kept=(short := kept_in(tmp_path / "short", 1000)))
+    whole = learned(runs)
+    assert learned(runs) == whole
+    assert opened == recordings[:1] * 2
     assert list(short.folder.iterdir()) == []
 
     def refused() -> NoReturn:
@@ -116,7 +101,7 @@ def test_where_room_or_the_disk_is_full_bins_are_computed_again(
     monkeypatch.setattr(
         Path, "open", lambda path, mode="r", *more: refused() if mode == "ab" else real_open(path, mode)
     )
-    assert of_both_passes(HealthyRuns(recordings[:1], part, kept=kept)) == whole
+    assert learned(HealthyRuns(recordings[:1], part, kept=kept)) == whole
     assert list(kept.folder.iterdir()) == []
 
 
@@ -136,9 +121,9 @@ def test_what_was_left_out_and_what_lies_outside_the_part_is_not_counted(
         return sum(run.fan_hours for run in HealthyRuns(recordings[:1], of).learned())
 
     whole = hours(part)
-    assert whole == pytest.approx(2 * 21.0 / 3600.0, rel=0.1)
-    first_half = HealthyPart(part.twin, to_s=10.0)
-    assert hours(first_half) == pytest.approx(0.5 * whole, rel=0.2)
+    assert whole == pytest.approx(2 * SECONDS / 3600.0, rel=0.2)
+    first_half = HealthyPart(part.twin, to_s=SECONDS / 2)
+    assert hours(first_half) == pytest.approx(0.5 * whole, rel=0.25)
     span = healthy_runs.LeftOut("", None, "tray1", 1, start_ns(1), start_ns(2))
     assert hours(HealthyPart(part.twin, left_out=(span,))) == pytest.approx(0.5 * whole, rel=0.01)
     with pytest.raises(UserError, match=r"1.mcap: tray1: no samples from 500 s to inf s; see --from and --to"):
@@ -152,10 +137,10 @@ def test_many_recordings_take_no_more_memory_than_one(
 
     def peak_of(paths: list[Path]) -> int:
         tracemalloc.start()
-        found = of_both_passes(HealthyRuns(paths, HealthyPart(part.twin, to_s=6.0)))
+        found = HealthyRuns(paths, HealthyPart(part.twin, to_s=3.0)).learned()
         _, peak = tracemalloc.get_traced_memory()
         tracemalloc.stop()
-        assert len(found) == 2 * len(paths)
+        assert len(found) == len(paths)
         return peak
 
     peak_of(copies[:1])  # what is imported and cached once

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import pty
 import sys
 
 import pytest
@@ -39,12 +37,3 @@ def test_without_a_terminal_there_are_no_keys(monkeypatch, tmp_path):
         assert not keys.is_available
         with keys:
             assert keys.pressed() == []
-
-
-def test_in_the_background_of_a_terminal_there_are_no_keys(monkeypatch):
-    ours, theirs = pty.openpty()
-    monkeypatch.setattr(os, "tcgetpgrp", lambda _descriptor: os.getpgrp() + 1)
-    with os.fdopen(theirs, "r") as terminal:
-        monkeypatch.setattr(sys, "stdin", terminal)
-        assert not Keys().is_available
-    os.close(ours)

@@ -11,8 +11,7 @@ import pytest
 
 from fantwin.pipeline.replay.offline.replay_input import open_replay_input
 from fantwin.pipeline.replay.offline.rescoring import rescore
-from fantwin.schemas.enums import Action, FanState, InvalidReason, Transition
-from fantwin.schemas.messages import ModelCard, Score
+from fantwin.schemas.enums import Action, FanState, Transition
 from tests.support.killed_site import CALIBRATION, FANS, Site, balanced_hybrid
 from tests.support.offline_replay import made_equal, recorded, verified
 from tests.support.twin_files import made_up_card, small_hybrid, write_twin
@@ -48,26 +47,6 @@ def learned(folder: Path) -> Path:
     site.put_in_force("tray1-1", first)
     site.run(90)
     return site.finished()
-
-
-def test_before_the_first_twin_nothing_is_judged_and_afterwards_all_is(learned: Path) -> None:
-    scores: list[Score] = recorded(learned, "score")
-    reasons = np.concatenate([score.invalid_reason for score in scores])
-    without = np.flatnonzero((reasons == InvalidReason.NO_TWIN).any(axis=1))
-    assert len(without) > 200
-    assert without[-1] < 310
-    valid = np.concatenate([score.valid for score in scores])
-    assert not valid[: without[-1]].any()
-    assert valid[400:500].all(axis=1).sum() > 80
-    assert valid[-40:].any()
-
-
-def test_each_twin_is_published_with_its_file_and_its_first_sample(learned: Path, folder: Path) -> None:
-    cards: list[ModelCard] = recorded(learned, "twin")
-    assert [card.twin for card in cards] == ["tray1-1", "tray1-2", "tray1-2", "tray1-1"]
-    assert cards[1].content == (folder / "tray1-2.onnx").read_bytes()
-    first_of = {p.twin: p.t_ns[0] for p in reversed(recorded(learned, "prediction")) if p.twin}
-    assert first_of["tray1-2"] == cards[1].t_ns
 
 
 def test_what_operators_set_stays_when_a_twin_takes_over_and_alarms_start_again(learned: Path) -> None:

@@ -16,7 +16,6 @@ from mcap.records import Attachment
 from fantwin.pipeline.recordings.metadata import CONFIGURATION
 from fantwin.pipeline.recordings.reading import RecordingError
 from fantwin.pipeline.recordings.records import RecordReader
-from fantwin.pipeline.replay.offline.alarm_episodes import episodes
 from fantwin.pipeline.replay.offline.replay_input import open_replay_input
 from fantwin.pipeline.replay.offline.rescoring import rescore
 from fantwin.schemas.enums import Action, FanState, Severity, Transition
@@ -25,13 +24,6 @@ from fantwin.schemas.units import NS_PER_S
 from tests.support.killed_site import CHAIN, Site
 from tests.support.offline_replay import alarms_of, changed, made_equal, recorded, verified
 from tests.support.twin_files import small_hybrid, write_twin
-
-
-def test_a_run_that_nothing_disturbed_is_decided_the_same(undisturbed):
-    tray = verified(undisturbed)
-    assert made_equal(tray) == sum(len(score.t_ns) for score in recorded(undisturbed, "score")) > 550
-    assert tray.comparison and tray.comparison.alarms_equal == len(recorded(undisturbed, "alarm")) > 0
-    assert tray.plan.restarts == 0
 
 
 def test_requests_of_operators_are_replayed_at_the_same_samples(tmp_path):
@@ -55,33 +47,6 @@ def test_requests_of_operators_are_replayed_at_the_same_samples(tmp_path):
 
     without = verified(changed(path, tmp_path / "unasked.mcap", unasked)).comparison
     assert without and not without.is_equal, "the requests are what made the difference"
-
-
-def test_a_restarted_scorer_continues_from_its_snapshot_and_so_does_a_replay(tmp_path):
-    site = Site(tmp_path, 1, raw_samples=4, calibrated=True)
-    site.run(210)
-    site.ask(Action.ACKNOWLEDGE, 0)
-    site.ask(Action.OUT_OF_SERVICE, 2)
-    site.run(5)
-    site.kill("scorer")
-    site.run(400)
-    path = site.finished()
-    alarms = alarms_of(path)
-    successor = next(alarm.header.producer for alarm in alarms if alarm.transition == Transition.REPUBLISHED)
-    republished = [alarm for alarm in alarms if alarm.transition == Transition.REPUBLISHED]
-    stood = {alarm.fan: (alarm.active, alarm.acknowledged, alarm.out_of_service) for alarm in republished}
-    assert stood[0] == (True, True, False)
-    assert stood[2][2]
-    assert len([alarm for alarm in alarms if alarm.request]) == 2, "what was answered is not answered again"
-    tray = verified(path)
-    assert made_equal(tray) > 550
-    assert [s.producer for s in tray.plan.last if s.snapshot] == [successor]
-    assert tray.comparison and tray.comparison.alarms_equal == len(alarms)
-    found = episodes(tray.alarms)
-    assert found == episodes(alarms)
-    first = next(episode for episode in found if episode.fan == 0 and episode.onset_ns == republished[0].onset_t_ns)
-    raised = [a for a in alarms if a.transition == Transition.RAISED and a.fan == 0 and a.onset_t_ns == first.onset_ns]
-    assert len(raised) == 1 and raised[0].t_ns == first.raised_ns, "one alarm, over the restart"
 
 
 def test_a_site_that_was_presented_by_a_replay_began_without_its_snapshot_and_so_does_a_replay_of_that(tmp_path):
@@ -243,17 +208,14 @@ def test_row_13_after_a_step_of_the_clock_the_samples_that_are_counted_are_those
     assert tray.lost == 0
 
 
-@pytest.mark.parametrize("restored_s_before_data", [0.0, 0.1])
-def test_row_13_alarms_stand_where_the_clock_of_the_stages_before_was_set_back_and_a_replay_decides_the_same(
-    tmp_path, restored_s_before_data
-):
+def test_row_13_alarms_stand_where_the_clock_of_the_stages_before_was_set_back_and_a_replay_decides_the_same(tmp_path):
     site = Site(tmp_path, seed=1, raw_samples=4, calibrated=True)
     site.run(200)
     site.restart_source()
     for stage in CHAIN:
         site.kill(stage)
     site.set_clock_back(3600)  # after the scorer has started, on another host
-    site.now_ns += round(restored_s_before_data * NS_PER_S)
+    site.now_ns += NS_PER_S // 10
     site.tick()
     site.run(50)
     found = verified(site.finished()).comparison
