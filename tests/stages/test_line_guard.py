@@ -107,24 +107,6 @@ def test_row_02_a_message_of_another_time_from_another_producer_moves_nothing(ah
     assert core.problem().startswith(f"raw samples of acquisition-forged are {abs(ahead_s):.0f} s {side} those of")
 
 
-def test_row_02_a_second_acquisition_with_a_fast_clock_moves_nothing() -> None:
-    core = core_of()
-    second = shifted(line(20, 40, producer="acquisition-fast"), 60.0)
-    both = [message for pair in zip(line(20, 40), second, strict=True) for message in pair]
-    grid = grid_of(core, line(0, 20), both)
-    assert grid.valid.all()
-    np.testing.assert_allclose(slopes(grid), RAD_S_PER_S, rtol=1e-3)
-    assert core.counters()["refused_other_time"] + 50 >= 2000
-    assert "acquisition-fast" in core.problem()
-
-
-def test_row_02_a_report_ends_a_minute_later() -> None:
-    core = core_of()
-    (forged,) = shifted(iter([sample(1, producer="acquisition-forged")]), 3600.0)
-    grid_of(core, line(0, 5), [forged], line(5, 70))
-    assert core.problem() == ""
-
-
 def test_row_02_acquisition_that_returns_after_some_time_is_the_line_again() -> None:
     core, away_s = core_of(), 5.0
     grid = grid_of(core, line(0, 20), line(20 + away_s, 40 + away_s, producer="acquisition-b"))

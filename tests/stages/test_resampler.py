@@ -17,6 +17,7 @@ from fantwin.schemas.blocks import join
 from fantwin.schemas.enums import InvalidReason, TachoKind
 from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Grid, Raw, StatedTacho
+from fantwin.schemas.side_by_side import present_columns
 from fantwin.schemas.tacho import Tacho
 from fantwin.schemas.units import NS_PER_S
 from fantwin.stages.resampler import ResamplerConfig, ResamplerCore
@@ -43,29 +44,10 @@ def raw(
     return Raw(fans=fans, host_receive_t_ns=t_ns, command=columns[0], speed_rad_s=columns[1])
 
 
-def split(message: Raw, size: int) -> Iterable[Raw]:
-    for k in range(0, len(message.host_receive_t_ns), size):
-        part = slice(k, k + size)
-        yield Raw(
-            fans=message.fans,
-            host_receive_t_ns=message.host_receive_t_ns[part],
-            device_clock_us=message.device_clock_us[part],
-            command=message.command[part],
-            speed_rad_s=message.speed_rad_s[part],
-        )
-
-
-def joined(grids: Iterable[Grid]) -> Grid:
-    grids = list(grids)
-    names = ("t_ns", "command", "speed_rad_s", "valid", "invalid_reason", "reading_missing", "reading_repeated")
-    columns: dict[str, Any] = {name: np.concatenate([getattr(grid, name) for grid in grids]) for name in names}
-    return Grid(fans=grids[0].fans, period_ns=grids[0].period_ns, **columns)
-
-
 def run(messages: Iterable[Raw], fans: int = 1, **config: float) -> tuple[Grid, ResamplerCore]:
     core = ResamplerCore(fans, ResamplerConfig.model_validate({"rate_hz": 100.0} | config))
     grids = [grid for message in messages for grid in core.step(message)]
-    return joined([*grids, *core.close()]), core
+    return join([*grids, *core.close()]), core
 
 
 def assert_same(a: Grid, b: Grid) -> None:
@@ -94,17 +76,6 @@ def test_a_sine_is_interpolated_to_the_second_order_of_the_spacing() -> None:
     assert errors[0] / errors[1] == pytest.approx(4.0, rel=0.1)
 
 
-def test_the_grid_is_uniform_rises_and_lies_at_multiples_of_its_step() -> None:
-    t_ns = irregular(5)
-    grid, core = run([raw(t_ns, np.sin(seconds_of(t_ns)))])
-    assert grid.valid.all()
-    assert (grid.t_ns % STEP_NS == 0).all()
-    assert (np.diff(grid.t_ns) == STEP_NS).all()
-    assert t_ns[0] <= grid.t_ns[0] < t_ns[0] + STEP_NS
-    assert t_ns[-1] - STEP_NS < grid.t_ns[-1] <= t_ns[-1]
-    assert core.counters()["samples_in"] == len(t_ns)
-
-
 def test_the_command_is_that_of_the_last_sample_at_or_before() -> None:
     grid, _ = run([raw(at(0.0, 0.02, 0.031, 0.05), np.zeros(4), np.array([1.0, 2.0, 3.0, 4.0]))])
     assert grid.command[:, 0].tolist() == [1, 1, 2, 2, 3, 4]
@@ -130,7 +101,7 @@ def test_for_any_sample_times_the_grid_rises_without_repeats_and_never_bridges_a
     grids = [*core.step(raw(t_ns, np.arange(0.0, len(t_ns)))), *core.close()]
     if not grids:
         return
-    grid = joined(grids)
+    grid = join(grids)
     assert (np.diff(grid.t_ns) == STEP_NS).all()
     accepted = np.unique(np.maximum.accumulate(t_ns))
     right = np.searchsorted(accepted, grid.t_ns)
@@ -176,18 +147,22 @@ def test_a_replay_gives_the_grid_that_was_published_during_a_silence() -> None:
     messages = [raw(at(0.0, 0.01), np.ones(2)), raw(at(3.0, 3.01), np.ones(2))]
     core = ResamplerCore(1, FIXED)
     live = [*core.step(messages[0]), *_ticks(core, 0.01, 2.9)]
-    assert joined(live).invalid_reason[-1, 0] == InvalidReason.STALE
+    assert join(live).invalid_reason[-1, 0] == InvalidReason.STALE
     live += core.step(messages[1])
     replayed, _ = run(messages)
-    assert_same(joined(live), replayed)
+    assert_same(join(live), replayed)
 
 
-def test_nothing_is_published_before_the_watermark_or_beyond_the_end() -> None:
+def test_nothing_is_published_before_the_watermark_or_beyond_the_end_and_a_stalled_host_is_no_silence() -> None:
+    core = ResamplerCore(1, FIXED)
+    core.step(raw(at(0.0), np.ones(1)))
+    assert _ticks(core, 0.0, 0.2) == core.tick(int(at(30.0)[0])) == []
+    assert join(core.step(raw(at(0.01), np.ones(1)))).valid.all(), "it was the host that stalled"
     core = ResamplerCore(1, FIXED)
     core.step(raw(at(0.0), np.ones(1)))
     assert _ticks(core, 0.0, 0.5) == []
     assert core.problem() == ""
-    grid = joined(_ticks(core, 0.5, 60.0))
+    grid = join(_ticks(core, 0.5, 60.0))
     assert seconds_of(grid.t_ns[[0, -1]]).tolist() == [0.01, 5.0]
     problem = core.problem()
     assert "acquisition" in problem
@@ -197,24 +172,11 @@ def test_nothing_is_published_before_the_watermark_or_beyond_the_end() -> None:
     assert not core.problem(), "the silence before an orderly stop is none"
 
 
-def test_a_stalled_host_is_not_a_silent_source_and_new_samples_end_a_silence() -> None:
-    core = ResamplerCore(1, FIXED)
-    core.step(raw(at(0.0), np.ones(1)))
-    assert _ticks(core, 0.0, 0.4) == []
-    core.step(raw(at(0.4), np.ones(1)))
-    assert _ticks(core, 0.4, 0.85) == []
-    core = ResamplerCore(1, FIXED)
-    core.step(raw(at(0.0), np.ones(1)))
-    assert _ticks(core, 0.0, 0.2) == []
-    assert core.tick(int(at(30.0)[0])) == []
-    assert joined(core.step(raw(at(0.01, 0.02), np.ones(2)))).valid.all()
-
-
 def test_a_sample_that_arrives_after_its_grid_time_was_published_is_counted_as_lost() -> None:
     core = ResamplerCore(1, FIXED)
     core.step(raw(at(0.0), np.ones(1)))
-    given_up = joined(_ticks(core, 0.0, 0.7))
-    grid = joined(core.step(raw(at(0.01, 0.5, 0.55), np.array([5.0, 6.0, 7.0]))))
+    given_up = join(_ticks(core, 0.0, 0.7))
+    grid = join(core.step(raw(at(0.01, 0.5, 0.55), np.array([5.0, 6.0, 7.0]))))
     assert core.counters()["lost_too_late"] == 1
     assert grid.t_ns[0] == given_up.t_ns[-1] + STEP_NS
 
@@ -223,7 +185,7 @@ def test_a_reading_that_is_held_where_a_line_was_lost_is_known_to_be_repeated() 
     counts, reads_at_once = Tacho(kind="count", window_s=0.5), Tacho()
     lines = raw(at(0.0, 0.01, 0.03, 0.04, 0.055), np.array([1.0, 2.0, 4.0, 5.0, 6.0]), fans=2)
     core = ResamplerCore(2, FIXED, tachos=(counts, reads_at_once))
-    grid = joined([*core.step(lines), *core.close()])
+    grid = join([*core.step(lines), *core.close()])
     np.testing.assert_array_equal(grid.speed_rad_s, [[1, 1], [2, 2], [2, 3], [4, 4], [5, 5], [5, 5 + 2 / 3]])
     np.testing.assert_array_equal(grid.reading_repeated[:, 0], [False, False, True, False, False, True])
     assert not grid.reading_repeated[:, 1].any()
@@ -246,13 +208,26 @@ def test_a_missing_reading_is_interpolated_up_to_the_limit_and_the_other_fan_is_
     assert np.isnan(grid.speed_rad_s[missing, 1]).all()
 
 
-def test_readings_too_far_apart_are_not_interpolated_though_samples_kept_arriving() -> None:
-    speed = np.array([[0.0, 0.0], [6.0, NAN], [13.0, 13.0]])
-    grid, _ = run([raw(at(0.0, 0.06, 0.13), speed, fans=2)], fans=2)
-    assert grid.valid[:, 0].all()
-    assert grid.invalid_reason[:, 1].tolist() == [InvalidReason.NONE] + [InvalidReason.NO_SPEED] * 12 + [
-        InvalidReason.NONE
-    ]
+def with_columns(times_s: list[float], **columns: list[float]) -> Raw:
+    given: dict[str, Any] = {name: np.array(values, np.float32)[:, np.newaxis] for name, values in columns.items()}
+    return replace(raw(at(*times_s), np.full(len(times_s), 100.0)), **given)
+
+
+def test_columns_are_interpolated_between_samples_held_before_one_that_has_none_and_bridge_no_gap() -> None:
+    volts, celsius = [12.0, 11.0, 12.0, 13.0], [20.0, NAN, NAN, 22.0]
+    grid, _ = run([with_columns([0.0, 0.02, 0.04, 0.06], supply_voltage_v=volts, temperature_c=celsius)])
+    np.testing.assert_allclose(grid.supply_voltage_v[:, 0], [12.0, 11.5, 11.0, 11.5, 12.0, 12.5, 13.0])
+    np.testing.assert_array_equal(grid.temperature_c[:, 0], [20.0, 20.0, NAN, NAN, NAN, NAN, 22.0])
+    grid, _ = run([with_columns([0.0, 0.01, 0.02, 0.30, 0.31], supply_voltage_v=[12.0, 12.0, 12.0, 11.0, 11.0])])
+    known = np.isfinite(grid.supply_voltage_v[:, 0])
+    np.testing.assert_array_equal(known, grid.valid[:, 0])
+    assert 0 < known.sum() < len(known)
+    core = ResamplerCore(1, FIXED)
+    later = with_columns([0.03, 0.04, 0.05], supply_voltage_v=[12.0, 12.0, 12.0])
+    grids = [g for m in (with_columns([0.0, 0.01]), later, with_columns([0.06, 0.07])) for g in core.step(m)]
+    assert [present_columns(grid)[1:] for grid in grids] == [(), *[("supply_voltage_v",)] * 2], (
+        "from its first value on"
+    )
 
 
 def test_a_tacho_that_fails_delays_the_others_once_by_the_gap_limit_and_none_at_all_never() -> None:
@@ -267,46 +242,6 @@ def test_a_tacho_that_fails_delays_the_others_once_by_the_gap_limit_and_none_at_
     assert sizes == [1] * 10 + [0] * 10 + [11] + [1] * 19
     waiting, _ = run([raw(at(0.0, 0.01), np.array([[1.0, 1.0], [1.0, NAN]]), fans=2)], fans=2)
     assert waiting.invalid_reason[:, 1].tolist() == [InvalidReason.NONE, InvalidReason.NO_SPEED], "published at the end"
-
-
-def _with_clock(
-    seconds: float, drift: float, seed: int
-) -> tuple[Raw, Callable[[NDArray[np.int64]], NDArray[np.float64]]]:
-    """A device whose clock drifts and wraps behind a jittery line, sampling a known speed."""
-    rng = np.random.default_rng(seed)
-    n = round(seconds * 100)
-    true_s = np.arange(n) / 100 + rng.uniform(0, 2e-3, n)
-    clock_us = (4_290_000_000 + true_s * 1e6 * (1 - drift)).astype(np.int64) % (1 << 32)
-    receive_t_ns = np.maximum.accumulate(at(*(true_s + rng.exponential(3e-3, n))))
-    kept = rng.random(n) > 0.01
-
-    def speed(t_ns: NDArray[np.int64]) -> NDArray[np.float64]:
-        return 300 + 100 * np.sin(2 * seconds_of(t_ns))
-
-    message = Raw(
-        fans=1,
-        host_receive_t_ns=receive_t_ns[kept],
-        device_clock_us=clock_us.astype(np.uint32)[kept],
-        command=np.zeros((kept.sum(), 1)),
-        speed_rad_s=speed(at(*true_s))[kept, np.newaxis],
-    )
-    return message, speed
-
-
-def test_the_device_clock_gives_the_speed_that_receive_times_would_blur() -> None:
-    message, speed = _with_clock(20, drift=100e-6, seed=5)
-    grid, core = run(split(message, 10))
-    by_receipt, _ = run(
-        [raw(message.host_receive_t_ns, message.speed_rad_s[:, 0])],
-    )
-
-    def error(g: Grid) -> float:
-        return float(np.abs(g.speed_rad_s[500:, 0] - speed(g.t_ns[500:])).max())
-
-    assert grid.valid.all()
-    assert error(grid) < 0.3
-    assert error(by_receipt) > 1.5
-    assert core.counters()["clock_restarts"] == 0
 
 
 def test_samples_of_another_number_of_fans_are_counted_and_reported_until_the_right_one_comes() -> None:
@@ -398,21 +333,6 @@ def test_messages_repeated_or_late_from_an_ended_session_are_no_clock_set_back_a
     assert core.counters()["lost_between_sessions"] == 8
 
 
-def test_readings_that_a_tacho_shows_until_the_next_are_held_and_others_interpolated() -> None:
-    """Also where a fan misses a reading, which another way of the grid handles."""
-    tachos = (Tacho(kind="count", window_s=1.0), Tacho())
-    core = ResamplerCore(2, ResamplerConfig(rate_hz=100.0, gap_limit_s=0.1), tachos=tachos)
-    speed = np.repeat(np.arange(8.0)[:, np.newaxis], 2, axis=1)
-    speed[4, :] = np.nan
-    t_ns = EPOCH_NS + np.arange(8) * 40_000_000 + 5_000_000
-    raw = Raw(fans=2, host_receive_t_ns=t_ns, command=np.zeros((8, 2)), speed_rad_s=speed)
-    grid = join([*core.step(raw), *core.close()])
-    since_s = (grid.t_ns - t_ns[0]) / 1e9 / 0.04
-    np.testing.assert_allclose(grid.speed_rad_s[:, 1], since_s, atol=1e-6)
-    held = np.floor(since_s)
-    np.testing.assert_array_equal(grid.speed_rad_s[:, 0], np.where(held == 4, 3, held))
-
-
 def test_health_says_when_messages_state_another_tacho_than_the_configuration() -> None:
     average = Tacho(kind="average", window_s=1.0, step_rad_s=0.1)
     core = ResamplerCore(2, ResamplerConfig(rate_hz=10.0), tachos=[average])
@@ -442,8 +362,8 @@ def test_row_16_a_gap_of_the_link_is_no_gap_of_the_samples():
     grids = [*cut.step(raw(at(*before), before)), *silent_for(cut, 10.0, is_complete=False)]
     assert "no raw samples for more than 0.5 s" in cut.problem()
     grids += [*cut.step(raw(at(*later), later)), *cut.close()]
-    should = joined([*whole.step(raw(at(*times_s), times_s)), *whole.close()])
-    found = joined(grids)
+    should = join([*whole.step(raw(at(*times_s), times_s)), *whole.close()])
+    found = join(grids)
     assert np.array_equal(found.t_ns, should.t_ns)
     assert np.array_equal(found.speed_rad_s, should.speed_rad_s)
     assert found.valid.all()
@@ -460,12 +380,12 @@ def test_row_16_a_gap_is_published_once_acquisition_shows_that_it_has_sent_nothi
         each.step(raw(at(*np.arange(0.0, 1.0, 0.01)), np.ones(100)))
     assert silent_for(core, 3.0, is_complete=False) == []
     core.confirm_input(is_complete=True)
-    found = joined(core.tick(at(4.0).item()))
+    found = join(core.tick(at(4.0).item()))
     assert not found.valid.any()
     assert found.t_ns[-1] == at(3.49), "up to the watermark before the time at which it is shown"
     assert silent_for(core, 2.0, is_complete=False, from_s=4.0) == []
     assert silent_for(doubts, 19.0, is_complete=False) == []
-    found = joined(silent_for(doubts, 3.0, is_complete=False, from_s=20.0))
+    found = join(silent_for(doubts, 3.0, is_complete=False, from_s=20.0))
     assert found.t_ns[-1] == at(0.99) + 5 * NS_PER_S, "the grid ends after five seconds"
     assert not found.valid.any()
 
@@ -484,7 +404,7 @@ def test_row_16_samples_of_the_next_session_that_are_not_admitted_yet_are_no_sil
         grids += core.step(replace(new, header=Header("acquisition-a-2", number, "")))
         grids += silent_for(core, step_s, is_complete=True, from_s=1.0 + cut_s + step_s * number)
     assert "lost_too_late" not in core.counters()
-    found = joined(grids)
+    found = join(grids)
     assert seconds_of(found.t_ns[found.valid.all(axis=1)])[0] == pytest.approx(3.0)
 
 
@@ -504,7 +424,7 @@ def test_row_16_samples_of_another_time_do_not_hide_a_silence_of_the_line(times_
         sent = raw(at(*times_s(number)), np.ones(len(times_s(number))))
         grids += core.step(replace(sent, header=Header(f"acquisition-a-{2 + number % 2}", number // 2, "")))
         grids += silent_for(core, 0.2, is_complete=True, from_s=1.0 + 0.2 * number)
-    found = joined(grids)
+    found = join(grids)
     assert not found.valid[found.t_ns > at(1.0)].any()
     assert found.t_ns[-1] > at(3.0)
     assert "no raw samples for more than 0.5 s" in core.problem()

@@ -103,6 +103,7 @@ class ScriptedLink:
             header=Header(self._producer, sequence, "t"),
             device_clock_us=clock_us if self._has_clock else clock_us[:0],
             device_sequence=np.array([self._device_sequence % 2**32], np.uint32),
+            supply_voltage_v=self._rng.choice([11.0, 12.0, NAN], (1, 3)).astype(np.float32),
         )
 
 
@@ -132,12 +133,12 @@ def driven(items: Iterable[Raw | ByTime], **config: float | None) -> tuple[list[
             grids += core.step(item) if isinstance(item, Raw) else item(core)
         problem = core.problem()
         grids += core.close()
-    names = ("t_ns", "command", "speed_rad_s", "valid", "invalid_reason")
+    names = ("t_ns", "command", "speed_rad_s", "valid", "invalid_reason", "supply_voltage_v")
     columns = [np.concatenate([getattr(grid, name) for grid in grids]).tobytes() for name in names if grids]
     return columns, dict(core.counters()), problem
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(
     happenings=st.lists(st.tuples(st.sampled_from(WHAT_HAPPENS), st.integers(1, 30)), min_size=1, max_size=12),
     seed=st.integers(0, 1000),

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fantwin.pipeline.timebase.line_rate import RATES_HZ, grid_rate_hz
+from fantwin.pipeline.timebase.line_rate import grid_rate_hz
 from fantwin.schemas.blocks import join
 from fantwin.schemas.enums import InvalidReason
 from fantwin.schemas.header import Header
@@ -139,32 +139,6 @@ def test_a_restarted_resampler_comes_to_the_same_rate_wherever_it_begins() -> No
         assert periods == {NS_PER_S // grid_rate_hz(line_hz)}, line_hz
 
 
-def refused_at_first(line_hz: float, how: str) -> Array:
-    """Times of a line of 20 s, of which samples of the first six are refused."""
-    line_s = times(line_hz, 20, 0.1)
-    kept = {
-        "half of them": np.random.default_rng(6).random(len(line_s)) < 0.5,
-        "while the device reboots": line_s % 1.5 < 0.35,
-    }[how]
-    return line_s[kept | (line_s > 6.0)]
-
-
-@pytest.mark.parametrize(
-    ("line_hz", "clock", "how"),
-    [
-        (25, False, "half of them"),
-        (100, True, "half of them"),
-        (10, False, "while the device reboots"),
-    ],
-)
-def test_a_line_whose_first_samples_are_refused_gets_the_grid_that_it_sends(
-    line_hz: int, clock: bool, how: str
-) -> None:
-    messages = samples(refused_at_first(line_hz, how), clock=clock)
-    grid, core = grid_of(messages)
-    assert (grid.period_ns, core.problem()) == (NS_PER_S // line_hz, "")
-
-
 def test_a_line_without_a_period_gets_the_rate_at_which_samples_arrive() -> None:
     by_chance = np.cumsum(np.random.default_rng(7).exponential(0.1, 300))
     read_together = (np.floor(times(line_hz, 5) / 0.04) * 0.04 for line_hz in (64, 100))  # every 40 ms
@@ -181,13 +155,6 @@ def test_lost_samples_and_pauses_while_it_is_measured_do_not_change_the_rate() -
         line_s[3:] += 1.5  # acquisition had to connect again
         grid, _ = grid_of(samples(line_s))
         assert grid.period_ns == NS_PER_S // line_hz
-
-
-def test_few_samples_get_a_grid_at_the_end() -> None:
-    grid, _ = grid_of(samples(times(10, 0.5)))
-    assert grid.period_ns == NS_PER_S // 10
-    assert len(grid.t_ns) >= 4
-    assert ResamplerCore(1, ResamplerConfig()).close() == []
 
 
 def test_a_session_of_acquisition_that_ends_before_there_is_a_rate_is_counted() -> None:
@@ -230,18 +197,3 @@ def test_a_line_that_becomes_faster_or_slower_is_named() -> None:
         [*fast, *[replace(m, header=Header("p", 9000 + k, "tray1")) for k, m in enumerate(samples(times(2, 40) + 40))]]
     )
     assert core.problem().endswith("too few for gap_limit_s = 0.1: restart the resampler")
-
-
-def test_limits_that_are_not_given_follow_and_keep_their_order() -> None:
-    for given, expected_s in (
-        ({}, (0.1, 0.5, 5.0)),
-        ({"gap_limit_s": 1.0}, (1.0, 1.0, 5.0)),
-        ({"watermark_s": 8.0}, (0.1, 8.0, 16.0)),
-        ({"watermark_s": 0.05}, (0.05, 0.05, 5.0)),
-    ):
-        timing = ResamplerConfig.model_validate(given).timing(100.0)
-        limits_ns = (timing.gap_limit_ns, timing.watermark_ns, timing.stale_for_ns)
-        assert limits_ns == tuple(round(limit_s * NS_PER_S) for limit_s in expected_s)
-    for rate_hz in RATES_HZ:
-        timing = ResamplerConfig().timing(rate_hz)
-        assert 3 * timing.period_ns <= timing.gap_limit_ns <= timing.watermark_ns <= timing.stale_for_ns
