@@ -1,12 +1,10 @@
 """Trays that are predicted in one pass: each gets what it would get alone.
 
-Decisions of their scorers are the same. Matrices of more columns may be multiplied in another order, so numbers may
-differ by rounding.
+Matrices of more columns may be multiplied in another order, so numbers may differ by rounding.
 """
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Sequence
 from itertools import zip_longest
 from pathlib import Path
@@ -16,27 +14,25 @@ import numpy as np
 import pytest
 
 from fantwin.pipeline.config.loading import parse_config
-from fantwin.pipeline.replay.offline.tolerance import differences
 from fantwin.pipeline.runtime.building import build_parts
 from fantwin.pipeline.runtime.joint_step import step_together
 from fantwin.pipeline.runtime.stage import Context, Core, Joint, load_stage
 from fantwin.schemas.header import Header
-from fantwin.schemas.messages import Alarm, Grid, Message, Prediction, Raw
+from fantwin.schemas.messages import Grid, Message, Raw
 from fantwin.schemas.units import NS_PER_S
 from fantwin.simulation.faults import Fault
 from fantwin.simulation.tray import SimulatedTray, TraySettings
 
-EPOCH_NS, SECONDS, BLOCK = 1_700_000_000 * NS_PER_S, 30.0, 25
+EPOCH_NS, SECONDS, BLOCK = 1_700_000_000 * NS_PER_S, 12.0, 25
 TWIN = Path(__file__).parents[2] / "pipeline" / "demo" / "twin.onnx"
 FAULTS: tuple[tuple[Fault, ...], ...] = (
-    (Fault("rotor", 3, 13.0, 19.0, 1.0),),
-    (Fault("tacho-dropout", 0, 11.0, 19.0, 0.6), Fault("inlet", 5, 14.0, 20.0, 1.6)),
-    (Fault("tacho-stuck", 7, 12.0, 18.0), Fault("tacho-dropout", 1, 3.0, 9.3, 1.0)),
-    (Fault("supply", 2, 14.0, 20.0, 0.85),),
+    (Fault("tacho-dropout", 0, 3.0, 6.0, 0.6), Fault("tacho-dropout", 1, 2.0, 7.0, 1.0)),
+    (),
+    (),
     (),
 )
-"""faults of each tray; the fourth loses samples, and the last one is silent for 3 s"""
-LOSING, SILENT = 3, 4
+"""faults of each tray; the second loses samples, and the third is silent for 3 s"""
+LOSING, SILENT = 1, 2
 
 
 class Counting:
@@ -85,7 +81,7 @@ def raws(number: int) -> Iterator[Raw]:
         samples.append(tray.take())
     for sequence, first in enumerate(range(0, len(samples), BLOCK)):
         block = samples[first : first + BLOCK]
-        if number == SILENT and 15.0 <= block[0].t_s < 18.0:
+        if number == SILENT and 4.0 <= block[0].t_s < 7.0:
             continue
         yield Raw(
             header=Header("source", sequence, f"tray{number}"),
@@ -98,16 +94,8 @@ def raws(number: int) -> Iterator[Raw]:
         )
 
 
-def alone(stage: str, items: Sequence[Sequence[Message]]) -> tuple[list[Core], list[list[Message]]]:
-    """What the core of each tray makes of its messages."""
-    cores = cores_of(stage)
-    return cores, [
-        [made for item in of_tray for made in core.step(item)] for core, of_tray in zip(cores, items, strict=True)
-    ]
-
-
 def together(stage: str, items: Sequence[Sequence[Message]]) -> tuple[list[Core], list[list[Message]], list[int]]:
-    """The same in turns of one message of each tray; and the number of trays in each pass."""
+    """What the cores make of their messages in turns of one of each tray; and the number of trays in each pass."""
     cores, made = cores_of(stage), [[] for _ in items]
     joint_of = load_stage(stage).joint
     assert joint_of
@@ -120,49 +108,24 @@ def together(stage: str, items: Sequence[Sequence[Message]]) -> tuple[list[Core]
     return cores, made, joint.trays
 
 
-def share_of_joint(trays: Sequence[int]) -> float:
-    """Of the blocks, those that were processed with others."""
-    return sum(count for count in trays if count > 1) / sum(trays)
-
-
-def assert_equal(expected: list[list[Message]], found: list[list[Message]]) -> None:
-    for number, (of_alone, of_joint) in enumerate(zip(expected, found, strict=True)):
-        assert len(of_alone) == len(of_joint), number
-        for place, (one, other) in enumerate(zip(of_alone, of_joint, strict=True)):
-            where = f"message {place} of tray {number}, a {type(one).__name__}"
-            assert type(one) is type(other) and one.header == other.header, where
-            for name, values in vars(one).items():
-                assert_alike(values, getattr(other, name), f"{where}: {name}")
-
-
 def assert_alike(one: Any, other: Any, where: str) -> None:
     if isinstance(one, np.ndarray) and one.dtype.kind == "f":
         rounding = 1e-9 if one.dtype == np.float64 else 1e-6
         np.testing.assert_allclose(other, one, rounding, 1e-9, err_msg=where)
     elif isinstance(one, np.ndarray):
         np.testing.assert_array_equal(other, one, where)
-    elif where.endswith("state_json"):
-        assert not list(differences(json.loads(one), json.loads(other), lambda _: None)), where
     else:
-        assert not list(differences({where: one}, {where: other}, lambda _: None)), where
+        assert one == other, where
 
 
-def test_trays_in_one_pass_are_predicted_as_each_alone_and_scored_alike(grids: list[list[Grid]]) -> None:
-    of_integrators, messages = alone("twin_integrator", grids)
-    joint_integrators, joint_messages, trays = together("twin_integrator", grids)
-    assert_equal(messages, joint_messages)
-    assert [core.counters() for core in of_integrators] == [core.counters() for core in joint_integrators]
-    assert share_of_joint(trays) > 0.7
-
-    scorers, scored = alone("scorer", predictions_of(messages))
-    joint_scorers, joint_scored = alone("scorer", predictions_of(joint_messages))
-    assert_equal(scored, joint_scored)
-    assert [core.counters() for core in scorers] == [core.counters() for core in joint_scorers]
-    assert len({each.fan for of_tray in scored for each in of_tray if isinstance(each, Alarm)}) >= 4
-    for one, other in zip(scorers, joint_scorers, strict=True):
-        assert_equal([list(one.close())], [list(other.close())])
-
-
-def predictions_of(messages: list[list[Message]]) -> list[list[Message]]:
-    """Samples of each tray."""
-    return [[each for each in of_tray if isinstance(each, Prediction)] for of_tray in messages]
+def test_trays_in_one_pass_are_predicted_as_each_alone(grids: list[list[Grid]]) -> None:
+    joint_cores, joint_messages, trays = together("twin_integrator", grids)
+    assert sum(count for count in trays if count > 1) / sum(trays) > 0.5, "of the blocks, most in one pass with others"
+    for number, core in enumerate(cores_of("twin_integrator")):
+        alone = [made for grid in grids[number] for made in core.step(grid)]
+        assert len(alone) == len(joint_messages[number])
+        for place, (one, other) in enumerate(zip(alone, joint_messages[number], strict=True)):
+            assert type(one) is type(other)
+            for name, values in vars(one).items():
+                assert_alike(values, getattr(other, name), f"message {place} of tray {number}: {name}")
+        assert core.counters() == joint_cores[number].counters()

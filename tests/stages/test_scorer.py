@@ -78,8 +78,8 @@ def transitions(alarms: Iterable[Alarm]) -> list[Transition]:
 # alarms
 
 
-def test_an_alarm_says_when_its_fault_began_what_it_takes_and_how_large_it_is() -> None:
-    core = learned(core_of())
+def test_an_alarm_says_when_its_fault_began_what_it_takes_and_how_large_it_is_in_the_unit_of_the_tray() -> None:
+    core = learned(unit="rpm")
     (score,), alarms = feed(core, [prediction_of(with_step(8.0, 2.0))])
     raised, *later = alarms
     assert (raised.transition, raised.statistic) == (Transition.RAISED, Statistic.DEVIATION)
@@ -89,16 +89,17 @@ def test_an_alarm_says_when_its_fault_began_what_it_takes_and_how_large_it_is() 
     found = alarms[-1]
     assert found.residual_rad_s == pytest.approx(STEP, abs=4.0 * found.residual_std_rad_s)
     assert 0.0 < found.residual_std_rad_s < 0.3 * abs(STEP)
-    assert "rad/s slower than when healthy (± " in raised.message
+    shown = -raised.residual_rad_s * 60.0 / (2.0 * np.pi)
+    assert raised.message.startswith(f"fan 0: {shown:.0f} rpm slower than when healthy (± ")
     assert {each.transition for each in later} <= {Transition.SEVERITY, Transition.DIAGNOSED}
     assert later[-1].severity == Severity.ALARM
     assert (score.state[:190, 0] != ALARM).all() and score.state[-1, 0] in (ALARM, RETURNING)
 
 
 def test_before_an_alarm_the_score_is_at_most_one_and_a_fan_is_suspect_above_a_half() -> None:
-    core = learned(core_of(fans=4), fans=4)
-    residual = noise_of(40 * SECOND, 4)
-    residual -= np.array([0.0, 0.2, 0.4, 0.8]) * np.arange(40 * SECOND)[:, np.newaxis] / SECOND
+    core = learned(4)
+    residual = noise_of(15 * SECOND, 4)
+    residual -= np.array([0.0, 0.6, 1.2, 2.4]) * np.arange(15 * SECOND)[:, np.newaxis] / SECOND
     (score,), alarms = feed(core, [prediction_of(residual)])
     is_before = ~np.isin(score.state, (ALARM, RETURNING))
     assert (score.score[is_before] <= 1.0).all()
@@ -109,17 +110,9 @@ def test_before_an_alarm_the_score_is_at_most_one_and_a_fan_is_suspect_above_a_h
     assert "SUSPECT" in {FanState(int(state)).name for state in score.state[:, 3]}, "it is said beforehand"
 
 
-def test_a_fault_that_becomes_large_becomes_an_alarm_of_that_severity() -> None:
-    core = learned(core_of(config={"alarm_share": 0.2}))
-    residual = with_step(20.0, 2.0) + np.where(np.arange(20 * SECOND)[:, np.newaxis] > 9 * SECOND, 2.0 * STEP, 0.0)
-    _, alarms = feed(core, [prediction_of(residual)])
-    reported = [(each.transition, each.severity) for each in alarms if each.transition != Transition.DIAGNOSED]
-    assert reported == [(Transition.RAISED, Severity.WARNING), (Transition.SEVERITY, Severity.ALARM)]
-
-
 def test_an_alarm_clears_once_when_the_fan_has_been_healthy_for_ten_seconds() -> None:
-    core = learned(core_of())
-    residual = with_step(60.0, 2.0, size=1.5 * STEP)
+    core = learned()
+    residual = with_step(28.0, 2.0, size=1.5 * STEP)
     residual[8 * SECOND :, 0] -= 1.5 * STEP
     (score,), alarms = feed(core, [prediction_of(residual)])
     changes = [each for each in transitions(alarms) if each != Transition.SEVERITY]
@@ -132,7 +125,7 @@ def test_an_alarm_clears_once_when_the_fan_has_been_healthy_for_ten_seconds() ->
 
 
 def test_samples_that_are_not_valid_change_nothing_and_the_alarm_becomes_stale_until_there_are_new_ones() -> None:
-    core = learned(core_of())
+    core = learned()
     feed(core, [prediction_of(with_step(4.0, 1.0))])
     nothing = prediction_of(np.zeros(2 * SECOND * 6), np.zeros(2 * SECOND * 6, np.bool_), first=400, period_ns=STEP_NS)
     (score,), alarms = feed(core, [nothing])
@@ -149,7 +142,7 @@ def test_samples_that_are_not_valid_change_nothing_and_the_alarm_becomes_stale_u
 def test_fans_do_not_affect_one_another() -> None:
     made = []
     for size in (0.0, STEP):
-        core = learned(core_of(fans=3), fans=3)
+        core = learned(3)
         (score,), alarms = feed(core, [prediction_of(with_step(6.0, 2.0, fans=3, fan=2, size=size))])
         made.append((score, {alarm.fan for alarm in alarms}))
     (healthy, none), (beside, faulty) = made
@@ -162,7 +155,6 @@ def test_fans_do_not_affect_one_another() -> None:
     ("fans", "faulty", "said"),
     [
         (4, (1, 2, 3, 4), [0, 0, 2, 3]),
-        (4, (1, 2), [0, 0]),
         (4, (1, 2, -3), [0, 0, 0]),
         (6, (1, 2, 3, 4), [0, 0, 0, 3]),
     ],
@@ -170,10 +162,10 @@ def test_fans_do_not_affect_one_another() -> None:
 def test_an_alarm_says_when_most_fans_of_the_tray_have_similar_ones(
     fans: int, faulty: tuple[int, ...], said: list[int]
 ) -> None:
-    core = learned(core_of(fans=fans), fans=fans)
-    residual = noise_of(14 * SECOND, fans)
+    core = learned(fans)
+    residual = noise_of(10 * SECOND, fans)
     for number, fan in enumerate(faulty):
-        since_s = np.arange(len(residual)) / SECOND - 2.0 * (1 + number)
+        since_s = np.arange(len(residual)) / SECOND - 1.5 * (1 + number)
         residual[:, abs(fan) - 1] += math.copysign(STEP, -fan) * -np.expm1(-since_s.clip(0.0) / TIME_CONSTANT_S)
     _, alarms = feed(core, [prediction_of(residual)])
     raised = [alarm.message for alarm in alarms if alarm.transition == Transition.RAISED]
@@ -181,7 +173,7 @@ def test_an_alarm_says_when_most_fans_of_the_tray_have_similar_ones(
     assert [next((n for n in (2, 3) if words.format(n) in each), 0) for each in raised] == said
 
 
-@pytest.mark.parametrize(("rate_hz", "within_s"), [(1, 3.0), (2, 3.0), (10, 1.0), (100, 1.0), (400, 1.0)])
+@pytest.mark.parametrize(("rate_hz", "within_s"), [(1, 3.0), (10, 1.0), (400, 1.0)])
 def test_at_any_rate_of_the_grid_a_healthy_fan_raises_nothing_and_a_step_of_ten_per_cent_is_an_alarm(
     rate_hz: int, within_s: float
 ) -> None:
@@ -204,7 +196,7 @@ def test_a_healthy_fan_leaves_the_band_often_and_raises_nothing() -> None:
 
 
 def test_a_fault_that_a_speed_loop_hides_is_found_in_the_torque_balance_while_the_free_run_is_not_known() -> None:
-    core = learned(core_of())
+    core = learned()
     extra = np.where(np.arange(6 * SECOND) < SECOND, 0.0, 6.0) + 0.1 * noise_of(6 * SECOND)[:, 0]
     young = prediction_of(noise_of(6 * SECOND), balance=extra)
     young.valid[:] = False
@@ -223,21 +215,11 @@ def test_a_tacho_that_gives_no_readings_is_found_and_a_silent_line_is_none() -> 
     nothing = np.zeros(4 * SECOND, np.bool_)
     dead = prediction_of(np.zeros(4 * SECOND), nothing)
     dead.invalid_reason[:] = InvalidReason.NO_SPEED
-    _, alarms = feed(learned(core_of()), [dead])
+    _, alarms = feed(learned(), [dead])
     assert alarms[0].statistic == Statistic.MISSING_READINGS
     assert alarms[0].message.startswith("fan 0: the tacho loses readings; a tacho that drops out")
-    _, alarms = feed(learned(core_of()), [prediction_of(np.zeros(4 * SECOND), nothing)])
+    _, alarms = feed(learned(), [prediction_of(np.zeros(4 * SECOND), nothing)])
     assert alarms == []
-
-
-def test_a_tacho_that_repeats_one_reading_is_found_once_the_speed_should_change() -> None:
-    stuck = prediction_of(np.full(10 * SECOND, 2.0))
-    stuck.predicted_speed_rad_s[2 * SECOND :, 0] += np.minimum(np.arange(8 * SECOND) * 0.1, 60.0)
-    stuck.command[2 * SECOND :, 0] += np.minimum(np.arange(8 * SECOND) * 0.03, 18.0)
-    _, alarms = feed(learned(core_of()), [stuck])
-    assert alarms[0].transition == Transition.RAISED
-    named = [alarm.causes[0].cause for alarm in alarms if alarm.causes]
-    assert named[-1] == "sensor_stuck"
 
 
 # the declared rate
@@ -270,22 +252,11 @@ def test_the_declared_rate_is_that_of_the_configuration_else_of_the_card(
     assert {alarm.fan for alarm in alarms} == {1}
 
 
-def test_more_false_alarms_are_raised_where_more_are_declared() -> None:
-    weak = prediction_of(with_step(12.0, 2.0, size=0.09 * STEP))
-    raised = []
-    for per_day in (1e-9, 8640.0):
-        core = learned(core_of(declared_per_day=per_day))
-        raised += [len(transitions(feed(core, [weak])[1]))]
-    assert raised[0] < raised[1]
-
-
 @pytest.mark.parametrize(
     ("wrong", "why"),
     [
         ({"limit_factor": -1.0}, "calibration cannot be used: limit_factor"),
-        ({"false_alarms_per_day": 0.0}, "calibration cannot be used: false_alarms_per_day"),
         ({"priors": {"wander": 0.0}}, "calibration cannot be used: priors.wander"),
-        ({"detectors": {}}, "calibration cannot be used: detectors"),
     ],
     ids=lambda each: next(iter(each)) if isinstance(each, dict) else "",
 )
@@ -308,7 +279,7 @@ def acknowledged(core: ScorerCore, **more: Any) -> list[Any]:
 
 
 def test_an_answer_names_its_request_and_the_sample_after_which_it_was_given() -> None:
-    core = learned(core_of())
+    core = learned()
     feed(core, [prediction_of(with_step(2.0, 1.0))])
     (answer,) = acknowledged(core, producer="operator-7", sequence=3, comment="seen")
     assert (answer.transition, answer.acknowledged, answer.active) == (Transition.ACKNOWLEDGED, True, True)
@@ -323,7 +294,7 @@ def test_an_answer_names_its_request_and_the_sample_after_which_it_was_given() -
 
 
 def test_commissioning_forgets_the_fan_that_it_is_asked_for_and_ends_its_alarm() -> None:
-    core = learned(core_of(fans=2), fans=2)
+    core = learned(2)
     both = noise_of(4 * SECOND, 2) + 0.6 * STEP
     _, alarms = feed(core, [prediction_of(both)])
     assert transitions(alarms) == [Transition.RAISED] * 2
@@ -409,7 +380,7 @@ def test_blocks_of_any_size_are_judged_the_same_to_the_bit(
 def test_a_score_carries_all_that_a_viewer_draws_and_a_prediction_that_is_no_number_has_none() -> None:
     prediction = prediction_of(np.array([0.0, 7.9, 8.1, -8.1, 0.0]))
     prediction.predicted_speed_rad_s[4] = prediction.torque_balance_command[4] = np.nan
-    (score,), _ = feed(learned(core_of()), [prediction])
+    (score,), _ = feed(learned(), [prediction])
     np.testing.assert_allclose(score.lower_bound_rad_s[:4], 300 - 8.0)
     np.testing.assert_allclose(score.upper_bound_rad_s[:4], 300 + 8.0)
     np.testing.assert_allclose(score.band_variance, 64.0)
@@ -421,27 +392,21 @@ def test_a_score_carries_all_that_a_viewer_draws_and_a_prediction_that_is_no_num
 
 def test_repeated_samples_are_dropped_and_counted() -> None:
     residual = with_step(4.0, 1.0)
-    core = learned(core_of())
+    core = learned()
     _, alarms = feed(core, [prediction_of(residual[:300]), prediction_of(residual[:300]), prediction_of(residual)])
-    _, once = feed(learned(core_of()), [prediction_of(residual)])
+    _, once = feed(learned(), [prediction_of(residual)])
     assert [alarm.t_ns for alarm in alarms] == [alarm.t_ns for alarm in once] != []
     assert core.counters()["repeated"] == 600
 
 
 def test_row_13_predictions_that_have_gone_back_for_good_are_reported_until_there_are_new_ones() -> None:
-    core = learned(core_of())
+    core = learned()
     feed(core, [prediction_of(np.zeros(500), first=-360_000)])
     assert core.problem() == "", "a producer that was restarted catches up"
     feed(core, [prediction_of(np.zeros(500), first=-359_500)])
     assert core.problem().startswith("predictions are 3590 s older than those before and not judged")
     feed(core, [prediction_of(np.zeros(10))])
     assert core.problem() == ""
-
-
-def test_an_alarm_reads_in_the_unit_people_are_shown() -> None:
-    _, (raised, *_) = feed(learned(core_of(unit="rpm")), [prediction_of(with_step(2.0, 1.0, size=80.0))])
-    shown = raised.residual_rad_s * 60.0 / (2.0 * np.pi)
-    assert raised.message.startswith(f"fan 0: {shown:.0f} rpm faster than when healthy (± ")
 
 
 def test_another_number_of_fans_is_lost_and_reported_until_the_right_one_comes() -> None:
@@ -454,39 +419,32 @@ def test_another_number_of_fans_is_lost_and_reported_until_the_right_one_comes()
 
 
 def unjudged(seconds: float, why: Sequence[InvalidReason], first_s: float = 0.0) -> Prediction:
-    """Fans that are judged where `why` is NONE."""
-    samples = round(seconds * 100)
-    valid = np.tile([reason == InvalidReason.NONE for reason in why], (samples, 1))
-    prediction = prediction_of(np.zeros(valid.shape), valid, first=round(first_s * 100))
+    """Fans that are judged where `why` is NONE, ten samples a second."""
+    valid = np.tile([reason == InvalidReason.NONE for reason in why], (round(seconds * 10), 1))
+    prediction = prediction_of(np.zeros(valid.shape), valid, first=round(first_s * 10), period_ns=NS_PER_S // 10)
     prediction.invalid_reason[:] = np.array(why, np.uint8)
     return prediction
 
 
-def test_fans_long_without_a_score_are_reported_with_the_reason() -> None:
-    core = learned(core_of(fans=4), fans=4)
+def test_fans_long_without_a_score_are_reported_with_the_reason_and_a_first_warm_up_after_a_minute() -> None:
+    core = core_of(fans=4)
     why = [InvalidReason.NONE, InvalidReason.NO_SPEED, InvalidReason.OUT_OF_RANGE, InvalidReason.NO_SPEED]
-    feed(core, [unjudged(9.99, why)])
+    feed(core, [unjudged(1, [InvalidReason.NONE] * 4, first_s=-1), unjudged(9.9, why)])
     assert core.problem() == ""
-    feed(core, [unjudged(0.01, why, first_s=9.99)])
+    feed(core, [unjudged(0.1, why, first_s=9.9)])
     assert core.problem() == (
         "fan 2 is not scored: the command is outside the twin's range, or a value is not a number, for 10 s or more; "
         "fans 1, 3 are not scored: no speed, for 10 s or more"
     )
-    feed(core, [unjudged(15, why, first_s=10)])
-    assert "no speed, for 20 s or more" in core.problem()
-    feed(core, [unjudged(0.01, [InvalidReason.NONE] * 4, first_s=25)])
+    feed(core, [unjudged(0.1, [InvalidReason.NONE] * 4, first_s=10)])
     assert core.problem() == ""
-
-
-def test_a_first_warm_up_is_reported_only_after_a_minute_and_a_silent_line_does_not_count() -> None:
+    feed(core, [unjudged(1, [InvalidReason.WARMING_UP] * 4, first_s=1000)])
+    assert core.problem() == "", "a silent line does not count"
     core = core_of()
-    feed(core, [unjudged(59.99, [InvalidReason.WARMING_UP])])
+    feed(core, [unjudged(59.9, [InvalidReason.WARMING_UP])])
     assert core.problem() == ""
-    feed(core, [unjudged(0.01, [InvalidReason.WARMING_UP], first_s=59.99)])
+    feed(core, [unjudged(0.1, [InvalidReason.WARMING_UP], first_s=59.9)])
     assert "fan 0 is not scored: the twin is warming up" in core.problem()
-    core = learned(core_of())
-    feed(core, [unjudged(1, [InvalidReason.NONE]), unjudged(1, [InvalidReason.WARMING_UP], first_s=1000)])
-    assert core.problem() == ""
 
 
 def test_the_unseen_error_of_a_twin_widens_the_band_and_what_a_fan_may_do_there() -> None:
@@ -498,7 +456,7 @@ def test_the_unseen_error_of_a_twin_widens_the_band_and_what_a_fan_may_do_there(
         speeds_up = np.clip(np.arange(12 * SECOND) - 5.0 * SECOND, 0.0, SECOND)[:, np.newaxis]
         moves.predicted_speed_rad_s[:] += 0.6 * speeds_up
         moves.measured_speed_rad_s[:] += 0.4 * speeds_up
-        scores, alarms = feed(learned(core_of(unseen_error=unseen)), [moves])
+        scores, alarms = feed(learned(seconds=10.0, unseen_error=unseen), [moves])
         half_rad_s = (scores[0].upper_bound_rad_s - scores[0].lower_bound_rad_s) / 2.0
         np.testing.assert_allclose(half_rad_s, 2.0 * np.hypot(SIGMA, std))
         raised.append(Transition.RAISED in transitions(alarms))

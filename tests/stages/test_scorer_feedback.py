@@ -11,7 +11,6 @@ import pytest
 from fantwin.schemas.enums import Action, Feedback, Transition
 from fantwin.schemas.messages import Alarm, Prediction
 from fantwin.schemas.units import NS_PER_S
-from fantwin.scoring.alarms.fan_condition import EARLIER_ALARMS
 from fantwin.stages.scorer import ScorerCore
 from tests.support.scored_blocks import core_of, feed, prediction_of, request_of, snapshot_of
 
@@ -65,7 +64,7 @@ def test_feedback_on_an_alarm_that_stands_is_in_every_message_about_it_and_not_i
     assert of(raised_again) == (Feedback.NONE, "", "")
 
 
-def test_an_earlier_alarm_is_named_by_its_onset_to_within_a_second() -> None:
+def test_an_earlier_alarm_is_named_by_its_onset_to_within_a_second_and_what_cannot_be_granted_changes_nothing() -> None:
     core = scorer()
     none = asked(core, Action.TRUE_ALARM)
     assert none.message == "fan 0: refused: no alarm has been raised"
@@ -78,30 +77,14 @@ def test_an_earlier_alarm_is_named_by_its_onset_to_within_a_second() -> None:
     assert (earlier.onset_t_ns, earlier.feedback) == (onsets[2], Feedback.TRUE_ALARM), "that of the last alarm stays"
     assert earlier.message == "fan 0: an earlier alarm is marked as a false alarm"
     assert asked(core, Action.FALSE_ALARM, "dust").marked_onset_t_ns == onsets[2], "without an onset it is the last one"
-    last = asked(core, Action.TRUE_ALARM)
-    assert of(last) == (Feedback.TRUE_ALARM, last.operator_name, ""), "the last word counts, and needs no reason"
-
-
-@pytest.mark.parametrize(
-    ("comment", "onset_t_ns", "why"),
-    [
+    for comment, onset_t_ns, why in (
         (" \t", 0, "fan 0: refused: a false alarm needs a reason: add a comment"),
         ("why", 5, "fan 0: refused: no alarm began then, or too many have been raised since"),
-    ],
-)
-def test_what_cannot_be_granted_changes_nothing(comment: str, onset_t_ns: int, why: str) -> None:
-    core = scorer()
-    excursions(core, 1)
-    answer = asked(core, Action.FALSE_ALARM, comment, onset_t_ns=onset_t_ns)
-    assert (answer.transition, answer.message) == (Transition.REFUSED, why)
-    assert (answer.feedback, answer.marked_onset_t_ns) == (Feedback.NONE, 0)
-
-
-def test_only_the_last_alarms_of_a_fan_are_kept() -> None:
-    core = scorer()
-    onsets = excursions(core, EARLIER_ALARMS + 2)
-    assert asked(core, Action.TRUE_ALARM, onset_t_ns=onsets[0]).transition == Transition.REFUSED
-    assert asked(core, Action.TRUE_ALARM, onset_t_ns=onsets[1]).marked_onset_t_ns == onsets[1]
+    ):
+        refused = asked(core, Action.FALSE_ALARM, comment, onset_t_ns=onset_t_ns)
+        assert (refused.message, refused.marked_onset_t_ns, refused.feedback_reason) == (why, 0, "dust")
+    last = asked(core, Action.TRUE_ALARM)
+    assert of(last) == (Feedback.TRUE_ALARM, last.operator_name, ""), "the last word counts, and needs no reason"
 
 
 @pytest.mark.parametrize("is_of_another_twin", [False, True])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,6 @@ from tests.support.scored_blocks import (
     core_of,
     feed,
     learned,
-    noise_of,
     prediction_of,
     request_of,
     snapshot_of,
@@ -95,44 +95,25 @@ def test_a_block_on_which_the_scorer_crashed_is_judged_after_the_restart(
     assert [score.t_ns.tolist() for score in scores] == [blocks[-1].t_ns.tolist()]
 
 
-def test_an_alarm_is_said_to_be_active_from_the_first_sample_after_a_restart_on() -> None:
-    before = learned(core_of(2), 2)
-    residual = noise_of(205, 2)
-    residual[100:, 0] += STEP
-    feed(before, [prediction_of(residual)])
-    successor = core_of(2)
-    successor.restore(snapshot_of(before))
-    (score,), alarms = feed(successor, [prediction_of(noise_of(3, 2) + STEP * np.eye(2)[0], first=205)])
-    assert alarms == []
-    assert np.isin(score.state[:, 0], IN_ALARM).all() and (score.state[:, 1] == FanState.NORMAL).all()
-
-
-def test_every_alarm_and_answer_is_in_the_file_before_it_is_emitted(tmp_path: Path) -> None:
-    snapshot_store = SnapshotStore(tmp_path / "m")
-    scorer = learned(core_of(snapshot_store=snapshot_store))
+def test_every_alarm_and_answer_is_in_the_file_and_in_a_published_snapshot_before_it_is_emitted(tmp_path: Path) -> None:
+    scorer = learned(seconds=5.0, snapshot_store=SnapshotStore(tmp_path / "m"))
+    assert len(snapshot_of(scorer).state_json) < 8_000
 
     def noted() -> dict[str, Any]:
         memory = SnapshotStore(tmp_path / "m").load()
-        assert memory
+        assert memory and len(memory.state_json) < 60_000
         return json.loads(memory.state_json)["alarms"]["last_emitted"]["0"]
 
-    _, alarms = feed(scorer, [prediction_of(np.full(100, STEP))])
-    assert alarms and noted()["active"]
+    made = scorer.step(prediction_of(np.full(100, STEP)))
+    assert [type(message) for message in made] == [Score, ScorerSnapshot, Alarm]
+    assert noted()["active"]
     feed(scorer, [request_of(Action.SHELVE, duration_s=60.0)])
     assert noted()["shelved_until_t_ns"] > 0
 
 
-def test_a_snapshot_is_published_before_the_alarms_that_it_contains_and_is_small() -> None:
-    scorer = learned(core_of())
-    assert len(snapshot_of(scorer).state_json) < 8_000
-    messages = scorer.step(prediction_of(np.full(100, STEP)))
-    assert [type(message) for message in messages] == [Score, ScorerSnapshot, Alarm]
-    assert len(snapshot_of(scorer).state_json) < 60_000
-
-
 @pytest.mark.parametrize(("fans", "rest_s"), [(64, 0.0), (80, 0.4)])
 def test_in_a_storm_of_alarms_a_large_tray_takes_its_snapshots_one_after_a_rest(fans: int, rest_s: float) -> None:
-    scorer = learned(core_of(fans), fans, seconds=3.0)
+    scorer = learned(fans, seconds=3.0)
     taken_s: list[float] = []
     with_alarms = 0
     for block in range(14):
@@ -147,18 +128,15 @@ def test_in_a_storm_of_alarms_a_large_tray_takes_its_snapshots_one_after_a_rest(
     assert taken_s[-1] > 1.0, "what is owed is taken after the rest, without another alarm"
 
 
-@pytest.mark.parametrize(("period_ns", "apart_s"), [(10_000_000, 60), (1_000_000_000, 3000)])
-def test_without_events_there_is_a_snapshot_every_minute_and_at_slow_rates_every_3000_samples(
-    period_ns: int, apart_s: int
+@pytest.mark.parametrize(("period_ns", "apart_s"), [(10_000_000, 6), (1_000_000_000, 30)])
+def test_without_events_there_is_a_snapshot_after_a_time_and_at_slow_rates_after_a_number_of_samples(
+    period_ns: int, apart_s: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    scorer = core_of()
-    block_ns = min(apart_s // 12, 50) * NS_PER_S
-    offsets_ns = np.arange(0, block_ns, period_ns)
-    taken_ns: list[int] = []
-    for block in range(3 * apart_s * NS_PER_S // block_ns):
-        prediction = prediction_of(np.full(len(offsets_ns), 0.1))
-        t_ns = EPOCH_NS + block * block_ns + offsets_ns
-        made = scorer.step(replace(prediction, t_ns=t_ns, period_ns=period_ns))
+    monkeypatch.setattr("fantwin.stages.scorer.SNAPSHOT_PERIOD_NS", 6 * NS_PER_S)
+    monkeypatch.setattr("fantwin.stages.scorer.SNAPSHOT_PERIOD_SAMPLES", 30)
+    scorer, taken_ns, samples = core_of(), list[int](), NS_PER_S // period_ns
+    for second in range(3 * apart_s):
+        made = scorer.step(prediction_of(np.full(samples, 0.1), first=second * samples, period_ns=period_ns))
         taken_ns += [each.t_ns for each in made if isinstance(each, ScorerSnapshot)]
     assert np.diff(taken_ns).tolist() == [apart_s * NS_PER_S] * 2
 
@@ -177,44 +155,41 @@ def test_while_nothing_happens_a_large_tray_publishes_every_third_snapshot_and_s
     assert published_s == [0.0, 180.0, 360.0, 540.0]
 
 
-def raised() -> ScorerCore:
-    """A fan with an acknowledged alarm, one that is shelved without one, one with nothing."""
-    scorer = learned(core_of(3), 3, seconds=10.0)
+@cache
+def raised() -> ScorerSnapshot:
+    """The last state of a fan with an acknowledged alarm, one that is shelved without one, and one with nothing."""
+    scorer = learned(3, seconds=10.0)
     residual = np.zeros((100, 3))
     residual[:, 0] = STEP
     feed(scorer, [prediction_of(residual)])
     feed(scorer, [request_of(Action.ACKNOWLEDGE, 0, sequence=0, comment="ordered")])
     feed(scorer, [request_of(Action.SHELVE, 1, sequence=1, duration_s=60.0)])
-    return scorer
+    return snapshot_of(scorer)
 
 
-def test_a_restarted_scorer_republishes_current_alarms_and_who_acknowledged_them() -> None:
-    successor = core_of(3)
-    memory, *emitted = successor.restore(snapshot_of(raised()))
+def test_a_restarted_scorer_republishes_at_once_and_only_once_its_state_and_who_acknowledged_alarms(
+    tmp_path: Path,
+) -> None:
+    store = SnapshotStore(tmp_path / "m")
+    store.save(raised())
+    successor = core_of(3, snapshot_store=store)
+    memory, first, second = successor.tick(0)
     assert isinstance(memory, ScorerSnapshot) and memory.restored
-    assert [(alarm.fan, alarm.transition) for alarm in emitted if isinstance(alarm, Alarm)] == [
+    assert isinstance(first, Alarm) and isinstance(second, Alarm)
+    assert [(each.fan, each.transition) for each in (first, second)] == [
         (0, Transition.REPUBLISHED),
         (1, Transition.REPUBLISHED),
     ]
-    first, second = emitted
-    assert isinstance(first, Alarm) and isinstance(second, Alarm)
     assert (first.active, first.acknowledged, first.operator_name, first.comment) == (True, True, "Ann", "ordered")
     assert (second.active, second.shelved_until_t_ns > 0) == (False, True)
+    assert successor.tick(0) == []
     (score,), alarms = feed(successor, [prediction_of(np.tile([STEP, 0.0, 0.0], (10, 1)), first=100)])
     assert alarms == [] and np.isin(score.state[:, 0], IN_ALARM).all()
 
 
-def test_a_successor_publishes_its_restored_state_at_once_and_only_once(tmp_path: Path) -> None:
-    snapshot_store = SnapshotStore(tmp_path / "m")
-    snapshot_store.save(snapshot_of(raised()))
-    successor = core_of(3, snapshot_store=snapshot_store)
-    assert [type(message) for message in successor.tick(0)] == [ScorerSnapshot, Alarm, Alarm]
-    assert [*successor.tick(0), *successor.step(prediction_of(np.zeros((1, 3)), first=100))][0].__class__ is Score
-
-
 def standing_of(emitted: Sequence[Any]) -> list[CurrentAlarm]:
     """How the alarms stand for who has followed them from `raised` on."""
-    former = raised().restore(snapshot_of(raised()))
+    former = core_of(3).restore(raised())
     messages = [*(("former", each) for each in former), *(("successor", each) for each in emitted)]
     book = AlarmBook()
     for number, (producer, message) in enumerate(messages):
@@ -223,47 +198,32 @@ def standing_of(emitted: Sequence[Any]) -> list[CurrentAlarm]:
     return book.all()
 
 
-def test_from_a_snapshot_of_another_twin_only_operator_settings_are_restored() -> None:
-    successor = core_of(3, sha256="another")
-    memory, *emitted = successor.restore(snapshot_of(raised()))
+@pytest.mark.parametrize("lost", ["twin", "model", "wear"])
+def test_of_a_snapshot_of_another_twin_or_read_in_part_operator_settings_are_restored_and_that_is_said_for_a_minute(
+    lost: str,
+) -> None:
+    state = json.loads(raised().state_json)
+    before = state["wear"]["state"]
+    state.pop(lost, None)
+    successor = core_of(3, sha256="another" if lost == "twin" else "twin")
+    memory, *emitted = successor.restore(replace(raised(), state_json=json.dumps(state)))
     assert isinstance(memory, ScorerSnapshot) and memory.restored
-    assert successor.counters()["snapshots_of_another_twin"] == 1
-    assert "the snapshot is of another twin" in successor.problem()
+    counter, why = "snapshots_not_understood", "can be read in part only"
+    if lost == "twin":
+        counter, why = "snapshots_of_another_twin", "the snapshot is of another twin"
+    assert successor.counters()[counter] == 1 and why in successor.problem()
     acknowledged, shelved = standing_of(emitted)
     assert (is_retained(acknowledged.newest), acknowledged.newest.message) == (False, "fan 0: no alarm")
     assert (is_silenced(shelved.newest), shelved.newest.message) == (True, "fan 1: no alarm, shelved")
     assert successor.step(request_of(Action.SHELVE, 1, sequence=1, duration_s=60.0)) == [], "it was answered"
     (score,), _ = feed(successor, [prediction_of(np.zeros((1, 3)), first=100)])
     assert (score.state == FanState.NORMAL).all() and not score.expected_residual_rad_s.any()
+    is_kept = json.loads(snapshot_of(successor).state_json)["wear"]["state"] == before
+    assert is_kept == (lost == "model"), "wear starts again where it cannot be read, or the twin is another"
     _, (unshelved,) = feed(successor, [request_of(Action.UNSHELVE, 1, sequence=2)])
     assert unshelved.transition == Transition.UNSHELVED
-
-
-@pytest.mark.parametrize("of", ["model", "wear"])
-def test_from_a_snapshot_read_in_part_operator_settings_are_restored(of: str) -> None:
-    memory = snapshot_of(raised())
-    state = json.loads(memory.state_json)
-    before = state["wear"]["state"]
-    del state[of]
-    successor = core_of(3)
-    first, *emitted = successor.restore(replace(memory, state_json=json.dumps(state)))
-    assert isinstance(first, ScorerSnapshot) and first.restored
-    assert successor.counters()["snapshots_not_understood"] == 1
-    assert "can be read in part only" in successor.problem()
-    acknowledged, shelved = standing_of(emitted)
-    assert (is_retained(acknowledged.newest), is_silenced(shelved.newest)) == (False, True)
-    assert successor.step(request_of(Action.SHELVE, 1, sequence=1, duration_s=60.0)) == [], "it was answered"
-    (score,), _ = feed(successor, [prediction_of(np.zeros((1, 3)), first=100)])
-    assert (score.state == FanState.NORMAL).all() and not score.expected_residual_rad_s.any()
-    is_kept = json.loads(snapshot_of(successor).state_json)["wear"]["state"] == before
-    assert is_kept == (of == "model"), "wear starts again where it cannot be read"
-
-
-def test_a_snapshot_that_was_not_used_is_reported_for_a_minute() -> None:
-    successor = core_of(3, sha256="another")
-    successor.restore(snapshot_of(raised()))
-    feed(successor, [prediction_of(np.zeros((1, 3)), first=at) for at in (100, 6098)])
-    assert "the snapshot is of another twin" in successor.problem()
+    feed(successor, [prediction_of(np.zeros((1, 3)), first=6098)])
+    assert why in successor.problem()
     feed(successor, [prediction_of(np.zeros((2, 3)), first=6099)])
     assert successor.problem() == ""
 
@@ -271,7 +231,7 @@ def test_a_snapshot_that_was_not_used_is_reported_for_a_minute() -> None:
 def restored(first: int, producer: str, *, is_replayed: bool) -> tuple[ScorerCore, list[Any]]:
     """A successor of `raised`, which began at sample -1000 and ended at 100, and its output for its first block."""
     successor = core_of(3, is_replayed=is_replayed)
-    successor.restore(snapshot_of(raised()))
+    successor.restore(raised())
     return successor, list(successor.step(prediction_of(np.zeros((20, 3)), first=first, producer=producer)))
 
 
@@ -306,7 +266,7 @@ def test_row_13_a_snapshot_that_is_ahead_of_a_clock_that_was_set_back_keeps_no_f
     tmp_path: Path, twin: str
 ) -> None:
     store = SnapshotStore(tmp_path / "scorer.snapshot")
-    store.save(snapshot_of(raised()))
+    store.save(raised())
     day = 24 * 3600 * 100
     made = prediction_of(np.zeros((20, 3)), first=-day, producer="integrator-new")
     successor = core_of(3, sha256=twin, snapshot_store=store, started_t_ns=int(made.t_ns[0]))
@@ -316,7 +276,7 @@ def test_row_13_a_snapshot_that_is_ahead_of_a_clock_that_was_set_back_keeps_no_f
 
 def test_alarms_of_a_discarded_snapshot_are_no_longer_current() -> None:
     successor = core_of(3, is_replayed=True)
-    republished = successor.restore(snapshot_of(raised()))
+    republished = successor.restore(raised())
     assert [is_listed(each.newest) for each in standing_of(republished)] == [True, True]
     later = successor.step(prediction_of(np.zeros((20, 3)), first=-HOUR, producer="integrator-2"))
     emitted = [message for message in later if isinstance(message, Alarm)]
@@ -330,7 +290,7 @@ def test_alarms_of_a_discarded_snapshot_are_no_longer_current() -> None:
 
 def test_a_request_that_was_answered_is_not_answered_again_after_a_restart_of_the_latest_producers() -> None:
     successor = core_of(3)
-    successor.restore(snapshot_of(raised()))
+    successor.restore(raised())
     for sequence, action in enumerate((Action.ACKNOWLEDGE, Action.SHELVE)):
         assert successor.step(request_of(action, sequence, sequence=sequence, duration_s=60.0)) == []
     assert successor.counters()["requests_repeated"] == 2
@@ -346,7 +306,6 @@ def test_a_request_that_was_answered_is_not_answered_again_after_a_restart_of_th
 def test_a_full_disk_is_reported_and_stops_nothing(tmp_path: Path) -> None:
     scorer = core_of(snapshot_store=SnapshotStore(tmp_path / "gone" / "m"))
     (tmp_path / "gone").write_text("a file where there was a folder")
-    learned(scorer)
     scores, _ = feed(scorer, [prediction_of(np.zeros(10))])
     assert len(scores) == 1
     assert "cannot save " in scorer.problem()

@@ -102,11 +102,11 @@ def seen(
     )
 
 
-@pytest.mark.parametrize("unread_below_rad_s", [0.0, 20.0, 60.0])
+@pytest.mark.parametrize("unread_below_rad_s", [0.0, 60.0])
 def test_a_fan_that_is_stopped_stands_and_starts_again_is_healthy_also_without_readings_at_rest(
     unread_below_rad_s: float,
 ) -> None:
-    command = commands((80.0, 20.0), (0.0, 30.0), (25.0, 20.0))
+    command = commands((80.0, 20.0), (0.0, 30.0), (25.0, 16.0))
     speed = speed_of(command)
     found = seen(command, np.where(speed < unread_below_rad_s, np.nan, speed))
     assert found.alarms == []
@@ -142,7 +142,7 @@ def test_a_blocked_fan_at_its_minimum_is_an_alarm_that_a_stop_does_not_end() -> 
 def test_a_fan_whose_supply_is_gone_has_no_power_whether_or_not_its_twin_knows_the_voltage(
     conditions: ReferenceConditions | None,
 ) -> None:
-    command = commands((60.0, 40.0))
+    command = commands((60.0, 31.0))
     since_s = PERIOD_S * np.arange(len(command)) - 20.0
     speed = speed_of(command)
     coasting = np.where(since_s > 6.0, 0.0, speed[round(20.0 / PERIOD_S)] * np.exp(-np.maximum(since_s, 0.0)))
@@ -173,41 +173,16 @@ def test_no_power_is_named_as_soon_as_the_fan_comes_to_rest_and_nothing_else_bef
     assert at_rest_s - 0.5 < (named[0].t_ns - EPOCH_NS) / 1e9 < at_rest_s + 0.7
 
 
-@pytest.mark.parametrize("cause", ["no_power", "blocked"])
-def test_a_fan_that_is_switched_off_and_does_not_start_again_keeps_the_cause_for_which_it_came_to_rest(
-    cause: str,
-) -> None:
-    command = commands((80.0, 40.0), (0.0, 10.0), (80.0, 60.0))
-    before = np.arange(len(command)) * PERIOD_S < 20.0
-    driven = speed_of(np.where(before, 80.0, 0.0))
-    found = seen(command, driven if cause == "no_power" else np.where(before, driven, 0.0))
+def test_a_fan_that_is_switched_off_and_does_not_start_again_keeps_the_cause_for_which_it_came_to_rest() -> None:
+    command = commands((80.0, 30.0), (0.0, 5.0), (80.0, 15.0))
+    found = seen(command, speed_of(np.where(np.arange(len(command)) * PERIOD_S < 20.0, 80.0, 0.0)))
     assert len(found.times(Transition.RAISED)) == 1
     last = found.alarms[-1].causes[0]
-    assert last.cause == cause and last.probability > 0.55 and "has not started" not in last.evidence
+    assert last.cause == "no_power" and last.probability > 0.55 and "has not started" not in last.evidence
 
 
-def test_another_reason_to_stand_within_one_alarm_is_named() -> None:
-    command = commands((80.0, 60.0))
-    driven = speed_of(np.where(np.abs(np.arange(len(command)) * PERIOD_S - 25.0) < 5.0, 0.0, 80.0))
-    driven[round(32.5 / PERIOD_S) :] = 0.0
-    found = seen(command, driven)
-    assert len(found.times(Transition.RAISED)) == 1
-    named = [alarm.causes[0].cause for alarm in found.alarms if alarm.causes and alarm.causes[0].probability < 1.0]
-    assert named[-1] == "blocked" and "no_power" in named
-
-
-def test_the_alarm_of_a_fan_that_was_blocked_clears_soon_after_it_turns_at_whatever_speed() -> None:
-    command = commands((80.0, 20.0), (80.0, 10.0), (40.0, 60.0))
-    speed = speed_of(command)
-    speed[round(20.0 / PERIOD_S) : round(30.0 / PERIOD_S)] = 0.0
-    speed[round(30.0 / PERIOD_S) :] = speed_of(commands((40.0, 60.0)))
-    (cleared_s,) = seen(command, speed).times(Transition.CLEARED)
-    assert 30.0 < cleared_s < 42.0
-
-
-@pytest.mark.parametrize("level", [40.0, 70.0])
-def test_a_weak_drive_is_not_taken_for_no_power_and_what_would_tell_an_unclear_cause_is_said(level: float) -> None:
-    found = seen(*losing(level))
+def test_a_weak_drive_is_not_taken_for_no_power_and_what_would_tell_an_unclear_cause_is_said() -> None:
+    found = seen(*losing(40.0))
     causes = [alarm.causes for alarm in found.alarms if alarm.causes]
     assert "no_power" not in {each[0].cause for each in causes}
     later = causes[-1]
@@ -220,7 +195,7 @@ def test_a_weak_drive_is_not_taken_for_no_power_and_what_would_tell_an_unclear_c
 def test_a_fan_that_does_not_start_is_an_alarm_after_three_times_the_longest_start(
     reading: float, causes: list[str]
 ) -> None:
-    command = commands((80.0, 20.0), (0.0, 20.0), (80.0, 10.0))
+    command = commands((80.0, 20.0), (0.0, 20.0), (80.0, 5.0))
     speed = speed_of(command)
     speed[round(40.0 / PERIOD_S) :] = reading
     found = seen(command, speed)
@@ -262,15 +237,9 @@ def test_a_fan_that_turns_after_it_has_been_at_rest_is_an_alarm_and_one_that_coa
         assert len(seen(command, coast).times(Transition.RAISED)) == alarms
 
 
-def test_a_card_without_it_decides_as_before() -> None:
-    command = commands((80.0, 20.0), (0.0, 20.0), (80.0, 20.0))
-    found = seen(command, speed_of(command), healthy=None)
-    assert not {FanState.STOPPED, FanState.STARTING} & set(map(FanState, found.state.tolist()))
-
-
 def test_a_stop_says_nothing_about_a_loose_contact() -> None:
-    """The tacho loses 40 % of its readings; the alarm outlasts a stop of a minute."""
-    command = commands((80.0, 20.0), (80.0, 30.0), (0.0, 60.0), (80.0, 30.0))
+    """The tacho loses 40 % of its readings; the alarm outlasts a stop."""
+    command = commands((80.0, 35.0), (0.0, 25.0), (80.0, 10.0))
     lost = np.random.default_rng(5).random(len(command)) < np.where(np.arange(len(command)) * PERIOD_S > 20.0, 0.4, 0.0)
     found = seen(command, np.where(lost, np.nan, speed_of(command)))
     assert len(found.times(Transition.RAISED)) == 1

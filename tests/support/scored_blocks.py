@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from copy import deepcopy
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -135,10 +137,22 @@ def prediction_of(
     )
 
 
-def learned(core: ScorerCore, fans: int = 1, seconds: float = 30.0, seed: int = 9) -> ScorerCore:
-    """A core whose fans were healthy up to EPOCH_NS."""
+def learned(fans: int = 1, *, seconds: float = 30.0, **of_core: Any) -> ScorerCore:
+    """A core of `core_of` whose fans were healthy up to EPOCH_NS."""
+    if of_core.keys() <= {"unit"}:
+        return deepcopy(_learned_once(fans, seconds, **of_core))
+    return _after_healthy(core_of(fans, **of_core), fans, seconds)
+
+
+@cache
+def _learned_once(fans: int, seconds: float, **of_core: Any) -> ScorerCore:
+    """It is copied: to learn takes longer than most tests."""
+    return _after_healthy(core_of(fans, **of_core), fans, seconds)
+
+
+def _after_healthy(core: ScorerCore, fans: int, seconds: float) -> ScorerCore:
     samples = round(seconds * 100)
-    core.step(prediction_of(noise_of(samples, fans, seed), first=-samples))
+    core.step(prediction_of(noise_of(samples, fans, 9), first=-samples))
     return core
 
 
