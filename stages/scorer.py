@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from fantwin.pipeline.prediction.old_samples import OldSamples
+from fantwin.pipeline.prediction.new_samples import BEGINNING_NS, NewSamples
 from fantwin.pipeline.prediction.tray_twin import TrayTwin, load_tray_twin, twin_path
 from fantwin.pipeline.runtime.stage import Admitted, BuiltStage, Context, Core, Stage, StageError, never
 from fantwin.pipeline.tray_scoring.healthy_twin import HealthyTwin, ScorerConfig, healthy_twin
@@ -29,7 +29,6 @@ from fantwin.pipeline.tray_scoring.judged_share import JudgedShare
 from fantwin.pipeline.tray_scoring.learned_scorer import LearnedTwinScorer
 from fantwin.pipeline.tray_scoring.snapshot_store import Elsewhere, SnapshotStore
 from fantwin.pipeline.tray_scoring.tray_scorer import TrayScorer
-from fantwin.schemas.blocks import select
 from fantwin.schemas.enums import Transition
 from fantwin.schemas.messages import Alarm, Message, ModelCard, Prediction, Request, Score, ScorerSnapshot
 from fantwin.schemas.topics import ALL_TRAYS
@@ -89,8 +88,7 @@ class ScorerCore(Core):
         self._is_replayed = is_replayed
         self._unscored = UnscoredMonitor(fans, round(NOT_JUDGED_S * NS_PER_S))
         self._snapshot_store = snapshot_store
-        self._wrong_fans = 0
-        self._old_samples = OldSamples()
+        self._samples = NewSamples(fans, "predictions", "scorer")
         self._judged_share = JudgedShare()
         self._counts: Counter[str] = Counter()
         self._not_restored = ""
@@ -106,13 +104,13 @@ class ScorerCore(Core):
         stored = snapshot_store.load() if snapshot_store and not continues else None
         self._at_start = self.restore(stored) if stored else self._continued(continues) if continues else []
         """messages to be emitted first"""
-        is_ahead = started_t_ns is not None and self._last_t_ns > started_t_ns + SET_BACK_NS
+        is_ahead = started_t_ns is not None and self._samples.last_t_ns > started_t_ns + SET_BACK_NS
         self._may_be_set_back = is_ahead and self._is_restored
         """the snapshot is of later times than now: the first prediction shows whether all times have gone back"""
 
     def _start_new(self) -> None:
         self.tray = TrayScorer(self._fans, self._text, self._config, self._twin)
-        self._last_t_ns = self._snapshot_t_ns = np.iinfo(np.int64).min
+        self._samples.last_t_ns = self._snapshot_t_ns = BEGINNING_NS
         self._shown_until_t_ns = np.iinfo(np.int64).max
         """end of the time in which health says that a snapshot was not used; not known before the first sample"""
         self._input_producer = ""
@@ -149,7 +147,7 @@ class ScorerCore(Core):
                     self.tray.wear.restore(state["wear"])
                 self._counts["snapshots_not_understood"] += 1
                 self._not_restored = READ_IN_PART
-        self._last_t_ns = self._snapshot_t_ns = snapshot.t_ns
+        self._samples.last_t_ns = self._snapshot_t_ns = snapshot.t_ns
         self._input_producer, self._is_restored = input_producer, True
         if self._not_restored:
             return [replace(snapshot, restored=True), *self.tray.alarms.discard_all(snapshot.t_ns, keep_silenced=True)]
@@ -194,24 +192,15 @@ class ScorerCore(Core):
         if isinstance(item, Request):
             self._may_be_set_back = False
             return Admitted([*self.tick(0), *self._answer(item)])
-        if item.fans != self._fans:
-            self._wrong_fans = item.fans
-            self._counts["lost_wrong_fan_count"] += len(item.t_ns)
+        if not self._samples.fits(item):
             return Admitted([])
-        self._wrong_fans = 0
         self._set_snapshot_back(item)
         before_score = [*self.tick(0), *self._discard_if_replayed(item)]
-        before = np.maximum.accumulate(np.concatenate(([self._last_t_ns], item.t_ns)))[:-1]
-        new = item.t_ns > before
-        self._counts["repeated"] += int((~new).sum())
-        if not new.any():
-            if len(item.t_ns):
-                self._old_samples.add(item.t_ns, item.period_ns, self._last_t_ns)
+        block = self._samples.take(item)
+        if block is None:
             return Admitted(before_score)
-        self._old_samples.clear()
-        self._shown_until_t_ns = min(self._shown_until_t_ns, int(item.t_ns[new][0]) + SHOWN_NS)
-        self._last_t_ns, self._input_producer = int(item.t_ns[new][-1]), item.header.producer
-        block = item if new.all() else select(item, new)
+        self._shown_until_t_ns = min(self._shown_until_t_ns, int(block.t_ns[0]) + SHOWN_NS)
+        self._input_producer = item.header.producer
         return Admitted(before_score, block)
 
     def finish(self, block: Prediction, made: tuple[Score, list[Alarm]]) -> list[Score | Alarm | ScorerSnapshot]:
@@ -226,11 +215,9 @@ class ScorerCore(Core):
 
     def counters(self) -> Mapping[str, int]:
         """docs/explanation/deciding.md says what each counts."""
-        of_alarms = {
-            "alarms_raised": self.tray.alarms.raised,
-            "alarms_cleared": self.tray.alarms.cleared,
-        }
-        return {**self._counts, **of_alarms}
+        alarms = self.tray.alarms
+        of_alarms = {"alarms_raised": alarms.raised, "alarms_cleared": alarms.cleared}
+        return {**self._counts, **self._samples.counters(), **of_alarms}
 
     def notes(self) -> list[str]:
         """Notes on where it continued from, if not from its file; on the share of the samples that was judged, and why
@@ -241,17 +228,15 @@ class ScorerCore(Core):
 
     def problem(self) -> str:
         """Problem for people to look at: input, snapshot, fans without a score, wear."""
-        if self._wrong_fans:
-            return f"predictions of {self._wrong_fans} fans, [[tray]] says fans = {self._fans}: correct one of them"
-        is_new = self._last_t_ns < self._shown_until_t_ns
+        is_new = self._samples.last_t_ns < self._shown_until_t_ns
         problems = [
             self._not_restored if is_new else "",
-            self._set_back if self._last_t_ns < self._set_back_until_t_ns else "",
+            self._set_back if self._samples.last_t_ns < self._set_back_until_t_ns else "",
             self._unscored.problem(),
-            self._old_samples.problem("predictions", "scorer"),
+            self._samples.problem(),
         ]
         problems += [self._snapshot_store.problem] if self._snapshot_store else []
-        problems.append(self.tray.wear.problem(self._last_t_ns))
+        problems.append(self.tray.wear.problem(self._samples.last_t_ns))
         return "; ".join(filter(None, problems))
 
     def close(self) -> list[ScorerSnapshot]:
@@ -262,7 +247,7 @@ class ScorerCore(Core):
 
     def last_snapshot(self) -> list[ScorerSnapshot]:
         """The state now; nothing before the first sample."""
-        return self._take_snapshot() if self._last_t_ns > np.iinfo(np.int64).min else []
+        return self._take_snapshot() if self._samples.last_t_ns > BEGINNING_NS else []
 
     def abort(self) -> None:
         """Save nothing; another process may use the snapshot."""
@@ -278,13 +263,13 @@ class ScorerCore(Core):
         if not self._may_be_set_back or not len(item.t_ns):
             return
         self._may_be_set_back = False
-        first_t_ns, ahead_ns = int(item.t_ns[0]), self._last_t_ns - int(item.t_ns[0])
+        first_t_ns, ahead_ns = int(item.t_ns[0]), self._samples.last_t_ns - int(item.t_ns[0])
         if item.header.producer == self._input_producer or ahead_ns < 0:
             return
         t_ns = first_t_ns - item.period_ns - 2 * round(FORGETS_S * NS_PER_S)
-        state = with_times_moved(self._state(), t_ns - self._last_t_ns)
+        state = with_times_moved(self._state(), t_ns - self._samples.last_t_ns)
         self._start_new()
-        self._at_start = self.restore(ScorerSnapshot(t_ns=t_ns, twin_sha256=self._twin.sha256, state_json=_json(state)))
+        self._at_start = self.restore(self._snapshot_of(t_ns, state))
         self._snapshot_t_ns = 0  # saved at once: a restart must not set back the same one again
         self._counts["snapshots_set_back"] += 1
         self._set_back_until_t_ns = first_t_ns + SHOWN_NS
@@ -304,7 +289,7 @@ class ScorerCore(Core):
         self._is_restored = False
         first_t_ns = int(item.t_ns[0])
         is_repeated = item.header.producer == self._input_producer  # what it has kept, in a replay as well
-        if first_t_ns > self._last_t_ns or is_repeated or not self._is_replayed():
+        if first_t_ns > self._samples.last_t_ns or is_repeated or not self._is_replayed():
             return []
         discarded, self._not_restored = self.tray.alarms.discard_all(first_t_ns, keep_silenced=False), ""
         self._start_new()
@@ -312,20 +297,20 @@ class ScorerCore(Core):
         return discarded
 
     def _answer(self, request: Request) -> list[Alarm | ScorerSnapshot]:
-        alarms = self.tray.alarms.answer(request, max(self._last_t_ns, 0))
+        alarms = self.tray.alarms.answer(request, max(self._samples.last_t_ns, 0))
         if not alarms:
             self._counts["requests_repeated"] += 1
             return []
         commissioned = np.zeros(self._fans, np.bool_)
         commissioned[[alarm.fan for alarm in alarms if alarm.transition == Transition.COMMISSIONING]] = True
-        self.tray.recommission(commissioned, self._last_t_ns)
+        self.tray.recommission(commissioned, self._samples.last_t_ns)
         self._counts["requests"] += 1
         return [*self._take_snapshot(), *alarms]  # whoever has the answer can rely on it
 
     def _is_snapshot_due(self, period_ns: int) -> bool:
         """Return whether alarms have changed since the last snapshot, or it is old; period_ns: between samples."""
         rest_ns = self._rest_ns if self._owes_snapshot else max(SNAPSHOT_PERIOD_NS, SNAPSHOT_PERIOD_SAMPLES * period_ns)
-        return self._last_t_ns - self._snapshot_t_ns >= rest_ns
+        return self._samples.last_t_ns - self._snapshot_t_ns >= rest_ns
 
     def _take_due_snapshot(self) -> list[ScorerSnapshot]:
         """Save the state; returns it if it is to be published, too."""
@@ -337,20 +322,18 @@ class ScorerCore(Core):
 
     def _take_snapshot(self) -> list[ScorerSnapshot]:
         """The state for a restart."""
-        self._snapshot_t_ns, self._owes_snapshot = self._last_t_ns, False
-        snapshot = ScorerSnapshot(
-            t_ns=max(self._last_t_ns, 0), twin_sha256=self._twin.sha256, state_json=_json(self._state())
-        )
+        self._snapshot_t_ns, self._owes_snapshot = self._samples.last_t_ns, False
+        snapshot = self._snapshot_of(max(self._samples.last_t_ns, 0), self._state())
         if self._snapshot_store:
             self._snapshot_store.save(snapshot)
         return [snapshot]
 
+    def _snapshot_of(self, t_ns: int, state: Mapping[str, Any]) -> ScorerSnapshot:
+        state_json = json.dumps(state, allow_nan=False)
+        return ScorerSnapshot(t_ns=t_ns, twin_sha256=self._twin.sha256, state_json=state_json)
+
     def _state(self) -> dict[str, Any]:
         return {**self.tray.snapshot(), "input_producer": self._input_producer}
-
-
-def _json(state: Mapping[str, Any]) -> str:
-    return json.dumps(state, allow_nan=False)
 
 
 def _kept_by_others(context: Context) -> Elsewhere | None:

@@ -29,18 +29,14 @@ measured motion. It needs no free run and is available a third of a second after
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
-
-import numpy as np
 
 from fantwin.pipeline.prediction.joint_tray_integrator import JointTrayIntegrator
 from fantwin.pipeline.prediction.learned_integrator import LearnedTwinIntegrator
-from fantwin.pipeline.prediction.old_samples import OldSamples
+from fantwin.pipeline.prediction.new_samples import NewSamples
 from fantwin.pipeline.prediction.tray_integrator import TrayIntegrator, TwinIntegratorConfig
 from fantwin.pipeline.prediction.twin_file import TwinFile, load_twin
 from fantwin.pipeline.runtime.stage import Admitted, BuiltStage, Context, Core, Stage, StageError
-from fantwin.schemas.blocks import select
 from fantwin.schemas.messages import Grid, Message, ModelCard, NewTwin, Prediction
 from fantwin.schemas.units import NS_PER_S
 
@@ -61,7 +57,7 @@ class TwinIntegratorCore(Core):
         """content: of the file of a learned twin, published with its card."""
         self._twin = twin
         self.tray = TrayIntegrator(twin, config)
-        self._producer = ""  # of the newest grid
+        self._producer: str | None = None  # of the newest grid
         self._card = [
             ModelCard(
                 t_ns=started_t_ns,
@@ -73,10 +69,8 @@ class TwinIntegratorCore(Core):
                 content=content,
             )
         ]
-        self._last_t_ns: int | None = None
         self._problem = ""
-        self._old_samples = OldSamples()
-        self._counts: Counter[str] = Counter()
+        self._samples = NewSamples(twin.fans, "grid samples", "twin_integrator and scorer")
 
     def step(self, item: Grid | NewTwin) -> list[Message]:
         """Predict the speeds of a block."""
@@ -90,19 +84,17 @@ class TwinIntegratorCore(Core):
         if isinstance(item, NewTwin):
             return Admitted([])
         messages: list[Message] = [*self.tick(0)]
-        if item.fans != self._twin.fans:
-            self._counts["lost_wrong_fan_count"] += len(item.t_ns)
-            self._problem = f"grid of {item.fans} fans, [[tray]] says fans = {self._twin.fans}: correct one of them"
+        if not self._samples.fits(item):
             return Admitted(messages)
         self._problem = ""
-        grid = self._only_new(item)
-        if not len(grid.t_ns):
-            if len(item.t_ns) and self._last_t_ns is not None:
-                self._old_samples.add(item.t_ns, item.period_ns, self._last_t_ns)
+        grid = self._samples.take(item)
+        if grid is None:
             return Admitted(messages)
-        self._old_samples.clear()
-        self.tray.begin(grid.period_ns, is_of_another_session=self._is_of_another_session(grid))
-        self._last_t_ns, self._producer = int(grid.t_ns[-1]), grid.header.producer
+        # each session of the resampler derives times from the clock of the device again: by tens of milliseconds they
+        # may differ, as if the speed had jumped
+        is_of_another_session = self._producer not in (None, grid.header.producer)
+        self.tray.begin(grid.period_ns, is_of_another_session=is_of_another_session)
+        self._producer = grid.header.producer
         card = self._twin.card
         if card.fixed_rate and abs(grid.period_ns * card.rate_hz / NS_PER_S - 1) > RATE_TOLERANCE:
             self._problem = (
@@ -123,7 +115,7 @@ class TwinIntegratorCore(Core):
 
     def counters(self) -> Mapping[str, int]:
         """docs/explanation/deciding.md explains each counter."""
-        return {**self._counts, **self.tray.counters()}
+        return {**self._samples.counters(), **self.tray.counters()}
 
     def notes(self) -> list[str]:
         """Note on the columns that the twin needs."""
@@ -133,31 +125,13 @@ class TwinIntegratorCore(Core):
     def problem(self) -> str:
         """A twin that does not fit the grid it receives or the supply of its fans, or a grid whose times have gone
         back."""
-        old = self._old_samples.problem("grid samples", "twin_integrator and scorer")
-        return self._problem or old or self._problem_of_columns() or self.tray.problem()
+        return self._samples.problem() or self._problem or self._problem_of_columns() or self.tray.problem()
 
     def _problem_of_columns(self) -> str:
         missing, name = self.tray.missing_columns, self._twin.card.name
         if not missing:
             return ""
         return f"twin {name} needs {missing}, which the source does not send: send it, or train without it (--ignore)"
-
-    def _only_new(self, grid: Grid) -> Grid:
-        """The block without the samples that are not newer than those before them."""
-        before = np.concatenate(([np.iinfo(np.int64).min if self._last_t_ns is None else self._last_t_ns], grid.t_ns))
-        new = grid.t_ns > np.maximum.accumulate(before)[:-1]
-        if new.all():
-            return grid
-        self._counts["repeated"] += int((~new).sum())
-        return select(grid, new)
-
-    def _is_of_another_session(self, grid: Grid) -> bool:
-        """Return whether another session of the resampler continues the grid.
-
-        Each derives times from the clock of the device again. By tens of milliseconds they may differ, as if the speed
-        had jumped.
-        """
-        return self._last_t_ns is not None and grid.header.producer != self._producer
 
 
 class JointIntegrators:

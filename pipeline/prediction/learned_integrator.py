@@ -14,14 +14,14 @@ from itertools import pairwise
 import numpy as np
 
 from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.prediction.new_samples import BEGINNING_NS, NewSamples, are_newer
 from fantwin.pipeline.prediction.twin_file import TwinFile, learned_twin
 from fantwin.pipeline.runtime.stage import Core, StageError
-from fantwin.schemas.blocks import cut, select
+from fantwin.schemas.blocks import cut
 from fantwin.schemas.channels import measured_columns
 from fantwin.schemas.enums import InvalidReason
-from fantwin.schemas.messages import Array, Grid, Message, NewTwin, Prediction
+from fantwin.schemas.messages import Grid, Message, NewTwin, Prediction
 
-BEGINNING = np.iinfo(np.int64).min
 MOST_COMING = 8
 """twins that wait for their first samples; a replay publishes one in advance"""
 
@@ -38,7 +38,7 @@ class LearnedTwinIntegrator(Core):
         """hash of the twin in force"""
         self._coming: list[NewTwin] = []
         """those that are to take over, in the order of their first samples"""
-        self._newest_t_ns = BEGINNING
+        self._samples = NewSamples(tray.fans, "grid samples", "twin_integrator and scorer")
         self._counts: Counter[str] = Counter()
         """counters of the twins before the current one"""
         self._problem = ""
@@ -49,9 +49,7 @@ class LearnedTwinIntegrator(Core):
             before = [each for each in self._coming if _first_t_ns(each) < _first_t_ns(item)]
             self._coming = [*before, item][-MOST_COMING:]
             return []
-        if item.fans != self._tray.fans and self._core is None:
-            self._counts["lost_wrong_fan_count"] += len(item.t_ns)
-            self._problem = f"grid of {item.fans} fans, [[tray]] says fans = {self._tray.fans}: correct one of them"
+        if self._core is None and not self._samples.fits(item):
             return []
         return [message for block in self._cut(item) for message in self._predict(block)]
 
@@ -61,11 +59,16 @@ class LearnedTwinIntegrator(Core):
 
     def counters(self) -> Mapping[str, int]:
         """Counters of all twins so far."""
-        return self._counts + Counter(self._core.counters() if self._core else {})
+        return self._counts + Counter(self._counting.counters())
 
     def problem(self) -> str:
         """A twin that could not take over, or what is wrong with the one in force."""
-        return self._problem or (self._core.problem() if self._core else "")
+        return self._problem or self._counting.problem()
+
+    @property
+    def _counting(self) -> Core | NewSamples:
+        """What counts and reports the samples of now: the core of a twin, where there is one."""
+        return self._core or self._samples
 
     def _cut(self, grid: Grid) -> Iterator[Grid]:
         """The block, cut before the first sample of each twin that names one in it."""
@@ -73,7 +76,7 @@ class LearnedTwinIntegrator(Core):
         if not named:
             yield grid
             return
-        new = self._new(grid)
+        new = are_newer(grid.t_ns, self._samples.last_t_ns)
         rows = (np.flatnonzero(new & (grid.t_ns >= first_t_ns)) for first_t_ns in named)
         cuts = sorted({int(found[0]) for found in rows if len(found)} - {0})
         for begin, end in pairwise((0, *cuts, len(grid.t_ns))):
@@ -81,18 +84,12 @@ class LearnedTwinIntegrator(Core):
 
     def _predict(self, grid: Grid) -> Sequence[Message]:
         """Predict a block by one twin."""
-        if len(grid.t_ns) and grid.t_ns[0] > self._newest_t_ns:
+        if len(grid.t_ns) and grid.t_ns[0] > self._samples.last_t_ns:
             self._take_over(int(grid.t_ns[0]))
-        new = self._new(grid)
-        if new.any():
-            self._newest_t_ns = int(grid.t_ns[new][-1])
+        new = self._samples.take(grid)
         if self._core is not None:
             return self._core.step(grid)
-        return [_without_twin(select(grid, new))] if new.any() else []
-
-    def _new(self, grid: Grid) -> Array:
-        """Select the samples that are newer than all before them: (n,) of bool."""
-        return grid.t_ns > np.maximum.accumulate(np.concatenate(([self._newest_t_ns], grid.t_ns)))[:-1]
+        return [_without_twin(new)] if new is not None else []
 
     def _take_over(self, first_t_ns: int) -> None:
         """Change to the newest twin whose first sample has come."""
@@ -108,13 +105,12 @@ class LearnedTwinIntegrator(Core):
         except StageError as error:
             self._problem = f"{new.twin} did not take over: {error}"
             return
-        if self._core:
-            self._counts.update(self._core.counters())
+        self._counts.update(self._counting.counters())
         self._core, self._sha256, self._problem = self._core_of(twin, first_t_ns, new.content), new.sha256, ""
 
 
 def _first_t_ns(new: NewTwin) -> int:
-    return new.first_sample_t_ns or BEGINNING
+    return new.first_sample_t_ns or BEGINNING_NS
 
 
 def _without_twin(grid: Grid) -> Prediction:

@@ -16,9 +16,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Protocol
 
-import numpy as np
-
 from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.prediction.new_samples import BEGINNING_NS, are_newer
 from fantwin.pipeline.prediction.onnx_metadata import without_metadata
 from fantwin.pipeline.prediction.tray_twin import TrayTwin, tray_twin
 from fantwin.pipeline.runtime.stage import Core, StageError
@@ -69,7 +68,7 @@ class LearnedTwinScorer(Core):
         """from the first one of a twin that has not arrived yet, after a restart"""
         self._producer = ""
         """who made the newest prediction"""
-        self._newest_t_ns = np.iinfo(np.int64).min
+        self._newest_t_ns = BEGINNING_NS
         self._judged_share = JudgedShare()
         self._counts: Counter[str] = Counter()
         """of the cores before the current one"""
@@ -194,7 +193,7 @@ class LearnedTwinScorer(Core):
         return first == second
 
     def _unscored(self, item: Prediction) -> list[Message]:
-        new = item.t_ns > np.maximum.accumulate(np.concatenate(([self._newest_t_ns], item.t_ns)))[:-1]
+        new = are_newer(item.t_ns, self._newest_t_ns)
         if not new.any() or item.fans != self._tray.fans:
             return []
         score = unscored(item if new.all() else select(item, new))

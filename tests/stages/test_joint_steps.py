@@ -1,4 +1,4 @@
-"""Trays that are predicted in one pass: each gets what it would get alone.
+"""Trays that are predicted in one pass, by a twin that allows for supply and air: each gets what it would get alone.
 
 Matrices of more columns may be multiplied in another order, so numbers may differ by rounding.
 """
@@ -18,13 +18,15 @@ from fantwin.pipeline.runtime.building import build_parts
 from fantwin.pipeline.runtime.joint_step import step_together
 from fantwin.pipeline.runtime.stage import Context, Core, Joint, load_stage
 from fantwin.schemas.header import Header
-from fantwin.schemas.messages import Grid, Message, Raw
+from fantwin.schemas.messages import Message, Raw
 from fantwin.schemas.units import NS_PER_S
 from fantwin.simulation.faults import Fault
+from fantwin.simulation.surroundings import Surroundings
 from fantwin.simulation.tray import SimulatedTray, TraySettings
+from tests.support.twin_files import small_hybrid, write_twin
 
 EPOCH_NS, SECONDS, BLOCK = 1_700_000_000 * NS_PER_S, 12.0, 25
-TWIN = Path(__file__).parents[2] / "pipeline" / "demo" / "twin.onnx"
+CONDITIONS = {"supply_voltage_v": 12.0, "temperature_c": 20.0}
 FAULTS: tuple[tuple[Fault, ...], ...] = (
     (Fault("tacho-dropout", 0, 3.0, 6.0, 0.6), Fault("tacho-dropout", 1, 2.0, 7.0, 1.0)),
     (),
@@ -47,18 +49,13 @@ class Counting:
         return self._joint.process(cores, blocks)
 
 
-@pytest.fixture(scope="module")
-def grids() -> list[list[Grid]]:
-    """Samples of each tray."""
-    cores = cores_of("resampler")
-    return [
-        [grid for raw in raws(number) for grid in core.step(raw) if isinstance(grid, Grid)]
-        for number, core in enumerate(cores)
-    ]
+@pytest.fixture
+def twin(tmp_path: Path) -> Path:
+    return write_twin(tmp_path / "twin.onnx", small_hybrid(), conditions=CONDITIONS)
 
 
-def cores_of(stage: str) -> list[Core]:
-    table = '[[tray]]\nname = "tray{}"\nfans = 8\ntwin = "' + str(TWIN) + '"\n'
+def cores_of(stage: str, twin: Path) -> list[Core]:
+    table = '[[tray]]\nname = "tray{}"\nfans = 8\ntwin = "' + str(twin) + '"\n'
     text = "[resampler]\nrate_hz = 100\n" + "".join(map(table.format, range(len(FAULTS))))
     config = parse_config(text, Path("/nowhere/fantwin.toml"), (), ("resampler", "twin_integrator", "scorer"))
     context = Context(
@@ -74,7 +71,11 @@ def cores_of(stage: str) -> list[Core]:
 
 def raws(number: int) -> Iterator[Raw]:
     settings = TraySettings(
-        seed=number + 1, duration_s=SECONDS, faults=FAULTS[number], lost=0.02 if number == LOSING else 0.0
+        seed=number + 1,
+        duration_s=SECONDS,
+        faults=FAULTS[number],
+        lost=0.02 if number == LOSING else 0.0,
+        surroundings=Surroundings(supply_wander=0.02, measured=("supply_voltage_v", "temperature_c")),
     )
     tray, samples = SimulatedTray(settings), []
     while tray.due_s() is not None:
@@ -89,15 +90,17 @@ def raws(number: int) -> Iterator[Raw]:
             host_receive_t_ns=np.array([EPOCH_NS + round(each.t_s * NS_PER_S) for each in block]),
             device_clock_us=np.array([each.clock_us for each in block], np.uint32),
             device_sequence=np.array([each.sequence for each in block], np.uint32),
-            command=np.array([each.command for each in block]),
+            command=np.array([100.0 * each.command for each in block]),
             speed_rad_s=np.array([each.speed_rad_s for each in block]),
+            supply_voltage_v=np.array([each.auxiliary["supply_voltage_v"] for each in block], np.float32),
+            temperature_c=np.array([each.auxiliary["temperature_c"] for each in block], np.float32),
         )
 
 
-def together(stage: str, items: Sequence[Sequence[Message]]) -> tuple[list[Core], list[list[Message]], list[int]]:
+def together(cores: Sequence[Core], items: Sequence[Sequence[Message]]) -> tuple[list[list[Message]], list[int]]:
     """What the cores make of their messages in turns of one of each tray; and the number of trays in each pass."""
-    cores, made = cores_of(stage), [[] for _ in items]
-    joint_of = load_stage(stage).joint
+    made: list[list[Message]] = [[] for _ in items]
+    joint_of = load_stage("twin_integrator").joint
     assert joint_of
     joint = Counting(joint_of())
     for turn in zip_longest(*items):
@@ -105,7 +108,7 @@ def together(stage: str, items: Sequence[Sequence[Message]]) -> tuple[list[Core]
         of_turn = step_together(joint, [cores[number] for number in present], [turn[number] for number in present])
         for number, messages in zip(present, of_turn, strict=True):
             made[number] += messages
-    return cores, made, joint.trays
+    return made, joint.trays
 
 
 def assert_alike(one: Any, other: Any, where: str) -> None:
@@ -118,10 +121,12 @@ def assert_alike(one: Any, other: Any, where: str) -> None:
         assert one == other, where
 
 
-def test_trays_in_one_pass_are_predicted_as_each_alone(grids: list[list[Grid]]) -> None:
-    joint_cores, joint_messages, trays = together("twin_integrator", grids)
+def test_trays_in_one_pass_are_predicted_as_each_alone(twin: Path) -> None:
+    resamplers, joint_cores = cores_of("resampler", twin), cores_of("twin_integrator", twin)
+    grids = [[grid for raw in raws(k) for grid in resampler.step(raw)] for k, resampler in enumerate(resamplers)]
+    joint_messages, trays = together(joint_cores, grids)
     assert sum(count for count in trays if count > 1) / sum(trays) > 0.5, "of the blocks, most in one pass with others"
-    for number, core in enumerate(cores_of("twin_integrator")):
+    for number, core in enumerate(cores_of("twin_integrator", twin)):
         alone = [made for grid in grids[number] for made in core.step(grid)]
         assert len(alone) == len(joint_messages[number])
         for place, (one, other) in enumerate(zip(alone, joint_messages[number], strict=True)):

@@ -186,15 +186,6 @@ def test_at_any_rate_of_the_grid_a_healthy_fan_raises_nothing_and_a_step_of_ten_
     assert 0.0 < min(raised_s) <= max(raised_s) <= within_s
 
 
-def test_a_healthy_fan_leaves_the_band_often_and_raises_nothing() -> None:
-    residual = noise_of(30 * SECOND, 20, seed=11)
-    blocks = [prediction_of(part, first=300 * k) for k, part in enumerate(np.split(residual, 10))]
-    scores, alarms = feed(core_of(fans=20), blocks)
-    outside = sum(int(score.outside.sum()) for score in scores)
-    assert outside == pytest.approx(0.0455 * residual.size, rel=0.1)
-    assert alarms == []
-
-
 def test_a_fault_that_a_speed_loop_hides_is_found_in_the_torque_balance_while_the_free_run_is_not_known() -> None:
     core = learned()
     extra = np.where(np.arange(6 * SECOND) < SECOND, 0.0, 6.0) + 0.1 * noise_of(6 * SECOND)[:, 0]

@@ -85,12 +85,6 @@ def test_after_missing_samples_the_balance_starts_again() -> None:
         assert np.abs(found[again:]).max() < 0.3
 
 
-def test_one_interval_of_another_length_is_not_a_gap() -> None:
-    grid = healthy()
-    grid.t_ns[200:] += STEP_NS // 3
-    assert where_known(balance([grid])) == [SETTLES, 400]
-
-
 def test_without_a_reading_a_command_or_samples_there_is_no_balance_and_it_starts_again() -> None:
     for column in ("speed_rad_s", "command"):
         grid = healthy()
@@ -108,27 +102,3 @@ def test_there_is_no_balance_while_the_drive_is_off() -> None:
     begins, ends, again, end = where_known(found)
     assert (begins, ends, end) == (SETTLES, 200, 400)
     assert again >= 220 + SETTLES
-
-
-def test_the_balance_starts_again_at_another_grid_rate() -> None:
-    first = healthy(200)
-    second = grid_of(np.full(200, 40.0), np.full(200, 100.0), first=1000, period_ns=2 * STEP_NS)
-    core = core_of()
-    assert where_known(feed(core, [first]).torque_balance_command[:, 0]) == [SETTLES, 200]
-    assert where_known(feed(core, [second]).torque_balance_command[:, 0]) == [(SETTLES + 1) // 2, 200]
-
-
-def test_the_balance_needs_no_free_run() -> None:
-    twin = physical_twin(fixed_rate=True, rate_hz=50.0)
-    prediction = feed(core_of(twin), [healthy()])
-    assert not prediction.valid.any()
-    assert (prediction.invalid_reason == InvalidReason.NO_TWIN).all()
-    assert np.isfinite(prediction.torque_balance_command[SETTLES:]).all()
-
-
-def test_there_is_no_balance_far_above_the_training_speeds() -> None:
-    twin = physical_twin(speed_range_rad_s=(0.0, 200.0))
-    fast = grid_of(np.full(100, 60.0), np.full(100, 301.0))
-    slower = grid_of(np.full(100, 60.0), np.full(100, 299.0))
-    assert np.isnan(feed(core_of(twin), [fast]).torque_balance_command).all()
-    assert np.isfinite(feed(core_of(twin), [slower]).torque_balance_command[SETTLES:]).all()

@@ -33,6 +33,7 @@ from tests.stages.test_twin_integrator import (
 from tests.support.twin_files import small_hybrid, write_twin
 
 FANS = 8  # of the demo's twin
+CONDITIONS = {"supply_voltage_v": 12.0, "temperature_c": 20.0}
 
 
 def unstable_twin() -> TwinFile:
@@ -57,6 +58,7 @@ def twins(tmp_path_factory: pytest.TempPathFactory) -> dict[str, TwinFile]:
         "hybrid": TwinFile.load(write_twin(folder / "hybrid.onnx", small_hybrid()), FANS),
         "unstable": unstable_twin(),
         "stiff": twin_with_friction(30.0, FANS),
+        "allowing for supply and air": TwinFile.load(write_twin(folder / "air.onnx", conditions=CONDITIONS), FANS),
     }
 
 
@@ -97,9 +99,12 @@ def grid_where(happenings: Iterable[tuple[str, int]], seed: int) -> Grid:
                 command[-1][2] = 150.0
             speed[-1][why > 0] = NAN
             invalid_reason.append(why)
+    wander, is_there = np.cumsum(rng.normal(0.0, 0.1, (len(t_ns), 1)), axis=0), rng.random((len(t_ns), FANS)) > 0.2
     return Grid(
         fans=FANS,
         period_ns=STEP_NS,
+        supply_voltage_v=np.where(is_there, 12.0 + 0.1 * wander, NAN).astype(np.float32),
+        temperature_c=np.where(is_there, 20.0 + 3.0 * wander, NAN).astype(np.float32),
         t_ns=np.array(t_ns),
         command=np.array(command),
         speed_rad_s=np.array(speed),
@@ -117,7 +122,7 @@ def predicted(core: TwinIntegratorCore, grids: Iterable[Grid]) -> tuple[Any, ...
 
 @settings(max_examples=30, deadline=None)
 @given(
-    name=st.sampled_from(["demo", "physical", "hybrid", "unstable", "stiff"]),
+    name=st.sampled_from(["demo", "physical", "hybrid", "unstable", "stiff", "allowing for supply and air"]),
     happenings=st.lists(st.tuples(st.sampled_from(WHAT_HAPPENS), st.integers(1, 30)), min_size=1, max_size=10),
     seed=st.integers(0, 1000),
     size=st.integers(2, 400),
