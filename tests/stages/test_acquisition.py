@@ -14,17 +14,15 @@ from cobs import cobs
 
 from fantwin.pipeline.config.models import TrayConfig
 from fantwin.pipeline.sources.serial.port import ReceivedBytes
-from fantwin.pipeline.sources.source import LinkDown, LinkUp, Reading, ReadingBatch
+from fantwin.pipeline.sources.source import LinkDown, LinkUp
 from fantwin.pipeline.timebase.host_clock import HostClock
 from fantwin.schemas.codec import decode
 from fantwin.schemas.codec import encode as encode_message
 from fantwin.schemas.messages import Command, Raw
 from fantwin.schemas.units import NS_PER_S
 from fantwin.schemas.wire import (
-    DEVICE_COUNTERS,
     CommandFrame,
     Decoder,
-    DeviceCounters,
     Frame,
     Protocol,
     Sample,
@@ -74,35 +72,6 @@ def test_a_sample_becomes_a_raw_message_with_both_clocks_and_its_speed_in_rad_pe
     assert core.counters()["samples"] == 1
 
 
-def test_samples_that_arrive_together_share_the_time_at_which_they_arrived() -> None:
-    core = make_core()
-    data = b"".join(encode("binary", sample(i)) for i in range(3))
-    assert core.step(ReceivedBytes(data[:10], S)) == []
-    messages = core.step(ReceivedBytes(data[10:], 2 * S))
-    assert [raw.host_receive_t_ns.tolist() for raw in messages] == [[2 * S] * 3]
-
-
-def feed_times(core: SerialCore, times_ms: Iterable[int]) -> list[tuple[int, list[int]]]:
-    """Feed a sample at each of these times; returns when messages came out, and the samples in each."""
-    return [
-        (t_ms, raw.device_sequence.tolist())
-        for number, t_ms in enumerate(times_ms)
-        for raw in feed(core, [sample(number)], t_ns=S + t_ms * S // 1000)
-    ]
-
-
-def test_a_message_holds_the_samples_of_a_time_and_ends_with_the_last_that_is_expected_in_it() -> None:
-    core = make_core(block_s=0.05)
-    messages = feed_times(core, range(0, 130, 10))
-    assert messages == [(0, [0]), (50, [1, 2, 3, 4, 5]), (100, [6, 7, 8, 9, 10])]
-    assert [raw.device_sequence.tolist() for raw in core.close()] == [[11, 12]]
-    assert core.close() == []
-    core = make_core(block_s=0.05)
-    assert feed_times(core, [0, 10, 20]) == [(0, [0])]
-    assert core.tick(S + 59 * S // 1000) == []
-    assert [raw.device_sequence.tolist() for raw in core.tick(S + 60 * S // 1000)] == [[1, 2]], "no more has come"
-
-
 def test_a_device_without_clock_and_sequence_has_empty_columns_and_loses_nothing() -> None:
     core = make_core(protocol="text", block_s=0.05)
     frames = sample(None), sample(None), sample(5), sample(6), sample(7)
@@ -111,13 +80,6 @@ def test_a_device_without_clock_and_sequence_has_empty_columns_and_loses_nothing
     assert [len(raw.device_sequence) for raw in messages] == [0, 3]
     assert [len(raw.device_clock_us) for raw in messages] == [0, 3]
     assert core.counters().get("lost_on_line", 0) == 0
-
-
-def test_a_reading_of_any_source_whose_command_is_no_number_is_refused() -> None:
-    core = make_core()
-    for command in ((0.5, math.nan), (math.inf, 0.5)):
-        assert core.step(ReadingBatch(S, (Reading(command, (50.0, 50.0)),))) == []
-    assert core.counters()["absurd_command"] == 2
 
 
 @pytest.mark.parametrize("speed", [1001.0, -math.inf, math.nan])
@@ -167,15 +129,6 @@ def test_a_device_restart_is_not_a_loss_of_four_billion(last: int) -> None:
     assert core.counters().get("lost_on_line", 0) == 0
 
 
-def test_a_device_restart_right_after_its_start_does_not_look_like_repeats() -> None:
-    core = make_core()
-    feed_sequences(core, [0, 1, 2])
-    core.step(LinkDown("reset"))
-    core.step(LinkUp())
-    assert feed_sequences(core, [0, 1, 2, 3]) == [0, 1, 2, 3]
-    assert core.counters()["device_restarts"] == 1
-
-
 def test_samples_measured_while_the_line_was_down_are_counted_as_lost() -> None:
     core = make_core()
     feed_sequences(core, [0, 1, 2])
@@ -201,25 +154,6 @@ def test_a_frame_of_a_later_protocol_is_skipped_and_is_no_fault() -> None:
     assert counters["samples"] == 100
     assert not {"refused_input", "lost_on_line", "lost_refused"} & {name for name, count in counters.items() if count}
     assert core.problem() == ""
-
-
-def device_counts(core: SerialCore) -> dict[str, int]:
-    """What the device has counted itself, only what is not 0."""
-    names = {f"device_{name}" for name in DEVICE_COUNTERS}
-    return {name: count for name, count in core.counters().items() if name in names and count}
-
-
-def test_what_the_device_counts_is_counted_since_the_line_was_opened_and_from_0_after_its_restart() -> None:
-    core = make_core()
-    feed(core, [DeviceCounters(70, (9, 65_530, 4))])
-    assert device_counts(core) == {}
-    assert core.counters()["device_bad_crc"] == 0, "it is known to be none"
-    feed(core, [sample(1), DeviceCounters(71, (9, 65_533, 4)), sample(2), DeviceCounters(72, (10, 2, 4))])
-    assert device_counts(core) == {"device_frames": 1, "device_bad_length": 8}
-    assert (core.counters()["samples"], core.problem()) == (2, "")
-    once = (0,) * 11 + (1,)
-    feed(core, [DeviceCounters(0, once), DeviceCounters(1, once)])
-    assert device_counts(core)["device_watchdog_resets"] == 1
 
 
 def command(*values: float, set_point: tuple[float, ...] = (), fans: int = 2) -> Command:
@@ -373,16 +307,6 @@ def test_columns_beside_command_and_speed_are_in_the_message_and_the_others_empt
     assert raw.temperature_c.dtype == np.float32
     assert raw.current_a.size == 0
     assert core.notes() == ["the source also measures supply voltage, temperature"]
-
-
-def test_a_column_that_some_samples_leave_out_is_unknown_there_and_splits_no_message() -> None:
-    core = make_core()
-    frames = [sample(0), with_columns(1, temperature_c=(25.0, 26.0)), sample(2), with_columns(3, current_a=(0.1, 0.2))]
-    messages = core.step(ReceivedBytes(b"".join(encode("binary", frame) for frame in frames), S))
-    assert [len(raw.host_receive_t_ns) for raw in messages] == [1, 2, 1]
-    assert np.array_equal(messages[1].temperature_c, [[25.0, 26.0], [math.nan] * 2], equal_nan=True)
-    assert np.isnan(messages[2].temperature_c).all()
-    assert messages[2].current_a.tolist() == [[pytest.approx(0.1), pytest.approx(0.2)]]
 
 
 def test_a_value_that_cannot_be_true_is_unknown_and_counted_and_the_sample_is_kept() -> None:

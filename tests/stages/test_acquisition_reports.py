@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 
 from fantwin.pipeline.sources.serial.port import ReceivedBytes
-from fantwin.pipeline.sources.source import LinkDown, LinkUp
 from fantwin.schemas.units import NS_PER_S as S
-from fantwin.schemas.wire import DeviceCounters, encode
-from tests.stages.test_acquisition import device_counts, feed, make_core, sample
+from fantwin.schemas.wire import encode
+from tests.stages.test_acquisition import feed, make_core, sample
 
 
 def test_a_command_at_a_limit_that_float32_rounds_beyond_it_is_no_absurd_one() -> None:
@@ -64,16 +63,3 @@ def test_a_long_piece_is_quoted_in_part_only() -> None:
     core.tick(3 * S)
     for text in (note, core.problem()):
         assert "xxx..." in text and len(text) < 250
-
-
-def test_what_the_device_counts_in_one_read_is_added_up_and_while_the_line_is_closed_is_not_counted() -> None:
-    core = make_core()
-    frames = (DeviceCounters(uptime_s, (0, 0, uptime_s)) for uptime_s in range(5))
-    core.step(ReceivedBytes(b"".join(encode("binary", frame) for frame in frames), S))
-    assert device_counts(core) == {"device_bad_crc": 4}
-    core.step(LinkDown("gone"))
-    core.step(LinkUp())
-    feed(core, [DeviceCounters(90, (0, 0, 30))])
-    assert device_counts(core) == {"device_bad_crc": 4}
-    feed(core, [DeviceCounters(91, (0, 0, 31))])
-    assert device_counts(core) == {"device_bad_crc": 5}

@@ -368,33 +368,6 @@ def marked(feedback: Feedback, sequence: int, reason: str = "") -> Alarm:
     return alarm(transition, sequence, marked_onset_t_ns=NOW_NS, t_ns=NOW_NS + sequence, operator_name="ann", **more)
 
 
-def test_the_rate_of_false_alarms_is_over_the_judged_time_and_beside_the_declared_one(tmp_path, users):
-    twin = golden_twin()
-    for number in range(2):  # the second process continues with the file of the first
-        gateway = RunningGateway(tmp_path, granted, users=users)
-        try:
-            gateway.feed(twin, score(0.0 + 100 * number), score(4.0 + 100 * number), score(90.0 + 100 * number))
-            if not number:
-                gateway.feed(alarm(t_ns=NOW_NS + 10**9), alarm(sequence=1, onset_t_ns=5, t_ns=NOW_NS + 20 * 10**9))
-                gateway.feed(marked(Feedback.TRUE_ALARM, 2), marked(Feedback.FALSE_ALARM, 3, "the door was open"))
-            body = Client(gateway).ask("GET", "/api/v1/alarm-rate")[1]
-            rows = Client(gateway).ask("GET", "/api/v1/alarms/history")[1]["transitions"]
-        finally:
-            gateway.close()
-        tray = body["trays"][TRAY]
-        judged_s = 4.0 * (FANS - 1) * (number + 1)  # fan 3 is not judged, and nobody in the pauses
-        assert tray["fan_hours"] == pytest.approx(judged_s / 3600)
-        counts = (tray["false_alarms"], tray["true_alarms"], tray["unmarked"])
-        assert counts == (1, 0, 0), "one is counted, as marked last; the other came in a pause"
-        assert (tray["declared_per_day"], body["site"]["declared_per_day"]) == (24.0, 24.0)
-        assert tray["interval_95"][1] == pytest.approx(5.5716 / (judged_s / 86400), rel=1e-4)
-        assert {each["onset_t_ns"]: each["feedback"] for each in rows if each["transition"] == "raised"} == {
-            NOW_NS: "false_alarm",
-            5: "none",
-        }
-        assert tray["since_t_ns"] == NOW_NS + 4 * STEP_NS
-
-
 RAISED_NS = 1_800_000_000_000_000_000
 
 

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from fantwin.pipeline.learning.versions import Check
 from fantwin.schemas.enums import Action, FanState
 from fantwin.schemas.messages import Request
 from fantwin.schemas.units import NS_PER_S
-from tests.pipeline.learning.test_versions import version
-from tests.support.one_learner import START_NS, Learner, raw, restarted
+from tests.support.one_learner import START_NS, Learner, restarted
 
 
 def test_the_first_version_waits_for_enough_running_and_enough_movement(tmp_path: Path) -> None:
@@ -134,40 +131,6 @@ def test_while_the_list_of_versions_cannot_be_read_nothing_is_learned_and_the_re
     assert learner.core.problem() == ""
 
 
-def test_learning_is_tried_again_when_the_history_grows_no_more(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("fantwin.pipeline.learning.history_recordings.LONGEST_RECORDING_NS", 200 * NS_PER_S)
-    learner = Learner(tmp_path, kept_s=1000.0)
-    learner.run(2000)
-    learner.learning.fails_with = "a failure"
-    before = len(learner.learning.starts)
-    learner.run(6000)
-    assert len(learner.learning.starts[before:]) >= 5
-    assert learner.history.seconds < 1600.0
-    assert learner.core.problem() == "learning: a failure"
-    learner.learning.fails_with = ""
-    learner.run(2000)
-    assert learner.core.problem() == ""
-
-
-def test_a_version_is_due_at_the_latest_when_as_much_was_added_as_is_kept(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("fantwin.pipeline.learning.history_recordings.LONGEST_RECORDING_NS", 200 * NS_PER_S)
-    learner = Learner(tmp_path, kept_s=1000.0)
-    learner.run(600)
-    made_t_ns = START_NS + learner.now_s * NS_PER_S
-    long_ago = tuple((day * 10_000 * NS_PER_S, (day * 10_000 + 5000) * NS_PER_S) for day in range(3))
-    learner.versions.file("tray1-2").write_bytes(b"tray1-2")
-    learner.versions.add(version("tray1-2", 2, learned_spans=long_ago, made_t_ns=made_t_ns))
-    before = len(learner.learning.starts)
-    learner.run(900)
-    assert len(learner.learning.starts) == before
-    learner.run(400)
-    assert len(learner.learning.starts) == before + 1
-
-
 def test_versions_and_checks_do_not_depend_on_one_another_and_what_failed_is_not_made_at_once_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -189,59 +152,3 @@ def test_versions_and_checks_do_not_depend_on_one_another_and_what_failed_is_not
     learner.run(3500)
     assert len(learner.learning.checks) >= before + 2
     assert learner.core.problem() == "learning: a failure"
-
-
-def test_a_time_span_that_is_marked_up_to_a_later_time_starts_no_learning(tmp_path: Path) -> None:
-    learner = Learner(tmp_path)
-    learner.run(600)
-    until_t_ns = START_NS + 3000 * NS_PER_S
-    learner.versions.mark_faulty((START_NS + learner.now_s * NS_PER_S, until_t_ns))
-    before = len(learner.learning.starts)
-    learner.run(2400)
-    assert len(learner.learning.starts) == before
-    learner.run(2000)
-    assert len(learner.learning.starts) > before
-
-
-def test_a_failure_is_over_although_the_version_was_made_before_the_failure_was_known(tmp_path: Path) -> None:
-    learner = Learner(tmp_path)
-    learner.run(2000)
-    learner.learning.fails_with = "another `fantwin twins learn` works here: wait for its end"
-    before = len(learner.learning.starts)
-    while len(learner.learning.starts) == before:
-        learner.run(10)
-    learner.add_version("tray1-9")
-    learner.run(20)
-    assert learner.core.problem() == ""
-
-
-def test_samples_of_another_number_of_fans_are_not_learned_from(tmp_path: Path) -> None:
-    learner = Learner(tmp_path)
-    one = raw(0, moves=True)
-    two = replace(one, fans=2, command=np.tile(one.command, 2), speed_rad_s=np.tile(one.speed_rad_s, 2))
-    assert not learner.core.step(two)
-    assert learner.history.seconds == 0.0
-
-
-def test_that_samples_are_older_than_the_history_is_said_as_a_clock_that_was_set_back(tmp_path: Path) -> None:
-    learner = Learner(tmp_path)
-    learner.run(1000)
-    learner.now_s -= 100_000
-    learner.run(100)
-    assert "the samples are older: was the clock set back?" in learner.core.problem()
-    assert "\n" not in learner.core.problem()
-    learner.now_s += 100_000
-    learner.run(100)
-    assert learner.core.problem() == ""
-
-
-def test_what_was_learned_from_is_on_the_disk_every_ten_seconds(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    learner = Learner(tmp_path)
-    learner.run(100)
-    flushed: list[int] = []
-    monkeypatch.setattr(learner.history, "flush", lambda: flushed.append(1))
-    for second in range(1, 101):
-        learner.core.tick(START_NS + (learner.now_s + second) * NS_PER_S)
-    assert len(flushed) == 10

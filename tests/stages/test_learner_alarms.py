@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from fantwin.pipeline.learning.healthy_history import healthy_recordings
-from fantwin.schemas.enums import Action, FanState
-from fantwin.schemas.messages import NewTwin, Request
+from fantwin.schemas.enums import FanState
+from fantwin.schemas.messages import NewTwin
 from fantwin.schemas.units import NS_PER_S
 from fantwin.stages.learner import LearnerConfig
 from tests.support.one_learner import START_NS, Learner, restarted
@@ -27,19 +27,6 @@ def test_beside_an_alarm_nothing_is_learned_and_fans_are_checked_each_day(
     assert second_h - first_h == pytest.approx(2.0, abs=0.1)
     assert len(learner.learning.starts) == before
     assert all(each.span[1] < START_NS + 600 * NS_PER_S for each in healthy_recordings(tmp_path))
-
-
-def test_after_commissioning_the_fans_are_checked_as_soon_as_one_kind_of_running_is_enough(tmp_path: Path) -> None:
-    learner = Learner(tmp_path)
-    learner.run(600)
-    learner.run(100, state=FanState.ALARM)
-    for state in (FanState.NORMAL, FanState.ALARM):
-        learner.learning.checked_t_ns.clear()
-        began_t_ns = START_NS + learner.now_s * NS_PER_S
-        learner.core.step(Request(t_ns=began_t_ns, action=Action.COMMISSION))
-        learner.run(2 * 3600, state=state)
-        (checked_t_ns,) = learner.learning.checked_t_ns
-        assert 4000 < (checked_t_ns - began_t_ns) / NS_PER_S < 5000
 
 
 def test_a_version_waits_for_the_end_of_an_alarm_unless_an_operator_chose_it(tmp_path: Path) -> None:
@@ -128,30 +115,3 @@ def test_when_an_alarm_begins_its_time_is_listed(tmp_path: Path) -> None:
     listed = learner.versions.read().alarms_t_ns
     assert listed[-1] == START_NS + (1110 + kept_s) * NS_PER_S
     assert len(listed) == 3, "no recording of the time of the others has been deleted yet"
-
-
-def test_an_alarm_that_cannot_be_listed_is_a_problem_and_nothing_more(tmp_path: Path) -> None:
-    learner = Learner(tmp_path)
-    learner.run(600)
-    lock = tmp_path / "versions.json.lock"
-    lock.unlink()
-    lock.mkdir()
-    learner.run(20, state=FanState.ALARM)
-    assert "cannot write the versions of the twin" in learner.core.problem()
-    assert "\n" not in learner.core.problem()
-    lock.rmdir()
-    learner.run(20)
-    learner.run(20, state=FanState.ALARM)
-    assert learner.core.problem() == ""
-
-
-@pytest.mark.parametrize("state", [None, FanState.UNKNOWN])
-def test_samples_that_no_score_judged_are_not_learned_from(tmp_path: Path, state: FanState | None) -> None:
-    learner = Learner(tmp_path)
-    learner.run(600)
-    learner = restarted(learner)
-    seconds = learner.history.seconds
-    learner.run(1000, state=state)
-    assert learner.history.seconds == seconds
-    learner.run(300)
-    assert learner.history.seconds > seconds + 200.0

@@ -20,7 +20,7 @@ from fantwin.schemas.enums import Severity, Transition
 from fantwin.schemas.messages import Alarm
 from fantwin.schemas.units import NS_PER_S
 from fantwin.stages.notifier import NotifierCore
-from tests.support.message_receivers import ALERTMANAGER, HttpReceiver, MailServer, RunningAlertmanager
+from tests.support.message_receivers import ALERTMANAGER, MailServer, RunningAlertmanager
 from tests.support.notified_alarms import START_NS, alarm, cleared, notifier_core, secret
 from tests.support.running_chain import eventually
 
@@ -119,25 +119,6 @@ def test_a_target_that_hangs_holds_up_neither_the_core_nor_its_end(tmp_path, mai
     assert left == [(1,), (0,)], "it is sent again after a restart"
 
 
-def test_a_mail_whose_answer_does_not_come_is_sent_again_and_says_so_and_one_that_is_refused_does_not(
-    tmp_path, mail, started
-):
-    mail.hangs_up = True
-    notifier = started(tmp_path, [mail_target(tmp_path, mail)])
-    notifier.hear(alarm())
-    assert "Connection unexpectedly closed" in eventually(notifier.core.problem, "the server does not answer")
-    mail.hangs_up = False
-    eventually(lambda: notifier.core.counters()["messages_waiting"] == 0, "it is taken")
-    assert MAY_BE_REPEATED not in mail.mails[0][1]
-    assert all(MAY_BE_REPEATED in body for _, body in mail.mails[1:])
-    before, mail.refuses = len(mail.mails), True
-    notifier.hear(alarm(fan=5))
-    eventually(lambda: "552" in notifier.core.problem(), "the server refuses it")
-    mail.refuses = False
-    eventually(lambda: len(mail.mails) > before, "it is taken")
-    assert MAY_BE_REPEATED not in mail.mails[before][1]
-
-
 def test_a_mail_that_alone_is_refused_does_not_hold_up_the_next_ones(tmp_path, mail, started):
     mail.refused_subjects.add("WARNING, fan 1 of tray1 (hall)")
     notifier = started(tmp_path, [mail_target(tmp_path, mail)])
@@ -185,25 +166,6 @@ def test_what_another_output_kept_while_the_notifier_was_away_is_sent_and_forged
     assert mail.subjects() == [f"WARNING, fan {fan} of tray1 (hall)" for fan in (0, 1, 3)]
 
 
-def test_a_fan_that_is_taken_out_of_the_configuration_is_not_spoken_of_any_more(tmp_path, mail, started):
-    receiver = HttpReceiver()
-    alerts = {"name": "alerts", "kind": "alertmanager", "url": f"http://127.0.0.1:{receiver.port}"}
-    targets = [mail_target(tmp_path, mail) | {"repeat_s": 60}, alerts]
-    before = started(tmp_path, targets)
-    before.hear(alarm(fan=6), alarm(fan=1))
-    eventually(lambda: len(mail.mails) == 2 and len(receiver.received) > 0, "both are said")
-    before.core.close()
-    receiver.received.clear()
-    after = started(tmp_path, targets, fans=4)
-    after.wait(120)
-    eventually(lambda: len(mail.mails) >= 3, "the one that is there is sent again")
-    assert mail.subjects()[2:] == ["Still: WARNING, fan 1 of tray1 (hall)"]
-    eventually(lambda: receiver.received, "the alerts are sent")
-    ended = {each["labels"]["fan"]: each["endsAt"] for each in receiver.received[0]}
-    assert ended["6"] < ended["1"], "that of the other fan is over"
-    receiver.stop()
-
-
 @pytest.mark.skipif(ALERTMANAGER is None, reason="needs Debian's prometheus-alertmanager")
 def test_an_alertmanager_has_what_is_presented_and_no_more(tmp_path, started, monkeypatch):
     monkeypatch.setattr("fantwin.pipeline.outputs.notify.alertmanager.RESEND_S", 0.5)
@@ -245,22 +207,6 @@ def test_an_alertmanager_has_what_is_presented_and_no_more(tmp_path, started, mo
         eventually(has, "none is left")
     finally:
         manager.stop()
-
-
-def test_an_alertmanager_that_comes_late_gets_all(tmp_path, started, monkeypatch):
-    monkeypatch.setattr("fantwin.pipeline.outputs.notify.alertmanager.LONGEST_DELAY_S", 0.2)
-    receiver = HttpReceiver()
-    receiver.status = 503
-    url = f"http://ann:secret@127.0.0.1:{receiver.port}"
-    target = {"name": "prometheus", "kind": "alertmanager", "url_file": secret(tmp_path, "alerts", url)}
-    notifier = started(tmp_path, [target])
-    notifier.hear(*(alarm(fan=fan) for fan in range(4)))
-    problem = eventually(notifier.core.problem, "the outage is said")
-    assert "it answers 503" in problem and "secret" not in problem
-    receiver.status = 200
-    eventually(lambda: receiver.received, "it gets them")
-    assert [each["labels"]["fan"] for each in receiver.received[0]] == ["0", "1", "2", "3"]
-    receiver.stop()
 
 
 def test_secrets_that_others_read_and_urls_that_cannot_be_are_refused_without_showing_them(tmp_path, mail):

@@ -284,9 +284,6 @@ def test_every_message_is_on_the_disk_a_second_after_it_was_received_and_not_at_
         core.step(envelope(raw(tick), "raw", NOW_NS - 5 * SECOND_NS))
         core.tick(NOW_NS + tick * TICK_NS)
     assert disk.parts[0].flushes == 18
-    for second in range(13, 20):
-        core.tick(NOW_NS + second * SECOND_NS)
-    assert disk.parts[0].flushes == 18, "without messages there is nothing to flush"
 
 
 def test_after_a_clock_is_set_back_flushes_disk_checks_and_parts_continue(monkeypatch):
@@ -301,15 +298,6 @@ def test_after_a_clock_is_set_back_flushes_disk_checks_and_parts_continue(monkey
     core.step(envelope(raw(1), "raw", back_ns))
     core.tick(back_ns + SECOND_NS)
     assert sequences(disk.parts[0]) == [0, 1]
-    full = Disk()
-    full.free = 0
-    waits = recorder(full)
-    record(waits, [0])
-    assert waits.problem().startswith("NOTHING IS RECORDED")
-    full.free = 1 << 40
-    for second in range(4):
-        waits.tick(back_ns + second * SECOND_NS)
-    assert sequences(full.parts[0]) == [0], "what was held meanwhile is flushed in time too"
     disk.free = 0
     core.tick(back_ns + 2 * SECOND_NS)
     assert core.problem()
@@ -383,20 +371,6 @@ def test_a_pause_that_exceeds_memory_loses_the_oldest_messages_and_counts_them(m
     assert disk.parts[1].ledger.counts[RAW_KEY, "acquisition-1"].missing == 10
 
 
-def test_a_disk_that_refuses_the_last_chunk_is_counted_and_after_a_crash_the_file_says_no_orderly_end():
-    disk = Disk()
-    core = recorder(disk)
-    record(core, range(3))
-    core.abort()
-    assert (sequences(disk.parts[0]), disk.parts[0].closed) == ([0, 1, 2], "before the next")
-    core = recorder(disk)
-    record(core, range(3))
-    disk.refuses = True
-    core.close()
-    assert core.counters() == {"lost_unwritten": 3, "parts": 1, "pauses": 1}
-    assert core.problem()
-
-
 def test_a_recorder_that_is_refused_before_it_received_anything_leaves_no_file(tmp_path):
     STAGE.build(context(tmp_path)).core.abort()
     assert not list((tmp_path / "runs").iterdir())
@@ -458,45 +432,6 @@ def test_each_part_begins_with_the_last_card_of_each_twin(monkeypatch):
     assert second == [("ModelCard", 1), ("Raw", 1)]
     assert disk.parts[1].content[0].received_t_ns == disk.parts[1].t_ns
     assert (tray_key("plant", "tray1", "twin"), "twin_integrator-1") not in disk.parts[1].ledger.counts
-
-
-def test_after_a_kill_what_was_recorded_is_not_recorded_again_and_what_was_lost_is_in_the_ledger():
-    disk = Disk(before={(RAW_KEY, "acquisition-1"): 7, (RAW_KEY, "acquisition-2"): 7})
-    core = recorder(disk)
-    record(core, range(5, 10))
-    for number in (10, 11):
-        of_other = replace(raw(number), header=Header("acquisition-2", number, "tray1"))
-        core.step(envelope(of_other, "raw", NOW_NS))
-    core.close()
-    assert sequences(disk.parts[0]) == [7, 8, 9, 10, 11]
-    counts = disk.parts[0].ledger.counts
-    account = counts[RAW_KEY, "acquisition-1"]
-    assert (account.messages, account.missing, account.duplicated) == (3, 0, 2)
-    assert counts[RAW_KEY, "acquisition-2"].missing == 3
-
-
-def test_that_the_recording_of_a_killed_recorder_was_repaired_is_said_with_its_name(tmp_path, caplog):
-    run = context(tmp_path)
-    with RecordingWriter(run.run_folder / "recording.mcap", {}) as writer:
-        writer.add_message(RAW_KEY, raw(0), 1)
-    writer.path.rename(run.run_folder / "recording.mcap.active")
-    with caplog.at_level(logging.WARNING):
-        STAGE.build(run).core.close()
-    assert f"its recording was repaired and is {run.run_folder}/recording.mcap: 1 messages" in caplog.text
-    assert sorted(p.name for p in run.run_folder.iterdir()) == ["recording-2.mcap", "recording.mcap"]
-
-
-def test_messages_that_the_bus_repeated_are_in_the_ledger_of_their_part(monkeypatch):
-    monkeypatch.setattr(disk_room, "PART_S", 60.0)
-    disk = Disk()
-    core = recorder(disk)
-    for shown in (health_of("recorder-1", 0), health_of("recorder-2", 50), health_of("recorder-1", 4)):
-        core.step(envelope(shown, "health", NOW_NS))
-    core.tick(NOW_NS + 60 * SECOND_NS)
-    core.step(envelope(health_of("scorer-1", 70, stage="scorer"), "health", NOW_NS))
-    core.step(envelope(health_of("recorder-1", 7), "health", NOW_NS))
-    core.close()
-    assert [part.ledger.counts[RAW_KEY, "a"].duplicated for part in disk.parts] == [4, 3]
 
 
 SAMPLES = ("raw", "grid", "prediction", "score")
@@ -633,18 +568,6 @@ def test_a_recording_says_which_topics_were_left_out_on_purpose(tmp_path):
     assert missing == {RAW_KEY: 3}, "only what should have been recorded is missing"
     STAGE.build(context(tmp_path)).core.close()
     assert read_metadata(run.run_folder / "recording-2.mcap").left_out == ()
-
-
-def test_what_a_killed_recorder_of_another_version_left_is_kept_and_its_format_is_said(tmp_path, caplog):
-    STAGE.build(context(tmp_path)).core.close()
-    finished = tmp_path / "runs" / "recording.mcap"
-    of_tomorrow = finished.read_bytes().replace(b"format\x01\x00\x00\x002", b"format\x01\x00\x00\x003")
-    finished.rename(finished.with_name("recording.mcap.active")).write_bytes(of_tomorrow)
-    with caplog.at_level(logging.WARNING):
-        STAGE.build(context(tmp_path)).core.close()
-    assert (tmp_path / "runs" / "recording.mcap.original").read_bytes() == of_tomorrow
-    reason = "a recording of format 3; this fantwin reads format 2: update fantwin"
-    assert "cannot be repaired and was renamed to recording.mcap.original: " in caplog.text and reason in caplog.text
 
 
 def test_a_recorder_that_is_restarted_keeps_the_last_snapshots_of_its_trays_for_others(tmp_path):

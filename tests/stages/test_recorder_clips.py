@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +13,9 @@ from fantwin.pipeline.recordings.clips.cutting import ClipCutter
 from fantwin.pipeline.recordings.clips.tracker import ClipTracker, CutResult
 from fantwin.pipeline.recordings.indexed import PartIndex
 from fantwin.pipeline.recordings.parts import RecordingParts
-from fantwin.pipeline.recordings.reading import RecordingError, read_recording
+from fantwin.pipeline.recordings.reading import read_recording
 from fantwin.pipeline.recordings.recorder import Recorder
 from fantwin.pipeline.recordings.recorder_config import RecorderConfig
-from fantwin.pipeline.recordings.writing import RecordingWriter
 from fantwin.schemas.enums import Severity, Transition
 from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Alarm
@@ -172,70 +170,6 @@ def test_a_clip_outlives_the_limit_of_days_until_it_is_acknowledged_and_that_is_
     core.step(envelope(raised(0, NOW_NS, acknowledged=True, transition=Transition.ACKNOWLEDGED), "alarm", now_ns))
     core.tick(now_ns + 10 * SECOND_NS)
     assert not clips.tracker.clips and len(core.notes()) == 1
-
-
-def test_of_clips_that_cannot_be_deleted_none_is_forgotten_and_the_first_is_named(tmp_path):
-    names = ["1.mcap", "2.mcap"]
-    listed = [Clip(name, "tray1", 0, at, 0, (), is_due=False, size_bytes=100) for at, name in enumerate(names)]
-    clips = AlarmClips(ClipTracker(listed, 1, 1, most_bytes=100), tmp_path / "recording.mcap", Cutter().cut)
-    in_the_way = tmp_path / "clips" / names[0]
-    in_the_way.mkdir(parents=True)
-    clips.tick(NOW_NS, lambda: None)
-    assert clips.tracker.clips == listed and clips.problem().startswith(f"{in_the_way}: cannot be deleted: ")
-    with pytest.raises(RecordingError, match=r"1\.mcap: cannot be deleted"):
-        clips.delete(listed[0])
-    in_the_way.rmdir()
-    clips.tick(NOW_NS, lambda: None)
-    assert clips.tracker.clips == [] and clips.problem() == "" and clips.tracker.counts["clips_deleted"] == 2
-
-
-def test_files_that_a_killed_recorder_left_of_a_clip_are_removed_and_what_another_one_is_writing_stays(tmp_path):
-    recording, folder = tmp_path / "recording.mcap", tmp_path / "clips"
-    folder.mkdir()
-    (folder / ".unfinished-tray1-0.mcap.active").touch()
-    (folder / "tray1-0.mcap").touch()
-    with RecordingWriter(folder / ".unfinished-tray2-0.mcap", {}):
-        clips_of(recording)
-        assert sorted(path.name for path in folder.iterdir()) == [".unfinished-tray2-0.mcap.active", "tray1-0.mcap"]
-
-
-def test_while_a_clip_is_cut_the_recorder_makes_room_and_ends_and_the_list_says_what_is_due(tmp_path, monkeypatch):
-    is_cutting, may_go_on = threading.Event(), threading.Event()
-
-    def cut(clip: Clip, _open_part: PartIndex | None) -> CutResult:
-        is_cutting.set()
-        may_go_on.wait(60)
-        return CutResult(clip.name, 100)
-
-    monkeypatch.setattr("fantwin.pipeline.recordings.clips.alarm_clips.CLOSE_S", 0.0)
-    recording = tmp_path / "recording.mcap"
-    old = Clip("old.mcap", "tray1", 0, 1, 0, (), is_due=False)
-    slow = Clip("slow.mcap", "tray1", 0, 1, 0, ())
-    clips = AlarmClips(ClipTracker([old, slow], 60, 60, 0), recording, cut)
-    (tmp_path / "clips").mkdir()
-    (tmp_path / "clips" / old.name).touch()
-    clips.tick(NOW_NS, lambda: None)
-    assert is_cutting.wait(60)
-    clips.delete(old)
-    is_there = (tmp_path / "clips" / old.name).exists()
-    clips.close(lambda: None)
-    may_go_on.set()
-    assert not is_there and listed_clips(recording) == [slow]
-
-
-def test_the_list_that_the_disk_has_refused_is_written_once_it_can_be(tmp_path):
-    core, clips, _ = with_cutter(Disk(), tmp_path)
-    (tmp_path / "clips").touch()
-    for _ in range(2):  # a restarted recorder receives it again
-        core.step(envelope(raised(0, NOW_NS), "alarm", NOW_NS))
-    core.tick(NOW_NS + SECOND_NS)
-    assert "clips: cannot be written: " in core.problem()
-    (tmp_path / "clips").unlink()
-    core.tick(NOW_NS + 2 * SECOND_NS)
-    assert listed_clips(tmp_path / "recording.mcap") == []
-    core.tick(NOW_NS + 12 * SECOND_NS)
-    assert listed_clips(tmp_path / "recording.mcap") == clips.tracker.clips != []
-    assert core.problem() == ""
 
 
 def test_a_clip_is_not_cut_before_what_was_received_in_a_pause_is_on_the_disk(tmp_path):

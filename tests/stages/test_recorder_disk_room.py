@@ -46,33 +46,6 @@ def test_on_a_full_disk_the_oldest_parts_go_one_at_a_time_and_what_others_take_c
     assert disk.old_names == [], "there was room meanwhile: the oldest goes again"
 
 
-def test_clips_count_as_half_of_the_share_at_most_and_the_last_part_stays():
-    disk = Disk()
-    disk.disk, disk.freed_by_each = 1_000_000_000, 10_000_000  # 100 MB may be taken
-    disk.clips_bytes = 400_000_000  # of other shards, and of lists that were lost
-    disk.old = old_parts("a.mcap", "b.mcap", "c.mcap", "d.mcap")
-    core = recorder(disk)
-    assert disk.old_names == ["b.mcap", "c.mcap", "d.mcap"], "30 MB, 50 MB of clips, 12.5 MB for the open part"
-    usage, beyond = core.notes()
-    assert usage.startswith("recordings: 430 MB of 100 MB")
-    assert beyond.startswith("clips take 400 MB, more than 50% of 100 MB (recorder.keep_share_of_disk)")
-    disk.freed_by_each = 95_000_000
-    core.tick(NOW_NS + 10 * SECOND_NS)
-    assert disk.old_names == ["d.mcap"]
-    assert "nothing may be deleted, the last finished part included" in core.notes()[1]
-
-
-@pytest.mark.parametrize("limits", [{"keep_days": 1e-6}, {"keep_share_of_disk": 1e-6}, {}])
-def test_limits_that_leave_room_for_no_part_begin_none_at_every_tick(limits, monkeypatch):
-    monkeypatch.setattr("fantwin.pipeline.recordings.disk_room.PART_BYTES", 1_000_000)
-    disk = Disk()
-    disk.disk, disk.attached_bytes = 1_000_000_000, 5_000_000
-    core = recorder(disk, **limits)
-    for tick in range(41):
-        core.tick(NOW_NS + tick * SECOND_NS // 20)
-    assert [(part.t_ns - NOW_NS) / SECOND_NS for part in disk.parts] == ([0, 1, 2] if "keep_days" in limits else [0])
-
-
 def test_a_clock_that_is_years_ahead_costs_a_part_an_hour_and_never_the_last():
     disk, hours = Disk(), [0.0]
     disk.old = ten_days_of_parts()

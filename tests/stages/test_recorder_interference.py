@@ -67,19 +67,6 @@ def test_row_03_a_recording_deleted_while_running_is_reported_and_recorded_again
     assert not run.active.exists()
 
 
-def test_row_03_a_restored_file_is_reported_for_a_minute_and_restored_also_at_the_end(tmp_path):
-    run = Run(tmp_path)
-    run.seconds(3)
-    run.active.unlink()
-    run.seconds(59)
-    assert run.core.problem()
-    run.seconds(5)
-    assert run.core.problem() == ""
-    run.active.unlink()
-    run.core.close()
-    assert run.recorded() == list(range(670))
-
-
 def test_row_03_the_file_that_replaced_a_recording_is_left_alone(tmp_path, monkeypatch):
     monkeypatch.setattr("fantwin.pipeline.recordings.disk_room.PART_S", 5.0)
     run = Run(tmp_path)

@@ -318,21 +318,6 @@ def test_samples_of_a_replay_that_goes_back_are_counted_and_reported_until_it_ha
     assert core.problem() == ""
 
 
-def test_messages_repeated_or_late_from_an_ended_session_are_no_clock_set_back_and_no_loss() -> None:
-    message = raw(at(0.0, 0.01), np.zeros(2))
-    core = ResamplerCore(1, FIXED)
-    for producer, sequence, by_s in (("a", 0, 0.0), ("a", 2, 5.0), ("a", 0, 0.0), ("b", 0, 5.5), ("a", 3, 5.2)):
-        core.step(stamped(moved(message, by_s), producer, sequence))
-    assert core.problem() == ""
-    assert core.counters()["out_of_order"] == 4
-    assert "lost_clock_set_back" not in core.counters()
-    core = ResamplerCore(1, FIXED)
-    for producer, sequence, by_s, first in (("a", 0, 0, 0), ("b", 0, 0.9, 10), ("a", 1, 0.1, 2), ("b", 1, 1, 12)):
-        numbered = replace(moved(message, by_s), device_sequence=np.array([first, first + 1], np.uint32))
-        core.step(stamped(numbered, producer, sequence))
-    assert core.counters()["lost_between_sessions"] == 8
-
-
 def test_health_says_when_messages_state_another_tacho_than_the_configuration() -> None:
     average = Tacho(kind="average", window_s=1.0, step_rad_s=0.1)
     core = ResamplerCore(2, ResamplerConfig(rate_hz=10.0), tachos=[average])

@@ -139,14 +139,6 @@ def test_a_restarted_resampler_comes_to_the_same_rate_wherever_it_begins() -> No
         assert periods == {NS_PER_S // grid_rate_hz(line_hz)}, line_hz
 
 
-def test_a_line_without_a_period_gets_the_rate_at_which_samples_arrive() -> None:
-    by_chance = np.cumsum(np.random.default_rng(7).exponential(0.1, 300))
-    read_together = (np.floor(times(line_hz, 5) / 0.04) * 0.04 for line_hz in (64, 100))  # every 40 ms
-    for line_s, grid_hz in zip((by_chance, *read_together), (10, 50, 100), strict=True):
-        grid, _ = grid_of(samples(line_s, clock=False))
-        assert grid.period_ns == NS_PER_S // grid_hz
-
-
 def test_lost_samples_and_pauses_while_it_is_measured_do_not_change_the_rate() -> None:
     rng = np.random.default_rng(4)
     for line_hz, seconds in ((1, 60), (10, 20), (100, 10)):

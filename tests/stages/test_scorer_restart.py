@@ -22,7 +22,6 @@ from fantwin.schemas.messages import Alarm, Score, ScorerSnapshot
 from fantwin.schemas.units import NS_PER_S
 from fantwin.scoring.alarms.alarm_flags import is_listed, is_retained, is_silenced
 from fantwin.scoring.alarms.current_alarms import CurrentAlarm
-from fantwin.scoring.model.decision import Decision
 from fantwin.stages.scorer import ScorerCore
 from tests.stages.test_scorer import eventful_prediction
 from tests.support.scored_blocks import (
@@ -70,29 +69,6 @@ def test_after_a_kill_the_samples_that_producers_still_keep_are_scored(tmp_path:
         np.testing.assert_allclose(column, expected[name], rtol=1e-9, atol=1e-9, err_msg=name)
     later = [(each.t_ns, each.fan, each.transition) for each in alarms if each.t_ns > kept.t_ns]
     assert [(each.t_ns, each.fan, each.transition) for each in again] == later
-
-
-def test_a_block_on_which_the_scorer_crashed_is_judged_after_the_restart(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    blocks = [cut(eventful_prediction(3, 100, 0.0), k, k + 10) for k in range(0, 100, 10)]
-    store = SnapshotStore(tmp_path / "scorer.snapshot")
-    crashed = core_of(3, snapshot_store=store)
-
-    def crash(*_: Any) -> None:
-        raise ZeroDivisionError
-
-    with np.errstate(all="ignore"):
-        feed(crashed, blocks[:-1])
-        store.save(snapshot_of(crashed))
-        with monkeypatch.context() as patch:
-            patch.setattr(Decision, "take", crash)
-            with pytest.raises(ZeroDivisionError):
-                crashed.step(blocks[-1])
-        crashed.abort()
-        successor = core_of(3, snapshot_store=store)
-        scores, _ = feed(successor, blocks[-1:])
-    assert [score.t_ns.tolist() for score in scores] == [blocks[-1].t_ns.tolist()]
 
 
 def test_every_alarm_and_answer_is_in_the_file_and_in_a_published_snapshot_before_it_is_emitted(tmp_path: Path) -> None:

@@ -15,7 +15,6 @@ import pytest
 from fantwin.pipeline.config.models import TrayConfig
 from fantwin.pipeline.outputs.rerun.alarm_log import LogLine
 from fantwin.pipeline.outputs.rerun.viewer_core import (
-    FLUSH_PERIOD_NS,
     REPEAT_STATES_NS,
     SAMPLES_HELD,
     ViewerCore,
@@ -25,14 +24,13 @@ from fantwin.pipeline.runtime.stage import Context, Core, StageError
 from fantwin.pipeline.site.fleet import Fan
 from fantwin.pipeline.site.trace import Trace
 from fantwin.schemas.codec import encode
-from fantwin.schemas.enums import FanState, InvalidReason
 from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.messages import Message, Score
 from fantwin.schemas.topics import tray_key
 from fantwin.schemas.units import RAD_S_PER_UNIT
 from fantwin.stages.viewer import ViewerConfig, build, check
 from tests.support.ports import free_port
-from tests.support.score_data import SIGMA, START_NS, STEP_NS, made_up_tray
+from tests.support.score_data import SIGMA, START_NS, made_up_tray
 
 LATER_NS = START_NS + 400 * 86_400 * 1_000_000_000  # the host's time while what was recorded at START_NS is replayed
 
@@ -138,19 +136,6 @@ def test_a_lane_follows_the_states_to_the_sample_and_repeats_a_steady_one_for_vi
     assert (np.diff(times)[1:] * 1e9 >= REPEAT_STATES_NS).all()
 
 
-def test_a_change_of_reason_is_a_change_of_state_and_what_is_not_known_is_shown_with_its_number() -> None:
-    sink = FakeSink()
-    (score,), _ = made_up_tray(seconds=0.1, fans=1, faulty_fan=None, gap_fan=None)
-    unknown, newer = FanState.UNKNOWN, max(InvalidReason) + 1
-    state = np.array([[unknown]] * 4 + [[FanState.NORMAL]] * 3 + [[99]] * 3, np.uint8)
-    reason = np.array([[InvalidReason.WARMING_UP]] * 2 + [[newer]] * 2 + [[InvalidReason.NONE]] * 6, np.uint8)
-    core = core_of(sink, fans=1)
-    core.step(sent(changed(score, state=state, invalid_reason=reason, valid=reason == 0)))
-    core.close()
-    unknowns = [(0, "unknown: warming up"), (0.02, f"unknown: unknown ({newer})")]
-    assert sink.lane(0) == [*unknowns, (0.04, "normal"), (0.07, "unknown (99)")]
-
-
 def test_the_file_holds_every_sample_with_its_unit_its_states_and_its_alarms(tmp_path: Path) -> None:
     scores, alarms = made_up_tray(seconds=20)
     half = len(scores) // 2
@@ -182,55 +167,6 @@ def test_the_file_holds_every_sample_with_its_unit_its_states_and_its_alarms(tmp
     known = [value for value in shown if np.isfinite(value)]
     np.testing.assert_allclose(known, np.concatenate(volts[half:])[:, 1], err_msg="from its first sample on")
     assert not any("temperature_c" in path for path in rows)
-
-
-def test_a_replay_of_an_old_recording_has_no_data_at_the_host_time(tmp_path: Path) -> None:
-    scores, alarms = made_up_tray(seconds=2)
-    core = build(context(tmp_path)).core
-    for number, item in enumerate((*scores, *alarms)):
-        core.step(sent(item))
-        core.tick(LATER_NS + number * FLUSH_PERIOD_NS)
-    core.close()
-    rows = rows_of(tmp_path / "view.rrd")
-    times = [t_ns for entity in rows.values() for t_ns, _ in entity]
-    assert min(times) == int(scores[0].t_ns[0])
-    assert max(times) == max(int(scores[-1].t_ns[-1]), *(alarm.t_ns for alarm in alarms))
-
-
-def test_in_an_alarm_the_area_between_twin_and_measured_speed_is_red_also_over_the_end_of_a_flush(
-    tmp_path: Path,
-) -> None:
-    scores, _ = made_up_tray(seconds=8, fault_s=(2.0, 5.0))
-    core = build(context(tmp_path)).core
-    play(core, scores)
-    core.close()
-    rows = rows_of(tmp_path / "view.rrd")
-    area = rows["/tray1/fan_2/deviation"]
-    drawn = dict(rows["/tray1/fan_2/speed"])
-    red = [(t, row) for t, row in area if np.isfinite(row["Measurements:values"]).all()]
-    assert [(t - START_NS) / 1e9 for t, _ in (red[0], red[-1])] == [2.5, 5.5 - STEP_NS / 1e9]
-    assert np.isnan(area[-1][1]["Measurements:values"]).all()
-    for t, row in red:
-        (middle,), (variance,) = row["Measurements:values"], row["Measurements:variances"]
-        measured, predicted, *_ = drawn[t]["Measurements:values"]
-        ends = middle - np.sqrt(variance), middle + np.sqrt(variance)
-        assert ends == pytest.approx(sorted((measured, predicted)))
-    assert "/tray1/fan_0/deviation" not in rows
-
-
-def test_samples_without_a_score_are_drawn_apart_in_grey(tmp_path: Path) -> None:
-    (score,), _ = made_up_tray(seconds=0.2, fans=1, block=20, faulty_fan=None, gap_fan=None)
-    valid = np.ones((20, 1), bool)
-    valid[5:10] = False
-    core = build(context(tmp_path, fans=1)).core
-    core.step(sent(changed(score, valid=valid)))
-    core.close()
-    rows = rows_of(tmp_path / "view.rrd")
-    scored = np.array([row["Measurements:values"][0] for _, row in rows["/tray1/fan_0/speed"]])
-    grey = np.array([row["Scalars:scalars"][0] for _, row in rows["/tray1/fan_0/not_scored"]])
-    assert np.isfinite(scored).tolist() == valid[:, 0].tolist()
-    np.testing.assert_array_equal(grey[5:10], score.measured_speed_rad_s[5:10, 0])
-    assert np.isnan(np.delete(grey, np.arange(5, 10))).all()
 
 
 def test_an_existing_view_is_not_overwritten_and_a_file_that_cannot_be_written_is_a_one_line_error(
@@ -286,10 +222,6 @@ def context(folder: Path, *, fans: int = 3, speed_unit: Any = "rad/s", serve: bo
         run_folder=folder,
         started_t_ns=START_NS,
     )
-
-
-def changed(score: Score, **columns: Any) -> Score:
-    return Score(**{**vars(score), **columns})
 
 
 def chunks_of(path: Path) -> list[Any]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +13,7 @@ from fantwin.pipeline.config.models import TrayConfig
 from fantwin.pipeline.outputs.rerun.fleet_view import FleetView
 from fantwin.pipeline.outputs.rerun.viewer_core import FLUSH_PERIOD_NS, ViewerCore
 from fantwin.pipeline.runtime.stage import Context, StageError
-from fantwin.pipeline.site.fleet import SILENT, Fan
-from fantwin.pipeline.site.site_model import SILENT_AFTER_S
+from fantwin.pipeline.site.fleet import Fan
 from fantwin.schemas.messages import Alarm, Score
 from fantwin.stages.viewer import ViewerConfig, build, check, topics_read
 from tests.stages.test_viewer import FakeSink, rows_of, sent, styles_of
@@ -84,51 +82,11 @@ def rows(score: Score) -> list[tuple[int, float]]:
     return list(zip(score.t_ns.tolist(), score.measured_speed_rad_s[:, 2].tolist(), strict=True))
 
 
-def test_a_plot_that_begins_again_repeats_no_sample_and_has_a_hole_where_it_was_not_drawn() -> None:
-    sink = FakeSink()
-    core = fleet_core(sink, hold_s=0)
-    first, second = (messages_of(seconds=16, fault_s=fault_s) for fault_s in ((2.0, 3.0), (13.0, 14.0)))
-    middle_ns = START_NS + 6_000_000_000
-    play(core, [m for m in first if last_t_ns(m) < middle_ns] + [m for m in second if last_t_ns(m) >= middle_ns])
-    t_ns, measured = drawn(sink, Fan("tray2", 2))
-    assert len(sink.shown) == 4 and (np.diff(t_ns) > 0).all()
-    (hole,) = np.flatnonzero(np.isnan(measured))
-    assert t_ns[hole] == t_ns[hole - 1] + 1_000_000_000 and t_ns[hole + 1] >= START_NS + 9_000_000_000
-
-
-def test_fans_asked_for_are_drawn_from_the_first_sample_on() -> None:
-    sink = FakeSink()
-    core = fleet_core(sink, show=(Fan("tray3", 1), Fan("tray3", 0)), for_alarms=0)
-    play(core, messages_of(seconds=5))
-    core.close()
-    assert sink.shown == [(Fan("tray3", 1), Fan("tray3", 0))]
-    assert {(trace.tray, *trace.fan_numbers) for trace in sink.traces} == {("tray3", 0, 1)}
-    t_ns, _ = drawn(sink, Fan("tray3", 1))
-    assert len(t_ns) == 500 and (np.diff(t_ns) == STEP_NS).all()
-
-
 def test_a_tray_that_sends_no_more_becomes_silent_and_its_alarm_gives_up_its_plot() -> None:
     sink = FakeSink()
     core = fleet_core(sink)
     play(core, [m for m in messages_of() if m.header.tray != "tray2" or last_t_ns(m) < START_NS + 10_000_000_000])
     assert sink.shown == [(Fan("tray2", 2),), ()]
-
-
-def test_the_lane_of_a_silent_fan_says_so_until_it_is_heard_again() -> None:
-    sink = FakeSink()
-    core = fleet_core(sink, show=(Fan("tray2", 0),))
-    gap_s = 3.0, 3.0 + SILENT_AFTER_S + 2.0
-
-    def is_lost(message: Score | Alarm) -> bool:
-        return message.header.tray == "tray2" and gap_s[0] <= (last_t_ns(message) - START_NS) / 1e9 < gap_s[1]
-
-    play(core, [message for message in messages_of(seconds=12) if not is_lost(message)])
-    lane = [(round(at_s, 2), name) for at_s, name in sink.lane(0)]
-    assert [next(group) for _, group in groupby(lane, key=lambda pair: pair[1])] == [
-        (0.0, "normal"),
-        (2.99, SILENT),
-        (10.0, "normal"),
-    ]
 
 
 @pytest.mark.parametrize("is_fleet", [False, True], ids=["few fans", "fleet"])
