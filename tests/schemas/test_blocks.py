@@ -12,7 +12,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fantwin.schemas.blocks import can_join, cut, join, select
-from fantwin.schemas.codec import decode, encode
 from fantwin.schemas.fields import columns
 from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Command, Grid, Message, Prediction, Raw, Score
@@ -70,12 +69,6 @@ def test_a_cut_message_is_joined_to_the_same_message(message: Any, marks: list[i
     assert equal(join(parts), message)
 
 
-@given(MESSAGES)
-def test_a_cut_message_goes_through_the_codec(message: Any) -> None:
-    half = cut(message, 0, len(times(message)) // 2)
-    assert equal(decode(type(half), encode(half)), half)
-
-
 def test_samples_are_joined_in_the_order_given_under_the_first_header() -> None:
     first, second = replace(grid(2), header=Header("p", 7, "t")), replace(grid(3), header=Header("p", 8, "t"))
     joined = join([second, first])
@@ -103,10 +96,6 @@ def test_messages_that_differ_in_more_than_their_samples_are_not_joined(one: Any
     assert not can_join(one, other)
     with pytest.raises(ValueError, match="message 1"):
         join([one, other])
-
-
-def test_predictions_of_one_twin_are_joined_although_each_has_its_own_sigma() -> None:
-    assert join([prediction(), prediction()]).sigma_rad_s.tolist() == [1.0]
 
 
 def test_samples_of_a_message_are_selected() -> None:

@@ -52,11 +52,6 @@ def test_it_is_linear_between_its_points_and_constant_beyond(speed_rad_s, comman
     assert TABLE.std_at(np.array([speed_rad_s]), np.array([command])) == pytest.approx(std_rad_s)
 
 
-def test_it_knows_nothing_of_an_unknown_speed() -> None:
-    found = TABLE.std_at(np.array([[np.nan, 50.0], [50.0, 50.0]]), np.array([[0.5, np.nan], [0.5, 0.5]]))
-    np.testing.assert_array_equal(np.isnan(found), [[True, True], [False, False]])
-
-
 def test_only_what_training_has_not_shown_is_unseen() -> None:
     table, speeds_rad_s, command = (
         replace(TABLE, seen_std_rad_s=(3.0,)),
@@ -76,10 +71,3 @@ def test_each_fan_has_its_own_around_the_speeds_at_which_it_settles() -> None:
     )
     np.testing.assert_allclose(OF_FANS.of_fans([1]).std_at(speed_rad_s[:, 1:], command[:, 1:]), expected[:, 1:])
     assert TABLE.of_fans([0, 0, 0]).std_at(np.zeros((1, 3)), np.ones((1, 3))).shape == (1, 3), "one holds for any fan"
-
-
-def test_of_one_fan_all_may_be_seen_and_of_another_not() -> None:
-    table = replace(OF_FANS, seen_std_rad_s=(10.0, 0.0))
-    found = table.unseen_std_at(np.array([[0.3, 15.0]]), np.full((1, 2), 150.0))
-    np.testing.assert_allclose(found, [[0.0, 8.0]])
-    np.testing.assert_allclose(table.over(np.array([0.3, 0.8]), np.array([150.0]))[:, 0], [4.0, 5.5])

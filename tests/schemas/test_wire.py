@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 import re
 import struct
@@ -86,27 +85,6 @@ def test_commands_and_set_points_come_back_fan_by_fan_in_text(data: list[float])
         assert repr(merged) == repr(data)
 
 
-@pytest.mark.parametrize("protocol", PROTOCOLS)
-@given(sample=samples(fans=2), cuts=st.lists(st.integers(0, 400), max_size=20))
-def test_how_the_stream_is_cut_makes_no_difference(protocol: Protocol, sample: Sample, cuts: list[int]) -> None:
-    good = encode(protocol, sample)
-    stream = b"fragment" + good + good + b"\xffnoise" + good + good[:9] + good + b"S 1 2\n\0\0#x\n" + good
-    whole = Decoder(protocol, 2).feed(stream)
-    decoder = Decoder(protocol, 2)
-    edges = [0, *sorted(min(cut, len(stream)) for cut in cuts), len(stream)]
-    pieces = [item for a, b in itertools.pairwise(edges) for item in decoder.feed(stream[a:b])]
-    assert [repr(item) for item in pieces] == [repr(item) for item in whole]
-
-
-@pytest.mark.parametrize("protocol", PROTOCOLS)
-def test_byte_by_byte_gives_the_same_even_where_a_piece_is_too_long(protocol: Protocol) -> None:
-    stream = encode(protocol, SAMPLE) + b"x" * 3 * MAX_FRAME_BYTES + encode(protocol, SAMPLE) * 2
-    whole = Decoder(protocol, 2).feed(stream)
-    decoder = Decoder(protocol, 2)
-    assert [item for byte in stream for item in decoder.feed(bytes([byte]))] == whole
-    assert whole == [SAMPLE, Fault(FaultKind.OVERSIZED, "more than 5120 bytes without an end"), SAMPLE, SAMPLE]
-
-
 @given(uptime_s=UINT32, counts=st.lists(st.integers(0, 65535), max_size=len(DEVICE_COUNTERS)).map(tuple))
 def test_what_a_device_has_counted_comes_back_for_the_host_whatever_its_fans(
     uptime_s: int, counts: tuple[int, ...]
@@ -114,41 +92,6 @@ def test_what_a_device_has_counted_comes_back_for_the_host_whatever_its_fans(
     frame = DeviceCounters(uptime_s, counts)
     assert joined("binary", fans=3).feed(encode("binary", frame)) == [frame]
     assert faults(joined("binary", end="device").feed(encode("binary", frame))) == [FaultKind.WRONG_TYPE]
-
-
-def test_of_more_counters_than_are_known_the_known_ones_are_taken() -> None:
-    payload = struct.pack("<BBIB20H", 1, 5, 9, 20, *range(20))
-    assert joined("binary").feed(framed(payload)) == [DeviceCounters(9, tuple(range(len(DEVICE_COUNTERS))))]
-
-
-@pytest.mark.parametrize(
-    ("protocol", "frame"),
-    [
-        ("text", DeviceCounters(1, (0,))),
-        ("binary", DeviceCounters(1, (65536,))),
-        ("binary", DeviceCounters(1, (0,) * (len(DEVICE_COUNTERS) + 1))),
-        ("binary", DeviceCounters(2**32, (0,))),
-    ],
-)
-def test_counters_that_no_frame_can_carry_are_refused(protocol: Protocol, frame: DeviceCounters) -> None:
-    with pytest.raises(ValueError, match=r"device counters|does not fit 32 bits"):
-        encode(protocol, frame)
-
-
-@pytest.mark.parametrize("protocol", PROTOCOLS)
-@pytest.mark.parametrize("end", ["host", "device"])
-@given(data=st.lists(st.binary(max_size=300), max_size=10))
-def test_no_bytes_make_it_raise(protocol: Protocol, end: str, data: list[bytes]) -> None:
-    decoder = joined(protocol, end=end)
-    for piece in data:
-        decoder.feed(piece)
-
-
-@pytest.mark.parametrize("protocol", PROTOCOLS)
-def test_joining_in_the_middle_of_a_frame_is_not_a_fault(protocol: Protocol) -> None:
-    frame = encode(protocol, SAMPLE)
-    for cut in range(3, len(frame) - 1):
-        assert faults(Decoder(protocol, 2).feed(frame[cut:] + frame)) == [FaultKind.RESYNC], cut
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
@@ -253,11 +196,6 @@ def test_the_checksum_finds_every_flipped_bit(position: int) -> None:
 def test_text_lines_as_printed_by_arduino_sketches_are_read(line: bytes, expected: Sample) -> None:
     (found,) = joined("text").feed(line)
     assert same(found, expected)
-
-
-def test_comments_and_empty_lines_are_nothing() -> None:
-    assert joined("text").feed(b"# fan tray, S 1 2 0.5 1 1 1\n\r\n   \n\n") == []
-    assert joined("binary").feed(b"\0\0\0") == []
 
 
 def test_a_person_can_type_commands() -> None:

@@ -46,15 +46,6 @@ def test_a_braking_fault_slows_only_its_fan_and_only_while_it_is_active(fault: s
     assert abs(lag[-1]) < 0.2 * lag[800]  # it recovers after the fault
 
 
-def test_an_opened_inlet_and_a_raised_supply_speed_the_fan_up() -> None:
-    assert speeds("inlet:fan=0,size=0.7")[-1, 0] > speeds()[-1, 0] + 20.0
-    assert speeds("supply:fan=0,size=1.1")[-1, 0] > speeds()[-1, 0] + 20.0
-
-
-def test_a_brake_does_not_drive_a_standing_fan_backwards() -> None:
-    assert np.all(speeds("rotor:fan=0,size=20", duty=0.5)[:, 0] == 0.0)
-
-
 def test_wear_grows_slowly_from_nothing() -> None:
     fault = parse_fault("wear:fan=1,start=10,stop=30,size=0.8")
     assert [round(fault.size_at(t), 6) for t in (10.0, 15.0, 20.0, 30.0)] == [0.0, 0.2, 0.4, 0.8]
@@ -142,7 +133,3 @@ def test_a_wrong_fault_is_a_one_line_error_that_names_the_part(text: str, messag
 def test_a_fault_that_does_not_fit_the_tray_is_refused(text: str, message: str) -> None:
     with pytest.raises(SimulationError, match=message):
         check_schedule([parse_fault(text)], fans=2, duration_s=10.0)
-
-
-def test_a_dropping_tacho_without_a_size_gives_no_reading_at_all() -> None:
-    assert np.isnan(speeds("tacho-dropout:fan=0,start=2")[200:, 0]).all()

@@ -166,15 +166,6 @@ def test_a_tray_shows_a_blocked_rotor_no_power_and_a_loose_wire_of_their_fans_al
     assert speed[500:, :2] == pytest.approx(healthy[500:, :2], rel=0.06)
 
 
-def test_the_readings_of_a_rack_do_not_depend_on_how_often_they_are_reported() -> None:
-    steady = replace(RACK, jitter_us=0.0, duration_s=25.0, tacho=TachoSettings((Tacho(kind="count", window_s=1.0),)))
-    _, ten = samples(steady, duty=0.5)
-    _, hundred = samples(replace(steady, rate_hz=100.0), duty=0.5)
-    resolution = steady.tacho.measurement[0].resolution_rad_s
-    # the wandering is drawn step by step, so the courses differ by that alone
-    assert np.abs(ten[100:] - hundred[1000::10][: len(ten) - 100]).max() < 3 * resolution
-
-
 def test_a_thermostat_stops_starts_and_moves_in_steps_of_its_register() -> None:
     profile = Thermostat(4, seed=2, low=0.1, high=0.95, period_s=4 * 3600.0)
     duty = np.array([profile.command(float(k)) for k in range(4 * 3600)])

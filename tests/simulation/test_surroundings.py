@@ -49,23 +49,6 @@ def test_warm_air_drags_less_and_a_fault_of_the_supply_shows_in_its_voltage() ->
     np.testing.assert_allclose(last(sagging).auxiliary["supply_voltage_v"], [12.0, 9.6], atol=0.2)
 
 
-def test_more_drag_takes_more_current_and_a_weak_supply_less() -> None:
-    measured = replace(STILL, surroundings=Surroundings(measured=ALL))
-    healthy, drag, supply = (
-        last(replace(measured, faults=faults)).auxiliary["current_a"][1]
-        for faults in ((), (Fault("inlet", 1, 0.0, size=1.6),), (Fault("supply", 1, 0.0, size=0.8),))
-    )
-    assert drag > healthy + 0.05
-    assert supply < healthy - 0.05
-
-
-def test_the_supply_wanders_as_much_as_it_is_set_to() -> None:
-    settings = replace(STILL, duration_s=60.0, rate_hz=5.0, surroundings=Surroundings(0.05, 1.0, measured=ALL))
-    volts = np.array([sample.auxiliary["supply_voltage_v"][0] for sample in samples(settings)])
-    assert volts.std() == pytest.approx(0.6, rel=0.3)
-    assert volts.mean() == pytest.approx(12.0, rel=0.03)
-
-
 FOUR_PIN = replace(STILL, fan="4-pin", surroundings=Surroundings(measured=("supply_voltage_v", "temperature_c")))
 
 
