@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from fantwin.pipeline.errors import refusals
 from fantwin.pipeline.prediction.new_samples import BEGINNING_NS, NewSamples
 from fantwin.pipeline.prediction.tray_twin import TrayTwin, load_tray_twin, twin_path
 from fantwin.pipeline.runtime.stage import Admitted, BuiltStage, Context, Core, Stage, StageError, never
@@ -378,14 +379,9 @@ def check(context: Context) -> list[str]:
     """Why the scorer cannot run; the twin integrator reports a twin that cannot be loaded."""
     if context.tray.twin is None:
         return []
-    try:
+    with suppress(StageError):
         twin = load_tray_twin(twin_path(context.tray, context.folder), context.tray.fans)
-    except StageError:
-        return []
-    try:
-        healthy_twin(context, twin)
-    except StageError as error:
-        return [str(error)]
+        return refusals(lambda: healthy_twin(context, twin))
     return []
 
 

@@ -31,12 +31,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+from fantwin.pipeline.errors import refusals
 from fantwin.pipeline.prediction.joint_tray_integrator import JointTrayIntegrator
 from fantwin.pipeline.prediction.learned_integrator import LearnedTwinIntegrator
 from fantwin.pipeline.prediction.new_samples import NewSamples
 from fantwin.pipeline.prediction.tray_integrator import TrayIntegrator, TwinIntegratorConfig
 from fantwin.pipeline.prediction.twin_file import TwinFile, load_twin
-from fantwin.pipeline.runtime.stage import Admitted, BuiltStage, Context, Core, Stage, StageError
+from fantwin.pipeline.runtime.stage import Admitted, BuiltStage, Context, Core, Stage
 from fantwin.schemas.messages import Grid, Message, ModelCard, NewTwin, Prediction
 from fantwin.schemas.units import NS_PER_S
 
@@ -162,13 +163,7 @@ def build(context: Context) -> BuiltStage:
 
 def check(context: Context) -> list[str]:
     """Problems that would keep the twin from being loaded."""
-    if context.tray.twin is None:
-        return []
-    try:
-        load_twin(context)
-    except StageError as error:
-        return [str(error)]
-    return []
+    return [] if context.tray.twin is None else refusals(lambda: load_twin(context))
 
 
 STAGE = Stage(

@@ -14,12 +14,14 @@ It may drop messages: the runner keeps a bounded queue in front of it and counts
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
 from pydantic import Field
 
 from fantwin.pipeline.config.models import TrayConfig, nearest
+from fantwin.pipeline.errors import refusals
 from fantwin.pipeline.extras import missing_extra, require
 from fantwin.pipeline.runtime.stage import BuiltStage, Context, Stage, StageConfig, StageError
 from fantwin.pipeline.site.fleet import Fan
@@ -131,16 +133,9 @@ def check(context: Context) -> list[str]:
     problems = list(filter(None, [missing_extra("stage viewer", "view", "rerun")]))
     if not (config.file or config.serve):
         problems.append("viewer.serve = false and no viewer.file: nothing would be shown; set one of them")
-    try:
-        shown_fans(config.show, context.trays)
-    except StageError as error:
-        problems.append(str(error))
-    for key, port in ({} if context.is_running else _ports(context)).items():
-        try:
-            check_free(port, f"viewer.{key}", "viewer.serve = false")
-        except StageError as error:
-            problems.append(str(error))
-    return problems
+    ports = {} if context.is_running else _ports(context)
+    attempts = [partial(check_free, port, f"viewer.{key}", "viewer.serve = false") for key, port in ports.items()]
+    return [*problems, *refusals(partial(shown_fans, config.show, context.trays), *attempts)]
 
 
 def topics_read(_config: ViewerConfig, trays: Sequence[TrayConfig]) -> tuple[str, ...]:

@@ -18,7 +18,7 @@ from fantwin.pipeline.prediction.twin_file import TwinFile
 from fantwin.pipeline.runtime.stage import StageError
 from fantwin.schemas.twin_card import CARD_PROPERTY
 from fantwin.twin.models.physical import PhysicalModel
-from tests.support.twin_files import PARAMETERS, SIGMA_COMMAND, SIGMA_RAD_S, made_up_balance, small_hybrid, write_twin
+from tests.support.twin_files import PARAMETERS, SIGMA_COMMAND, SIGMA_RAD_S, made_up_balance, write_twin
 from tests.twin.models.test_models import random_narx
 
 
@@ -50,17 +50,6 @@ def test_each_fan_runs_with_its_own_parameters_and_lag(tmp_path: Path) -> None:
     speed, state = twin.advance(start, command, step_s)
     np.testing.assert_allclose(speed, expected, rtol=1e-12)
     np.testing.assert_allclose(state, last, rtol=1e-12)
-
-
-def test_a_twin_of_one_fan_serves_every_fan_of_the_tray(tmp_path: Path) -> None:
-    path = write_twin(tmp_path / "twin.onnx", small_hybrid())
-    command, step_s = np.full((50, 1), 40.0), np.full(50, 0.01)
-    one, five = TwinFile.load(path, 1), TwinFile.load(path, 5)
-    speed, _ = one.advance(one.initial_state(np.zeros(1), command[0]), command, step_s)
-    commands = np.repeat(command, 5, axis=1)
-    speeds, _ = five.advance(five.initial_state(np.zeros(5), commands[0]), commands, step_s)
-    assert five.sigma_rad_s.shape == (5,)
-    np.testing.assert_allclose(speeds, np.repeat(speed, 5, axis=1), rtol=1e-12)
 
 
 def test_the_balance_of_each_fan_is_read_and_that_of_one_fan_holds_for_all(tmp_path: Path) -> None:

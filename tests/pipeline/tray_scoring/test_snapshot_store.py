@@ -33,28 +33,6 @@ def test_the_last_snapshot_is_loaded_again(tmp_path: Path) -> None:
     assert [path.name for path in file.path.parent.iterdir()] == ["scorer-tray1.snapshot"]
 
 
-@pytest.mark.parametrize("step", ["fsync", "replace"])
-def test_a_kill_at_any_step_leaves_the_previous_snapshot(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str
-) -> None:
-    file = SnapshotStore(tmp_path / "m.snapshot")
-    file.save(snapshot(1))
-
-    def killed(*_: object) -> None:
-        raise SystemExit
-
-    with monkeypatch.context() as patch:
-        if step == "fsync":
-            patch.setattr(os, "fsync", killed)
-        else:
-            patch.setattr(Path, "replace", killed)
-        with pytest.raises(SystemExit):
-            file.save(snapshot(2))
-    assert saved(file.path) == 1
-    file.save(snapshot(3))
-    assert saved(file.path) == 3
-
-
 def test_a_full_disk_is_reported_until_there_is_room_and_leaves_the_previous_snapshot(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -254,35 +253,18 @@ SETTINGS = st.builds(
 )
 
 
-def played(settings: ConditionSettings, history: dict[str, Any], restarts: set[int]) -> tuple[list[Any], Any]:
-    """All events and answers, and the last state; at `restarts` a new object continues from the snapshot."""
-    conditions, found = TrayConditions(2, settings), []
-    for number, (active, judged) in enumerate(zip(history["active"], history["judged"], strict=True)):
-        if number in restarts:
-            kept = json.loads(json.dumps(conditions.snapshot()))
-            conditions = TrayConditions(2, settings)
-            conditions.restore(kept)
-        if number in history["requests"]:
-            action, fan, duration_ns = history["requests"][number]
-            found += conditions.request(action, [fan], STEP_NS * (number - 1), duration_ns, "Ann")
-        found += conditions.update(decided(number, active, judged))
-    return found, conditions.snapshot()
-
-
-@given(HISTORIES, SETTINGS, st.sets(st.integers(1, LENGTH - 1)))
-@settings(max_examples=30, deadline=None)
-def test_continuing_from_a_snapshot_changes_nothing(
-    history: dict[str, Any], chosen: ConditionSettings, restarts: set[int]
-) -> None:
-    assert played(chosen, history, restarts) == played(chosen, history, set())
-
-
 @given(HISTORIES, SETTINGS)
 @settings(max_examples=30, deadline=None)
 def test_raised_and_cleared_alternate_and_say_what_was_decided_last(
     history: dict[str, Any], chosen: ConditionSettings
 ) -> None:
-    found, snapshot = played(chosen, history, set())
+    conditions, found = TrayConditions(2, chosen), list[Any]()
+    for number, (active, judged) in enumerate(zip(history["active"], history["judged"], strict=True)):
+        if number in history["requests"]:
+            action, fan, duration_ns = history["requests"][number]
+            found += conditions.request(action, [fan], STEP_NS * (number - 1), duration_ns, "Ann")
+        found += conditions.update(decided(number, active, judged))
+    snapshot = conditions.snapshot()
     for fan in (0, 1):
         events = [each for each in found if isinstance(each, AlarmEvent) and each.fan == fan]
         turns = [each.transition for each in events if each.transition in (RAISED, CLEARED)]
