@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import random
 from collections import Counter
-from collections.abc import Iterator
+from itertools import cycle
+from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fantwin.pipeline.config.models import TrayConfig
@@ -46,85 +47,43 @@ def make_core(protocol: Protocol, block_s: float = 0.0) -> SerialCore:
     return core
 
 
-def make_pool(protocol: Protocol) -> list[tuple[Sample, bytes]]:
-    chance = random.Random(1)
-    pool = []
-    for i in range(64):
-        command = tuple(chance.randrange(1024) / 1024 for _ in range(FANS))
-        speed = tuple(chance.randrange(1 << 20) / 1024 for _ in range(FANS))
-        sample = Sample((2**32 - 100_000 + 10_000 * i) % 2**32, (FIRST_SEQUENCE + i) % 2**32, command, speed)
-        pool.append((sample, encode(protocol, sample)))
-    return pool
+def sample(number: int) -> Sample:
+    chance = random.Random(number)
+    command = tuple(chance.randrange(1024) / 1024 for _ in range(FANS))
+    speed = tuple(chance.randrange(1 << 20) / 1024 for _ in range(FANS))
+    return Sample((2**32 - 100_000 + 10_000 * number) % 2**32, (FIRST_SEQUENCE + number) % 2**32, command, speed)
 
 
-def spoil(frame: bytes, chance: random.Random) -> bytes:
-    """A frame with one to three mutations."""
-    data = bytearray(frame)
-    for _ in range(chance.randint(1, 3)):
-        at = chance.randrange(len(data)) if data else 0
-        what = chance.randrange(6)
-        if what == 0 and data:
-            data[at] ^= 1 << chance.randrange(8)
-        elif what == 1 and data:
-            data[at] = chance.choice(b"\0\n\r #-SCP\xff" + bytes([chance.randrange(256)]))
-        elif what == 2:
-            del data[at : at + chance.randint(1, 8)]
-        elif what == 3:
-            data[at:at] = chance.randbytes(chance.randint(1, 8))
-        elif what == 4:
-            del data[at:]
-        else:
-            data[at:at] = data[: chance.randint(1, 20)]
-    return bytes(data)
-
-
-WELL_FORMED_BUT_NOT_WANTED = (
+NOT_WANTED = (
     CommandFrame((0.5,) * FANS),
     SetPointFrame((10.0,) * FANS),
     Sample(1, 1, (0.5,) * (FANS + 1), (1.0,) * (FANS + 1)),
     Sample(1, 1, (0.5, float("nan")), (1.0, 1.0)),
     Sample(1, 1, (0.5, 99.0), (1.0, 1.0)),
 )
+CHANGED = st.tuples(st.integers(0, 60), st.binary(max_size=8), st.integers(0, 8))
+"""place in a frame, and what is there instead of so many of its bytes"""
+NOISE = st.binary(min_size=1, max_size=40) | st.integers(MAX_FRAME_BYTES - 1, MAX_FRAME_BYTES + 99).map(b"x".__mul__)
+PIECES = st.sampled_from(("whole", "whole", "twice", "left out", *NOT_WANTED, b"# a comment\n")) | CHANGED | NOISE
 
 
-def noise(protocol: Protocol, chance: random.Random) -> bytes:
-    what = chance.randrange(20)
-    if what == 0:
-        return chance.randbytes(1) * (MAX_FRAME_BYTES + chance.randint(-1, 100))
-    if what == 1:
-        return b"# a comment\n"
-    if what < 7:
-        return encode(protocol, chance.choice(WELL_FORMED_BUT_NOT_WANTED))
-    return chance.randbytes(chance.randint(1, 40))
-
-
-def make_stream(
-    protocol: Protocol, pool: list[tuple[Sample, bytes]], chance: random.Random
-) -> tuple[bytes, list[Sample]]:
-    """A mutated stream, and the samples in it that were not mutated, in order."""
+def stream_of(protocol: Protocol, pieces: list[Any]) -> tuple[bytes, list[Sample]]:
+    """A stream, and the samples in it that were not changed, in order."""
     stream, untouched = b"", []
-    start = chance.randrange(len(pool) - 6)
-    for sample, frame in pool[start : start + chance.randint(2, 6)]:
-        if chance.random() < 0.3:
-            stream += noise(protocol, chance)
-        what = chance.randrange(10)
-        if what < 6:
-            hidden = protocol == "text" and stream[stream.rfind(b"\n") + 1 :].startswith(b"#")
+    for number, piece in enumerate(pieces):
+        frame = encode(protocol, sample(number))
+        if piece in ("whole", "twice"):
+            is_comment = protocol == "text" and stream.rpartition(b"\n")[2].startswith(b"#")
             stream += frame  # after half a comment, a line of text is part of the comment
-            if not hidden:
-                untouched.append(sample)
-                stream += frame if what == 0 else b""  # repeated
-        elif what < 9:
-            stream += spoil(frame, chance)
+            if not is_comment:
+                untouched.append(sample(number))
+                stream += frame if piece == "twice" else b""
+        elif isinstance(piece, tuple):
+            at, instead, gone = piece
+            stream += frame[:at] + instead + frame[at + gone :]
+        elif piece != "left out":
+            stream += piece if isinstance(piece, bytes) else encode(protocol, piece)
     return stream, untouched
-
-
-def cut(stream: bytes, chance: random.Random) -> Iterator[bytes]:
-    at = 0
-    while at < len(stream):
-        size = chance.choice((1, 7, 40, len(stream)))
-        yield stream[at : at + size]
-        at += size
 
 
 def samples_of(messages: list[Raw]) -> list[Sample]:
@@ -150,12 +109,23 @@ def outcomes_by_kind(protocol: Protocol, stream: bytes) -> Counter[str]:
     return Counter(item.kind.value if isinstance(item, Fault) else "samples" for item in found)
 
 
-def check_one_stream(protocol: Protocol, pool: list[tuple[Sample, bytes]], chance: random.Random) -> None:
-    stream, untouched = make_stream(protocol, pool, chance)
-    core = make_core(protocol, block_s=chance.choice((0.0, 0.05)))
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+@settings(max_examples=100)
+@given(
+    pieces=st.lists(PIECES, min_size=1, max_size=8),
+    sizes=st.lists(st.sampled_from((1, 7, 40, 9999)), min_size=1, max_size=4),
+    block_s=st.sampled_from((0.0, 0.05)),
+)
+def test_changed_streams_are_counted_to_the_last_frame(
+    protocol: Protocol, pieces: list[Any], sizes: list[int], block_s: float
+) -> None:
+    stream, untouched = stream_of(protocol, pieces)
+    core, rest, wanted = make_core(protocol, block_s), stream, cycle(sizes)
     messages: list[Raw] = []
-    for data in cut(stream, chance):
-        messages += core.step(ReceivedBytes(data, 0))
+    while rest:
+        size = next(wanted)
+        messages += core.step(ReceivedBytes(rest[:size], 0))
+        rest = rest[size:]
         assert len(core.source._decoder._pending) <= MAX_FRAME_BYTES + 1
     messages += core.close()
 
@@ -169,20 +139,13 @@ def check_one_stream(protocol: Protocol, pool: list[tuple[Sample, bytes]], chanc
     assert outcomes.pop("samples", 0) == counts["samples"] + counts["repeated"] + counts["absurd_command"]
     assert outcomes == +Counter({kind.value: counts[kind.value] for kind in FaultKind}), "a fault has no count"
     if protocol == "binary":  # with a checksum all output is correct, so that the sequence must add up
-        pieces = stream.split(b"\0")[:-1]
+        frames = stream.split(b"\0")[:-1]
         good = counts["samples"] + counts["repeated"] + counts["absurd_command"]
-        assert outcomes.total() + good == sum(1 for piece in pieces if piece)
+        assert outcomes.total() + good == sum(1 for frame in frames if frame)
         assert counts["device_restarts"] == 0
         found = [(sample.sequence or 0) for sample in samples_of(messages)]
         if found:
             assert counts["samples"] + counts["lost_on_line"] == (found[-1] - found[0]) % 2**32 + 1
-
-
-@pytest.mark.parametrize("protocol", PROTOCOLS)
-def test_mutated_streams_are_counted_to_the_last_frame(protocol: Protocol) -> None:
-    chance, pool = random.Random(20), make_pool(protocol)
-    for _ in range(300):
-        check_one_stream(protocol, pool, chance)
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)

@@ -31,7 +31,7 @@ from fantwin.schemas.units import NS_PER_S
 from fantwin.twin.models.physical import PhysicalModel
 from tests.support.twin_files import write_twin
 
-FANS, FAULTY, SAMPLES, RATE_HZ = 1024, 1000, 500, 100
+FANS, FAULTY, SAMPLES, RATE_HZ = 1024, 1000, 350, 100
 CHAIN = ("acquisition", "resampler", "twin_integrator", "scorer")
 CONFIGURATION = f"""
 [[tray]]
