@@ -10,8 +10,8 @@ import pytest
 from fantwin.schemas.tacho import Tacho
 from fantwin.scoring.model.decision import OVER_S, Decision
 from fantwin.scoring.model.faults import DRAG, DRAG_GROWS, DRIVE, FRICTION, GROWS_S
-from fantwin.scoring.model.healthy import SLOW, K
-from tests.support.made_bins import Changes, MadeFans, plays
+from fantwin.scoring.model.healthy import SLOW
+from tests.support.made_bins import MadeFans, plays
 from tests.support.scored_blocks import TWIN_SPEED, twin_of
 
 FANS = 4
@@ -70,11 +70,10 @@ def test_an_alarm_stays_while_the_command_moves_and_clears_once_ten_seconds_afte
     assert all(OVER_S <= time_s - ends_s < OVER_S + 4.0 and not is_raised for time_s, _, is_raised in cleared)
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_a_small_fault_of_which_each_reading_of_a_coarse_tacho_says_little_does_not_outlive_its_end(seed: int) -> None:
+def test_a_small_fault_of_which_each_reading_of_a_coarse_tacho_says_little_does_not_outlive_its_end() -> None:
     """A count says 3 rad/s, the fault takes 4."""
     tacho = Tacho(kind="count", pulses=2, window_s=1.0)
-    made = MadeFans(twin_of(FANS, tachos=(tacho,)).fans, 1.0, lambda _time_s: 100.0, seed=seed, own=0.3)
+    made = MadeFans(twin_of(FANS, tachos=(tacho,)).fans, 1.0, lambda _time_s: 100.0, seed=0, own=0.3)
     decision = made.decision(declared_s=86400.0)
     assert plays(made, decision, 60.0) == []
     made.fault_from_s, made.sizes[:, DRIVE] = 60.0, -0.016
@@ -84,15 +83,14 @@ def test_a_small_fault_of_which_each_reading_of_a_coarse_tacho_says_little_does_
     assert raised and raised <= cleared.keys() and max(cleared.values()) < 250.0
 
 
-@pytest.mark.parametrize("period_s", [3.0, 10.0])
-def test_a_fan_whose_speed_varies_is_unsteady_and_its_alarm_stays_until_it_is_steady_again(period_s: float) -> None:
+def test_a_fan_whose_speed_varies_is_unsteady_and_its_alarm_stays_until_it_is_steady_again() -> None:
     made = MadeFans(twin_of(2).fans, 0.1, moving, seed=6)
     decision = made.decision()
     made.fault_from_s = 20.0
     assert plays(made, decision, 20.0) == []
     changes, is_returning = [], []
     for number in range(500):
-        made.sizes[0, DRAG] = 0.06 * math.sin(2.0 * math.pi * number * made.bin_s / period_s)
+        made.sizes[0, DRAG] = 0.06 * math.sin(2.0 * math.pi * number * made.bin_s / 3.0)
         changes += plays(made, decision, made.bin_s)
         is_returning.append(bool(decision.is_returning[0]))
     assert [each[1:] for each in changes] == [(0, True)]
@@ -105,47 +103,6 @@ def test_a_fan_whose_speed_varies_is_unsteady_and_its_alarm_stays_until_it_is_st
     assert over[1:] == (0, False) and OVER_S <= over[0] - ends_s < OVER_S + 15.0
 
 
-def test_forgetting_a_fan_ends_its_alarm_and_its_new_state_is_healthy_while_the_others_go_on() -> None:
-    made = MadeFans(twin_of(2).fans, 0.1, steady, seed=4)
-    decision = with_faults(made, DRAG, DRAG)
-    made.sizes[0] *= 0.3
-    assert plays(made, decision, 5.0) == []
-    decision.begin_again(np.array([True, False]))
-    assert decision.has_alarm.tolist() == [False, True]
-    std = np.sqrt(np.einsum("nii->ni", decision.model.covariance)[:, :K].mean(axis=1))
-    assert std[0] > 1.2 * std[1], "it is as little known as a new one"
-    assert plays(made, decision, 20.0) == [], "what it does now is what it does when healthy"
-    assert decision.model.expected_rad_s[0] == pytest.approx(-0.3 * taken_rad_s(made, 0.12), abs=12.0)
-
-
-def continued(made: MadeFans, decision: Decision) -> Decision:
-    """Another one that goes on from the snapshot."""
-    times, arrays = decision.snapshot()
-    other = made.decision()
-    other.restore({name: array.copy() for name, array in arrays.items()}, **times)
-    return other
-
-
-def outcome(
-    made: MadeFans, decision: Decision, of_alarm: int, cuts: set[int]
-) -> tuple[Changes, list[str], list[float]]:
-    """All changes of 40 s, and at the end the causes of an alarm, and numbers that tell of it and of all fans."""
-    changes: Changes = []
-    for number in range(400):
-        if number in cuts:
-            decision = continued(made, decision)
-        if number == 200:
-            made.sizes[1, DRAG] = -0.12
-        if number == 250:
-            made.sizes[0] = 0.0
-        changes += plays(made, decision, made.bin_s)
-    causes = decision.alarms[of_alarm].causes()
-    told = [each for cause in causes for each in (cause.probability, cause.change)]
-    told += [float(decision.deviation_score[of_alarm]), *decision.fault[0].tolist()]
-    told += decision.model.mean.ravel().tolist()
-    return changes, [cause.cause for cause in causes], told
-
-
 def test_what_the_filter_took_of_a_large_fault_before_its_alarm_is_given_back() -> None:
     """The speed falls when the fault begins: what it takes looks like a lag at first."""
     made = MadeFans(twin_of(4).fans, 0.1, lambda time_s: 320.0 - 60.0 * min(max(time_s - 20.0, 0.0), 2.0), seed=6)
@@ -155,26 +112,3 @@ def test_what_the_filter_took_of_a_large_fault_before_its_alarm_is_given_back() 
     made.fault_from_s, made.sizes[:, DRAG] = 20.0, -0.6
     assert len(plays(made, decision, 1.0)) == 4
     assert np.all(np.abs(decision.model.mean[:, SLOW] - before) < 0.5 * std)
-
-
-def test_a_decision_that_goes_on_from_a_snapshot_decides_the_same_at_the_same_times_also_in_an_alarm() -> None:
-    runs: list[tuple[Changes, list[str], list[float]]] = []
-    for cuts in (set[int](), {100}, {230, 255, 300}):
-        made = MadeFans(twin_of(3).fans, 0.1, steady, seed=4)
-        decision = made.decision()
-        made.fault_from_s, made.sizes[0, DRAG] = 10.0, -0.12
-        plays(made, decision, 20.0)
-        runs.append(outcome(made, decision, 1, cuts))
-    assert {(fan, is_raised) for _, fan, is_raised in runs[0][0]} == {(0, False), (1, True)}
-    for run in runs[1:]:
-        assert run[:2] == runs[0][:2]
-        np.testing.assert_allclose(run[2], runs[0][2], rtol=1e-3, atol=1e-7, err_msg="sums have seven digits")
-
-
-def test_a_snapshot_of_another_number_of_fans_is_refused() -> None:
-    made = MadeFans(twin_of(2).fans, 0.1, steady, seed=4)
-    decision = made.decision()
-    plays(made, decision, 1.0)
-    times, arrays = decision.snapshot()
-    with pytest.raises(ValueError, match="has the shape"):
-        MadeFans(twin_of(3).fans, 0.1, steady, seed=4).decision().restore(arrays, **times)

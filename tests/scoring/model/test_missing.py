@@ -56,19 +56,6 @@ def test_a_loose_wire_is_one_alarm_of_a_few_seconds_delay_that_ends_once_after_i
     assert not active[-1].any()
 
 
-def test_a_loose_wire_explains_a_silence_that_it_makes_now_and_then_and_no_longer_one() -> None:
-    line, rng = MissingReadings(1, 0.2, math.log(1e8)), np.random.default_rng(2)
-    before, lost = np.zeros(1, np.bool_), [*(rng.random(200) < 0.35), *[False], *[True] * 30]
-    explained = []
-    for each in lost:
-        missing = np.array([each])
-        line.take(counts(missing, before))
-        before = missing
-        explained.append(bool(line.explains_silence[0]))
-    assert line.is_active[0]
-    assert explained[-20] and not explained[-1]
-
-
 def played(line: MissingReadings, lost: Array) -> Array:
     """Where alarms are active, (n, fans). lost: (n, fans) whether each reading is missing."""
     before, found = np.zeros(lost.shape[1], np.bool_), []
@@ -87,13 +74,6 @@ def test_a_dead_tacho_is_an_alarm_and_teaches_nothing_of_what_a_healthy_line_los
     active = played(line, lost)
     assert active[620:, 0].all()
     assert not active[:, 1:].any()
-
-
-def test_the_share_of_a_wire_that_is_looser_than_a_poor_line_is_told() -> None:
-    line, rng = MissingReadings(1, 0.1, math.log(1e8)), np.random.default_rng(4)
-    line.restore({**line.arrays(), "_counts": np.array([3000.0, 600.0, 750.0, 150.0])})
-    assert played(line, rng.random((1000, 1)) < 0.45)[-1, 0]
-    assert 0.4 <= line.share[0] < 0.5
 
 
 def test_bursts_of_seconds_on_a_fast_line_are_one_alarm() -> None:

@@ -11,9 +11,8 @@ from scipy.stats import poisson
 
 from fantwin.schemas.messages import Array
 from fantwin.scoring.model.bins import Bin
-from fantwin.scoring.model.healthy import COUNT
 from fantwin.scoring.model.operation import Fans
-from tests.support.made_bins import PRIORS, MadeFans, bin_of, plays, with_reading
+from tests.support.made_bins import MadeFans, plays, with_reading
 from tests.support.scored_blocks import twin_of
 
 DECLARED_S, LASTS_S = 100.0, 150.0
@@ -124,14 +123,3 @@ def test_far_readings_of_a_counting_tacho_agree_where_they_differ_or_last_longer
 
     raised = [time_s - 30.0 for time_s, _, is_raised in plays(made, decision, 3.0, with_far) if is_raised]
     assert raised == ([] if raised_s is None else [raised_s])
-
-
-def test_of_a_count_that_was_not_seen_it_is_not_known_what_it_missed() -> None:
-    made = MadeFans(counting(twin_of(FANS).fans), 0.5, moved, seed=5)
-    decision, missed = made.decision(), PRIORS.count**2 * made.fans.pulse_rad_s**2 / 12.0
-    plays(made, decision, 30.0)
-    assert np.abs(decision.model.mean[:, COUNT]).mean() > 0.3
-    assert (decision.model.covariance[:, COUNT, COUNT] < 0.7 * missed).all()
-    decision.take(bin_of(made.number, made.bin_ns, FANS, moved(made.time_s)))
-    assert not decision.model.mean[:, COUNT].any()
-    np.testing.assert_allclose(decision.model.covariance[:, COUNT, COUNT], missed)

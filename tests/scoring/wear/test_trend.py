@@ -32,17 +32,15 @@ def times_of(forecast: LimitForecast) -> tuple[int, int, int]:
     return forecast.earliest_ns, forecast.likely_ns, forecast.latest_ns
 
 
-@pytest.mark.parametrize(("correlation", "wrong"), [(0.0, 0.08), (0.8, 0.12)])
-def test_without_a_trend_one_is_found_about_as_rarely_as_declared(correlation, wrong) -> None:
-    trends = [series(10, 20, 0.0, seed, correlation).trend() for seed in range(100)]
+def test_without_a_trend_one_is_found_about_as_rarely_as_declared() -> None:
+    trends = [series(10, 20, 0.0, seed, 0.8).trend() for seed in range(100)]
     reported = [trend for trend in trends if trend is not None]  # residuals correlated for too long give no trend
     assert len(reported) > 95
-    assert np.mean([trend.significant for trend in reported]) <= wrong
+    assert np.mean([trend.significant for trend in reported]) <= 0.12
 
 
-@pytest.mark.parametrize("correlation", [0.0, 0.7])
-def test_the_interval_holds_the_true_slope(correlation) -> None:
-    trends = [trend_of(series(10, 20, 0.004, seed, correlation)) for seed in range(100)]
+def test_the_interval_holds_the_true_slope() -> None:
+    trends = [trend_of(series(10, 20, 0.004, seed, 0.7)) for seed in range(100)]
     assert 0.88 <= np.mean([trend.low <= 0.004 <= trend.high for trend in trends]) <= 1.0
 
 
@@ -101,13 +99,3 @@ def test_few_points_give_no_trend_and_those_that_are_no_numbers_or_come_again_ar
     refused = ((START_NS, 2.0, 0.1), (START_NS - 1, 2.0, 0.1), (START_NS + 1, np.nan, 0.1), (START_NS + 2, 1.0, 0.0))
     assert points.add(START_NS, 1.0, 0.1) and not any(points.add(*point) for point in refused)
     assert points.snapshot()["value"] == [1.0]
-
-
-def test_the_mean_of_some_days_gives_the_surer_points_more_weight() -> None:
-    points = WearSeries()
-    for day, (value, error) in enumerate([(1.0, 0.2), (2.0, 0.1), (9.0, 0.1)]):
-        points.add(START_NS + day * NS_PER_DAY, value, error)
-    found = points.mean_from(START_NS, 1.0)
-    assert (found.value, found.std_error) == (pytest.approx(1.8), pytest.approx(0.126, abs=0.001))
-    assert points.mean_from(START_NS + NS_PER_DAY // 2, 0.1).value == 2.0, "the next one"
-    assert points.mean_from(START_NS + 9 * NS_PER_DAY, 1.0).value == 9.0, "the last one"
