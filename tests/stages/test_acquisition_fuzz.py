@@ -110,7 +110,7 @@ def outcomes_by_kind(protocol: Protocol, stream: bytes) -> Counter[str]:
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
-@settings(max_examples=100)
+@settings(max_examples=60)
 @given(
     pieces=st.lists(PIECES, min_size=1, max_size=8),
     sizes=st.lists(st.sampled_from((1, 7, 40, 9999)), min_size=1, max_size=4),

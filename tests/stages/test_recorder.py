@@ -88,7 +88,7 @@ class Part(RecordingWriter):
         self.content: list[Envelope] = []
         self.flushes = self.restored = self.lost = 0
         self.closed = ""
-        self.size_bytes = disk.attached_bytes
+        self.size_bytes = 0
 
     @property
     def size(self) -> int:
@@ -140,8 +140,8 @@ class Part(RecordingWriter):
 class Disk(RecordingParts):
     """A stand-in for the folder in which parts are created."""
 
-    def __init__(self, before: dict[StreamId, int] | None = None) -> None:
-        self.before = before or {}
+    def __init__(self) -> None:
+        self.before: dict[StreamId, int] = {}
         self.parts: list[Part] = []
         self.free = 1 << 40
         self.room = 1 << 40
@@ -149,8 +149,8 @@ class Disk(RecordingParts):
         self.disk = 1 << 44
         self.old: list[StoredPart] = []
         self.deleted: list[Path] = []
-        self.freed_by_each = self.clips_bytes = self.attached_bytes = 0
-        self.gone = self.refuses_to_list = self.undeletable = self.sizeless = ""
+        self.freed_by_each = 0
+        self.gone = self.refuses_to_list = self.undeletable = ""
 
     def begin(self, t_ns: int, ledger: SequenceLedger, about: Mapping[str, str]) -> Part:
         if self.refuses:
@@ -164,8 +164,6 @@ class Disk(RecordingParts):
         return self.free
 
     def disk_bytes(self) -> int:
-        if self.sizeless:
-            raise DiskError(self.sizeless)
         return self.disk
 
     def stored(self) -> Stored:
@@ -174,7 +172,7 @@ class Disk(RecordingParts):
         numbered = enumerate(self.parts, 1000)
         ended = [StoredPart(part.t_ns, number, part.path) for number, part in numbered if part.closed]
         stored = [part for part in (*self.old, *ended) if part.path not in self.deleted]
-        return Stored(tuple(stored), len(stored) * self.freed_by_each, self.clips_bytes)
+        return Stored(tuple(stored), len(stored) * self.freed_by_each, 0)
 
     def delete(self, part: StoredPart) -> None:
         if self.undeletable:

@@ -87,11 +87,11 @@ class FakeLearning(LearningProcess):
 class Learner:
     """A learner, and the seconds that its tray has run."""
 
-    def __init__(self, folder: Path, kept_s: float = 1e6) -> None:
+    def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.versions = TwinVersions(folder, "tray1")
         self.learning = FakeLearning(self.versions)
-        self.history = HealthyHistory(folder, "site", "tray1", {}, {}, hold_back_s=60.0, kept_s=kept_s)
+        self.history = HealthyHistory(folder, "site", "tray1", {}, {}, hold_back_s=60.0, kept_s=1e6)
         self.core = LearnerCore(
             1, LearnerConfig(first_minutes=5.0), self.history, self.versions, OrdinaryOperation(TRAY), self.learning
         )
