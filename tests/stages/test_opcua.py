@@ -145,6 +145,19 @@ def check_that_only_trusted_clients_connect(running: RunningOpcua, folder: Path,
     asyncio.run(connects())
 
 
+def test_wrong_passwords_are_counted(opcua, tmp_path):
+    async def log_in(password: str) -> bool:
+        try:
+            client = await encrypted(opcua, tmp_path, "guessed", password)
+        except ua.UaStatusCodeError:
+            return False
+        await client.disconnect()
+        return True
+
+    assert [asyncio.run(log_in("wrong wrong wrong")) for _ in range(5)] == [False] * 5
+    assert not asyncio.run(log_in(PASSWORD)), "not even with the right one, for a minute"
+
+
 def test_a_session_cannot_be_guessed_and_nobody_refreshes_the_subscription_of_another(opcua):
     class Ignores:
         def event_notification(self, event: Any) -> None: ...

@@ -7,13 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from fantwin.schemas.messages import Array
 from fantwin.scoring.model.bins import Bin
 from fantwin.scoring.model.decision import FORGETS_S
 from fantwin.scoring.model.faults import DRAG, SCALE
 from tests.support.made_bins import MadeFans, plays, with_balance, with_reading
 from tests.support.scored_blocks import TWIN_SPEED, twin_of
 
-FANS = 6
+FANS, MANY = 6, 20
 OF_TEN_PER_CENT, OF_TWENTY_PER_CENT = 0.105, 0.21
 """sizes of a drag that takes this much of TWIN_SPEED"""
 
@@ -57,6 +58,38 @@ def test_a_fall_of_twenty_per_cent_in_a_moment_is_an_alarm_where_a_twin_was_not_
     assert plays(made, decision, 20.0, untrained) == [], "an error of 15 % is no fault there, nor that it wanders"
     made.fault_from_s, made.sizes[:, DRAG] = 20.0, -OF_TWENTY_PER_CENT
     assert sorted(fan for *_, fan, _ in plays(made, decision, 1.0, untrained)) == list(range(FANS))
+
+
+def raised_after_s(has_speed: bool, has_balance: bool) -> Array:
+    """Times, of 15 s at most, after which a drag that takes 3 % of the speed is an alarm.
+
+    Speed and balance are known by turns.
+    """
+    made = MadeFans(twin_of(MANY).fans, 0.1, steady, seed=1)
+    made.fault_from_s, made.sizes[:, DRAG] = 10.0, -0.3 * OF_TEN_PER_CENT
+    rng, times = np.random.default_rng(1), np.full(MANY, 15.0)
+    decision = made.decision()
+
+    def by_turns(one: Bin) -> Bin:
+        is_of_balance = made.number % 2 == 1
+        assert made.rotor_rad_s is not None
+        needs = -made.fans.slope(one.predicted_rad_s) * made.rotor_rad_s + rng.normal(0.0, 0.15, MANY)
+        if is_of_balance and has_balance:
+            return with_balance(one, needs)
+        if has_speed and not is_of_balance:
+            return one
+        return replace(one, readings=np.zeros(MANY), deviations_rad_s=np.full((1, MANY), np.nan))
+
+    for time_s, fan, is_raised in plays(made, decision, 25.0, by_turns):
+        times[fan] = min(times[fan], time_s - 10.0) if is_raised else times[fan]
+    return times
+
+
+def test_speed_and_torque_balance_add_up() -> None:
+    speed, balance = raised_after_s(True, False), raised_after_s(False, True)
+    both = raised_after_s(True, True)
+    assert (min(map(np.min, (speed, balance, both)))) > 0.0, "nothing before the fault"
+    assert np.median(both) < 0.9 * min(np.median(speed), np.median(balance))
 
 
 @pytest.mark.parametrize("gap_s", [3.0, 2.0 * FORGETS_S, 7200.0])
