@@ -68,10 +68,10 @@ def answers(config: BusConfig, credentials: Credentials | None, stop: threading.
             zenoh.open(conf).close()  # a peer would try again for ever, and takes ten seconds to close
             return True
         except zenoh.ZError as error:
+            if (stop is not None and stop.is_set()) or not accepts_connections(config.endpoint):
+                return False  # whoever listened has ended meanwhile
             if time.monotonic() > until_s:
                 raise BusError(foreign_program(config.endpoint, is_secure=credentials is not None)) from error
-            if stop is not None and stop.is_set():
-                return False
 
 
 def _short_lived_config(config: BusConfig, credentials: Credentials | None) -> zenoh.Config:

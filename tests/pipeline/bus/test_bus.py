@@ -1,17 +1,13 @@
-"""The bus between real processes: nothing is lost, in any order of starting and after any death."""
+"""The bus between sessions: nothing is lost, in any order of starting and after any death."""
 
 from __future__ import annotations
 
-import queue
 import subprocess
 import sys
 import threading
-from pathlib import Path
 
-import pytest
 import zenoh
 
-from fantwin.pipeline.bus.errors import BusError
 from fantwin.pipeline.bus.publisher import KEPT_BYTES
 from fantwin.pipeline.bus.recovery import recovery_key
 from fantwin.pipeline.bus.session import Bus
@@ -19,71 +15,34 @@ from fantwin.pipeline.config.models import BusConfig
 from fantwin.schemas.codec import type_name
 from fantwin.schemas.messages import Alarm
 from fantwin.schemas.topics import BY_NAME, alive_key, tray_key
-from tests.support.bus_peer import KEY, TOPIC
 from tests.support.running_chain import eventually
 
+KEY, TOPIC = tray_key("site", "tray", "alarm"), BY_NAME["alarm"]
 COUNT = 400
+HOLDS_THE_ENDPOINT = """
+import sys
+from fantwin.pipeline.bus.session import Bus
+from fantwin.pipeline.config.models import BusConfig
+with Bus(BusConfig(endpoint=sys.argv[1])):
+    print("ready", flush=True)
+    sys.stdin.read()
+"""
 
 
-def peer(role: str, endpoint: str) -> subprocess.Popen[str]:
-    return subprocess.Popen(
-        [sys.executable, "-m", "tests.support.bus_peer", role, endpoint, str(COUNT)],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-        cwd=Path(__file__).parents[3],
-    )
-
-
-def line_of(process: subprocess.Popen[str]) -> str:
-    assert process.stdout
-    return process.stdout.readline().strip()
-
-
-def collected(collector: subprocess.Popen[str], publisher: subprocess.Popen[str]) -> str:
-    """The line that the collector prints at the end; until then the publisher publishes one message at a time."""
-    result: queue.Queue[str] = queue.Queue()
-    threading.Thread(target=lambda: result.put(line_of(collector)), daemon=True).start()
-    assert publisher.stdin
-    for _ in range(300):
-        publisher.stdin.write("one more\n")
-        publisher.stdin.flush()
-        try:
-            return result.get(timeout=0.1)
-        except queue.Empty:
-            continue
-    pytest.fail("the collector did not get what it waits for")
-
-
-@pytest.fixture
-def peers(endpoint):
-    """Starts peers, waits for their first word, and ends them after the test."""
-    started: list[subprocess.Popen[str]] = []
-
-    def start(role: str) -> subprocess.Popen[str]:
-        started.append(peer(role, endpoint))
-        assert line_of(started[-1]) in {"published", "ready"}
-        return started[-1]
-
-    yield start
-    for process in started:
-        process.kill()
-        process.communicate()
-
-
-ALL = " ".join(map(str, range(COUNT)))
-
-
-def test_every_message_arrives_in_order_when_the_consumer_starts_last(peers):
-    publisher, collector = peers("publish"), peers("collect")
-    assert collected(collector, publisher).startswith(ALL)
-
-
-def test_peers_discover_each_other_after_the_process_at_the_endpoint_was_killed(peers):
-    holder, collector = peers("collect"), peers("collect")
-    holder.kill()
-    holder.wait()
-    assert collected(collector, peers("publish")).startswith(ALL)
+def test_peers_meet_after_the_process_at_the_endpoint_was_killed_and_the_last_one_gets_all_that_it_missed(endpoint):
+    words = [sys.executable, "-c", HOLDS_THE_ENDPOINT, endpoint]
+    config = BusConfig(endpoint=endpoint)
+    with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as holder:
+        assert holder.stdout
+        assert holder.stdout.readline() == "ready\n"
+        with Bus(config) as first:
+            holder.kill()
+            publisher = first.publisher(KEY, TOPIC, type_name(Alarm), "peer")
+            for number in range(COUNT):
+                publisher.put(b"%d" % number)
+            with Bus(config) as last:
+                found = eventually(lambda: last.recover(KEY, "peer"), "they meet")
+    assert sorted(int(payload) for _, payload in found) == list(range(COUNT))
 
 
 def test_a_token_shows_when_a_process_appears_and_when_it_has_gone(endpoint):
@@ -145,8 +104,3 @@ def test_row_11_a_request_that_makes_no_sense_is_answered_as_if_it_had_not_asked
             assert [reply.ok.payload.to_bytes() for reply in replies if reply.ok] == [b"kept", b""], asked
         assert bus.recover(KEY, "nobody") == []
     assert "Traceback" not in capfd.readouterr().err
-
-
-def test_a_wrong_endpoint_is_one_line():
-    with pytest.raises(BusError, match="bus.endpoint = 'nonsense' cannot be used"):
-        Bus(BusConfig(endpoint="nonsense"))

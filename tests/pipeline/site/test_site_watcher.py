@@ -20,7 +20,6 @@ from fantwin.schemas.health import Health, Output
 from fantwin.schemas.messages import Alarm
 from fantwin.schemas.topics import alive_key, health_key, sessions_key, tray_key
 from tests.support import made_messages
-from tests.support.bus_peer import alarm
 
 TRAYS = [TrayConfig(name="tray", fans=8)]
 KEY = tray_key("s", "tray", "alarm")
@@ -66,7 +65,7 @@ def health(of: Session, t_ns: int = 1, **more: Any) -> Health:
 
 
 def of(producer: str, sequence: int = 0, **more: Any) -> Alarm:
-    return replace(alarm(0), header=Header(producer, sequence, "tray"), **more)
+    return replace(made_messages.alarm(0, tray="tray"), header=Header(producer, sequence, "tray"), **more)
 
 
 SCORER = session("scorer", 1)
@@ -192,13 +191,14 @@ def test_row_18_bytes_of_a_stranger_are_no_alarm_and_one_that_is_recovered_is_kn
     receive = bus.subscribers[tray_key("s", "*", "alarm")]
     receive(KEY, b"")  # all fields at their defaults: it decodes
     for name in ("", "other", "tray/../x", "*"):
-        receive(KEY, encode(replace(alarm(0), header=Header("peer", 0, name))))
+        receive(KEY, encode(replace(of("peer"), header=Header("peer", 0, name))))
     bus.kept = [(KEY, b"")]
     watcher.ask_for_past_alarms()
     assert fans(watcher) == []
-    bus.kept = [(KEY, encode(alarm(3)))]
+    known = of("peer", 3)
+    bus.kept = [(KEY, encode(known))]
     watcher.ask_for_past_alarms()
-    assert [each.newest.header for each in watcher.current_alarms()] == [alarm(3).header]
+    assert [each.newest.header for each in watcher.current_alarms()] == [known.header]
 
 
 def test_row_11_what_a_launched_session_has_lost_is_not_forgotten_in_a_flood_of_others(bus):
