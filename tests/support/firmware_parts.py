@@ -56,16 +56,10 @@ class Fan(Structure):
     _fields_ = (("duty", c_float), ("set_point_rpm", c_float), ("integral", c_float), ("holds_speed", c_bool))
 
 
-class Host(Structure):
-    """host_t of fan.h."""
-
-    _fields_ = (("silent_samples", c_uint32), ("has_commanded", c_bool))
-
-
 def firmware_parts(library: Path) -> ctypes.CDLL:
     """The functions of firmware/src, with the types of their headers."""
     parts = ctypes.CDLL(str(library))
-    tacho, fan, host, octets = POINTER(TachoStruct), POINTER(Fan), POINTER(Host), POINTER(c_uint8)
+    tacho, fan, octets = POINTER(TachoStruct), POINTER(Fan), POINTER(c_uint8)
     for name, result, arguments in (
         ("cobs_encode", c_uint8, (octets, c_uint8, octets)),
         ("cobs_decode", c_int16, (octets, c_uint8)),
@@ -77,15 +71,11 @@ def firmware_parts(library: Path) -> ctypes.CDLL:
         ("tacho_edge", None, (tacho, c_bool, c_uint32)),
         ("tacho_settle", None, (tacho, c_uint32)),
         ("tacho_period_rpm", c_float, (tacho, c_uint32)),
-        ("tacho_count_rpm", c_float, (c_uint16,)),
         ("fan_start", None, (fan,)),
         ("fan_set_duty", None, (fan, c_float)),
         ("fan_set_speed", None, (fan, c_float, c_float)),
         ("fan_step", None, (fan, c_float)),
         ("fan_level", c_uint16, (fan,)),
-        ("host_commanded", None, (host,)),
-        ("host_falls_silent", c_bool, (host,)),
-        ("supply_volts", c_float, (c_uint16, c_uint16)),
     ):
         function = getattr(parts, name)
         function.restype, function.argtypes = result, arguments

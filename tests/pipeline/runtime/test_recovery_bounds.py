@@ -12,12 +12,10 @@ from fantwin.pipeline.bus import recovery as bus_recovery
 from fantwin.pipeline.bus.recovery import LAST_SEQUENCE, Answer, recovery_key
 from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.config.models import BusConfig
-from fantwin.pipeline.runtime.inbox import INBOX_BYTES, FromBus, Inbox, Liveness, Recovered
-from fantwin.pipeline.runtime.peers import MOST_PEERS, Peers
-from fantwin.pipeline.runtime.recovery import BACK_OFF_S, MOST_AT_A_TIME, Recovery
+from fantwin.pipeline.runtime.inbox import INBOX_BYTES, FromBus, Inbox, Recovered
 from fantwin.pipeline.runtime.sequence_tracker import MOST_HELD_MESSAGES, Found, SequenceTracker
 from fantwin.pipeline.runtime.sessions import Session, Sessions
-from fantwin.pipeline.runtime.tracked_streams import MOST_HEALTH_PRODUCERS, MOST_PRODUCERS, SILENT_S, Request
+from fantwin.pipeline.runtime.tracked_streams import MOST_PRODUCERS, SILENT_S, Request
 from fantwin.schemas.codec import encode, type_name
 from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Grid, Raw
@@ -127,15 +125,6 @@ def test_row_11_where_a_stage_publishes_others_are_refused_without_asking():
     )
 
 
-def test_row_11_a_flood_of_healths_is_remembered_in_part():
-    tracker = SequenceTracker(lambda _request: Found())
-    for number in range(MOST_HEALTH_PRODUCERS + 100):
-        key = health_key("site", "stage", f"false-{number}")
-        tracker.accept(replace(packet(0, f"p{number}"), key=key, topic="health"))
-        tracker.reconcile(health(5, f"p{number}"), [KEY])
-    assert len(list(tracker._streams)) == MOST_HEALTH_PRODUCERS + MOST_PRODUCERS
-
-
 def test_row_11_a_producer_that_was_silent_for_long_makes_room_and_while_all_wait_others_are_refused_and_named():
     now_s = [0.0]
     tracker = SequenceTracker(lambda _request: Found(), lambda: now_s[0])
@@ -150,96 +139,6 @@ def test_row_11_a_producer_that_was_silent_for_long_makes_room_and_while_all_wai
         tracker.accept(packet(1, f"p{number}"))
     assert tracker.counters() == {"refused_producers": 1}
     assert f"{KEY}: too many producers at once" in tracker.problem()
-
-
-class FakeBus:
-    """Keeps the requests, and how each is answered."""
-
-    def __init__(self) -> None:
-        self.asked: list[tuple[str, str, float]] = []
-        self.answer: list[Any] = []
-
-    def request_missed(self, key: str, producer: str, first: int, last: int, timeout_s: float, on_answer: Any) -> Any:
-        self.asked.append((key, producer, timeout_s))
-        self.answer.append(on_answer)
-        return self
-
-    def cancel(self) -> None:
-        """Nothing is running."""
-
-
-class Asker:
-    """A `Recovery` with a bus and a clock of its own."""
-
-    def __init__(self, *, only_rare: bool = False) -> None:
-        self.now_s = 0.0
-        self.bus: Any = FakeBus()
-        self.inbox = Inbox(drops_oldest=False)
-        self.recovery = Recovery(self.bus, self.inbox, 5.0, only_rare=only_rare, now_s=lambda: self.now_s)
-
-    def finish(self) -> Recovered:
-        item = self.inbox.get(0.0)
-        assert isinstance(item, Recovered)
-        self.recovery.finish(item)
-        return item
-
-
-def request(producer: str = "p", key: str = KEY) -> Request:
-    return Request(key, producer, 0, 5)
-
-
-def test_row_11_a_producer_that_did_not_answer_is_left_alone_for_a_while():
-    asker = Asker()
-    assert asker.recovery.ask(request()) is None
-    asker.bus.answer[0](Answer(timed_out=True))
-    asker.finish()
-    assert asker.recovery.ask(request()) == Found()
-    assert asker.recovery.ask(request("another")) is None
-    asker.now_s = BACK_OFF_S
-    assert asker.recovery.ask(request()) is None
-
-
-def test_row_11_a_producer_that_answers_in_part_as_on_a_busy_machine_is_asked_until_all_has_come():
-    asker = Asker()
-    tracker = SequenceTracker(asker.recovery.ask, now_s=lambda: asker.now_s)
-    tracker.accept(packet(0))
-    due = sequences(tracker.accept(packet(5)))
-    for number in range(1, 5):
-        asker.now_s += 5.0
-        asker.bus.answer[-1](Answer([(KEY, packet(number).payload)], timed_out=True))
-        item = asker.inbox.get(0.0)
-        assert isinstance(item, Recovered)
-        due += sequences(tracker.answer(item.request, Found([packet(number)])))
-        asker.recovery.finish(item)
-    assert due == [1, 2, 3, 4, 5]
-    assert tracker.inputs()[0].missing == 0
-
-
-def test_row_11_few_requests_run_at_a_time_and_one_that_waited_too_long_is_not_sent():
-    asker = Asker()
-    requests = [request(f"p{number}") for number in range(MOST_AT_A_TIME + 2)]
-    assert [asker.recovery.ask(each) for each in requests] == [None] * len(requests)
-    assert len(asker.bus.asked) == MOST_AT_A_TIME
-    asker.bus.answer[0](Answer())
-    asker.finish()
-    assert asker.bus.asked[-1][1] == f"p{MOST_AT_A_TIME}"
-    asker.now_s = 5.0
-    asker.bus.answer[1](Answer())
-    asker.finish()
-    assert len(asker.bus.asked) == MOST_AT_A_TIME + 1
-    assert asker.finish() == Recovered(requests[-1], Answer())
-
-
-def test_row_11_after_one_catch_up_without_an_answer_the_next_ones_wait_for_less():
-    asker = Asker()
-    asker.recovery.catch_up(["a/1", "a/2"])
-    asker.bus.answer[0](Answer(timed_out=True))
-    asker.finish()
-    assert [each[2] for each in asker.bus.asked] == [5.0, 0.5]
-    assert asker.recovery.is_catching_up
-    asker.bus.answer[1](Answer())
-    asker.finish()
-    assert not asker.recovery.is_catching_up
 
 
 @pytest.fixture
@@ -310,18 +209,9 @@ def test_row_11_the_inbox_is_bounded_in_bytes_and_what_must_not_be_missed_is_not
         inbox.put(FromBus("k", bytes(INBOX_BYTES // 2), number))
     assert (inbox.waiting(), inbox.dropped) == (2, 3)
     inbox = Inbox(drops_oldest=True)
-    answer = Recovered(request(), Answer())
+    answer = Recovered(Request(KEY, "p", 0, 5), Answer())
     inbox.put(answer)
     for number in range(5):
         inbox.put(FromBus("k", bytes(INBOX_BYTES), number))
     assert inbox.get(0.0) is answer
     assert inbox.get(0.0) == FromBus("k", bytes(INBOX_BYTES), 4)
-
-
-def test_row_11_the_healths_of_few_peers_are_remembered():
-    peers = Peers(frozenset())
-    for number in range(MOST_PEERS + 10):
-        peers.add_health(f"key {number}", health(0))
-        peers.update(Liveness(f"key {number}", alive=True))
-        peers.update(Liveness(f"other key {number}", alive=False))
-    assert [len(each) for each in (peers._reported, peers._alive, peers._left_s)] == [MOST_PEERS] * 3

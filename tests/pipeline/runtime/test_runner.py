@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import threading
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -13,8 +12,6 @@ import pytest
 from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.config.models import TrayConfig
 from fantwin.pipeline.runtime.runner import TICK_S
-from fantwin.pipeline.runtime.sessions import Sessions
-from fantwin.pipeline.runtime.silences import Silences
 from fantwin.pipeline.runtime.stage import BuiltStage, Context, Core
 from fantwin.pipeline.site.loss_accounting import losses
 from fantwin.schemas.codec import encode, type_name
@@ -24,7 +21,6 @@ from fantwin.schemas.header import Header, InputPosition
 from fantwin.schemas.health import Health, Note, Output
 from fantwin.schemas.messages import Command, Grid, Message, Raw
 from fantwin.schemas.topics import BY_NAME, alive_key, health_key, tray_key
-from fantwin.schemas.units import NS_PER_S
 from tests.support.running_chain import eventually
 from tests.support.toy_stage import TRAY_A, TRAY_B, Bench, Passer, Silent, raw, toy
 
@@ -177,52 +173,6 @@ def test_row_16_a_stage_that_was_held_up_says_that_its_input_is_not_all_processe
     assert not waits(last, TRAY_A)
 
 
-class Endless:
-    """A source of which an item always waits: the core that processes one asks for the next."""
-
-    def __init__(self, *, is_silent: bool = False) -> None:
-        self.is_silent = is_silent
-
-    def start(self, deliver: Callable[[Any], None]) -> None:
-        self.deliver = deliver
-        if not self.is_silent:
-            deliver(None)
-
-    def stop(self) -> None:
-        self.deliver = lambda _item: None
-
-
-def test_row_16_a_tray_whose_source_is_silent_shows_it_although_input_of_other_trays_always_waits(config, monkeypatch):
-    monkeypatch.setattr("fantwin.pipeline.runtime.runner.HEALTH_PERIOD_S", 0.0)
-    monkeypatch.setattr("fantwin.pipeline.runtime.silences.BEGINS_NS", 0)
-    sources = {f"b{number}": Endless() for number in range(8)} | {"a": Endless(is_silent=True)}
-
-    class OfSource(Passer):
-        def __init__(self, tray: str) -> None:
-            super().__init__()
-            self.tray = tray
-
-        def step(self, item: Any) -> Sequence[Message]:
-            time.sleep(0.001)
-            sources[self.tray].deliver(None)
-            return []
-
-    def build(context: Context) -> BuiltStage:
-        name = context.tray.name
-        return BuiltStage(OfSource(name), source=sources[name])
-
-    config = replace(config, trays=tuple(TrayConfig(name=name, fans=1) for name in sources))
-    bench = Bench(toy(build, name="acquisition", reads=()), config)
-    silences = Silences({tray_key("s", name, "grid"): name for name in sources}, Sessions())
-    shown: set[str] = set()
-    for _ in range(5):
-        health = bench.next(Health)
-        silences.add_health(health, lambda _stream, _published: True)
-        shown |= {name for name in sources if silences.take(name)}
-    bench.end()
-    assert shown == {"a"}
-
-
 def test_health_accounts_for_inputs_outputs_counters_and_losses(config):
     bench = Bench(toy(), config)
     for t_ns in range(5):
@@ -342,17 +292,6 @@ def test_a_stage_that_may_drop_recovers_messages_published_on_change(config):
     inputs = bench.health_with(lambda health: len(health.inputs) == 2).inputs
     bench.end()
     assert {line.key.split("/")[-1]: line.received for line in inputs} == {"command": 2, "raw": 1}
-
-
-def test_a_stage_is_not_behind_with_messages_that_it_had_missed_and_recovered(config):
-    """Its live inputs may have been silent for hours."""
-    with Bus(config.bus) as before:
-        publisher = before.publisher(tray_key("s", TRAY_A, "raw"), BY_NAME["raw"], type_name(Raw), "x")
-        publisher.put(encode(replace(raw(1), header=Header("x", 0, TRAY_A))))
-        bench = Bench(toy(lambda _context: BuiltStage(Silent())), config)
-        health = bench.health_with(lambda health: sum(line.received for line in health.inputs) == 1)
-        bench.end()
-    assert 0 <= health.t_ns - health.newest_input_t_ns < 60 * NS_PER_S
 
 
 def test_a_stage_that_may_drop_discards_its_oldest_items_and_counts_them(config, monkeypatch):

@@ -24,7 +24,7 @@ from fantwin.schemas.health import Health
 from fantwin.schemas.messages import Message
 from fantwin.schemas.topics import health_key, tray_key
 from tests.support.running_chain import eventually
-from tests.support.toy_stage import TRAY_A, TRAY_B, Bench, Burst, Passer, raw, toy
+from tests.support.toy_stage import TRAY_A, TRAY_B, Burst, Passer, raw, toy
 
 
 class Ended:
@@ -175,23 +175,6 @@ def test_row_04_a_stage_that_is_stopped_while_it_waits_for_what_it_missed_ends_i
     assert not runner.is_hung
 
 
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
-def test_row_04_counts_that_no_health_can_hold_do_not_keep_the_stage_on_the_bus(config):
-    class CountsTooMuch(RaisesAtClose):
-        """It cannot be aborted either."""
-
-        def counters(self):
-            return {"seen": 2**64 if self.fans else 0}
-
-    bench = Bench(toy(lambda _context: BuiltStage(CountsTooMuch())), config)
-    bench.feed(TRAY_A, 1)
-    last = bench.health_with(lambda health: "crashed" in health.problem)
-    bench.thread.join(20)
-    bench.bus.close()
-    assert not bench.thread.is_alive()
-    assert (last.status, last.is_last) == (StageStatus.DEGRADED, True)
-
-
 class StopRaises(Burst):
     """A source whose port is gone."""
 
@@ -206,30 +189,6 @@ def test_row_04_a_source_that_raises_while_it_is_stopped_does_not_keep_the_stage
     assert ended.has_ended
     assert "stopping the source failed: OSError: [Errno 5] Input/output error" in ended.problem
     assert ended.healths[-1].outputs[0].published == 2, "what it had delivered was published"
-
-
-def test_row_04_each_source_is_stopped_once_before_its_core_is_closed_also_after_a_crash(config):
-    done: list[str] = []
-    may_stop = threading.Event()
-
-    class Slow(Burst):
-        def stop(self) -> None:
-            done.append("stop begins")
-            super().stop()
-            may_stop.wait(20)
-            done.append("stopped")
-
-    class Broken(Passer):
-        def step(self, item: Any) -> Sequence[Message]:
-            threading.Timer(0.1, may_stop.set).start()  # the crash comes first
-            raise ZeroDivisionError("on purpose")
-
-        def abort(self) -> None:
-            done.append("aborted")
-
-    ended = Ended(toy(lambda _context: BuiltStage(Broken(), Slow([raw(1)])), name="acquisition"), config, tray=TRAY_A)
-    assert isinstance(ended.error, ZeroDivisionError)
-    assert done == ["stop begins", "stopped", "aborted"]
 
 
 BLOCKED = """

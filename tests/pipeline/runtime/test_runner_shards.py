@@ -32,11 +32,6 @@ def test_a_shard_reads_its_trays_only_and_says_in_its_health_which_they_are(conf
     assert {line.key.split("/")[2] for line in (*last.inputs, *last.outputs)} == {TRAY_B}
 
 
-def test_a_process_with_all_trays_is_called_as_before_and_names_none(config):
-    last = Bench(toy(), config).end()
-    assert (last.instance, last.trays) == ("all", "")
-
-
 def test_a_shard_receives_the_health_of_every_process_that_has_one_of_its_trays_and_of_no_other(config):
     heard: list[tuple[str, str]] = []
 

@@ -10,7 +10,7 @@ import pytest
 
 from fantwin.pipeline.runtime.lost_sessions import LostSessions
 from fantwin.pipeline.runtime.sessions import Session, Sessions, this_host
-from fantwin.pipeline.runtime.silences import BEGINS_NS, MOST_DELAY_S, MOST_HEARD, RESTART_S, Silences
+from fantwin.pipeline.runtime.silences import BEGINS_NS, MOST_DELAY_S, RESTART_S, Silences
 from fantwin.schemas.enums import StageStatus
 from fantwin.schemas.header import Header
 from fantwin.schemas.health import Health, Output
@@ -97,18 +97,6 @@ def test_row_16_a_health_that_was_cut_off_on_its_way_shows_nothing_also_after_on
     assert not consumer.is_shown()
 
 
-def test_a_clock_that_is_set_back_delays_what_is_shown_for_a_while_only(consumer):
-    consumer.arrived = 5
-    consumer.hear(5)
-    assert consumer.is_shown()
-    shown = []
-    for _ in range(20):
-        consumer.now_s += 1.0
-        consumer.hear(5, t_ns=round((consumer.now_s - 3600.0) * NS_PER_S))
-        shown.append(consumer.is_shown())
-    assert (shown[0], shown[-1]) == (False, True)
-
-
 def test_row_16_a_session_that_has_just_begun_shows_nothing_before_its_first_message(consumer):
     """It may still read what its device kept while none ran."""
     consumer.hear(0, STARTING)
@@ -154,22 +142,6 @@ def test_row_11_after_a_crash_the_next_session_is_waited_for_a_few_seconds_only(
     assert consumer.is_shown()
 
 
-def test_row_11_a_stage_that_crashes_at_each_start_does_not_hide_it(consumer):
-    consumer.arrived = 5
-    consumer.hear(5, DEGRADED, is_last=True)
-    for session in ("q", "r", "s"):
-        consumer.now_s += RESTART_S / 2
-        consumer.hear(0, STARTING, session)
-        consumer.hear(0, DEGRADED, session, is_last=True)
-    assert consumer.is_shown()
-    consumer.arrived = 0
-    consumer.hear(3, OK, "t")
-    assert not consumer.is_shown()
-    consumer.arrived = 3
-    consumer.hear(3, DEGRADED, "t", is_last=True)
-    assert not consumer.is_shown(), "this one has worked: its successor may read what its device keeps"
-
-
 FIRST, SECOND = (
     Session("acquisition", "a", started, f"acquisition-a-0{started}", this_host(), started) for started in (1, 2)
 )
@@ -208,29 +180,6 @@ def test_row_11_a_producer_that_is_no_session_shows_nothing_where_a_session_publ
     assert not of_two.is_shown()
 
 
-def test_a_session_has_begun_also_where_another_one_reports_by_turns(consumer):
-    shown: list[bool] = []
-    for _ in range(BEGINS_NS // NS_PER_S + 1):
-        consumer.hear(0)
-        shown.append(consumer.is_shown())
-        consumer.hear(3, OK, "q")
-        assert not consumer.is_shown()
-        consumer.now_s += 1.0
-    assert (shown[0], shown[-1]) == (False, True)
-
-
-def test_row_11_of_sessions_that_come_and_go_the_last_ones_are_remembered(consumer):
-    consumer.arrived = 5
-    sent_ns = round(consumer.now_s * NS_PER_S)
-    for number in range(MOST_HEARD + 1):
-        consumer.hear(5, OK, f"p{number}")
-    consumer.now_s += 30.0
-    for number, is_shown in ((MOST_HEARD, False), (0, True)):
-        consumer.is_shown()
-        consumer.hear(5, OK, f"p{number}", t_ns=sent_ns)
-        assert consumer.is_shown() == is_shown
-
-
 def token(process_id: int, host: str = this_host()) -> str:
     return Session("acquisition", "a", 1, "acquisition-a-01", host, process_id).key("s")
 
@@ -259,19 +208,6 @@ def test_row_11_a_session_without_a_token_was_killed_if_its_process_runs_no_more
     assert not sessions.cut_off(), "it was killed"
     assert sessions.take_killed() == ["acquisition-a-01"]
     assert sessions.take_killed() == []
-
-
-def test_row_11_sessions_that_come_and_go_are_remembered_up_to_a_limit(monkeypatch):
-    monkeypatch.setattr("fantwin.pipeline.runtime.lost_sessions.MOST_SESSIONS", 2)
-    sessions = LostSessions(this_host())
-    processes = [subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) for _ in range(3)]
-    for process in processes:
-        sessions.update(token(process.pid), alive=True)
-        sessions.update(token(process.pid), alive=False)
-    for process in processes:
-        process.kill()
-        process.communicate()
-    assert len(sessions.take_killed()) == 2
 
 
 def test_row_11_whether_a_process_elsewhere_runs_is_not_known():
