@@ -174,7 +174,7 @@ def main(
     broker.start()
     stages = json.dumps(["acquisition", "resampler", "twin_integrator", "scorer", "recorder", "mqtt"])
     settings = (f"launcher.stages={stages}", f"mqtt.port={broker.port}", "mqtt.host='127.0.0.1'")
-    chain = Chain(folder, endpoint, *settings, viewer=False)
+    chain = Chain(folder, endpoint, *settings)
     subscriber = Subscriber(broker.port)
     try:
         chain.start_tray()

@@ -49,7 +49,7 @@ def measured(source: Path, folder: Path) -> dict[str, Any]:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
-    chain = Chain(folder, endpoint, f"launcher.stages={json.dumps(STAGES)}", viewer=False)
+    chain = Chain(folder, endpoint, stages=STAGES)
     try:
         up = chain.start_up()
         with chain.watcher() as watcher:

@@ -14,7 +14,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
-from tests.support.running_chain import Chain, eventually, published, view_of
+from tests.support.running_chain import STAGES, Chain, eventually, published, view_of
 
 ALLOWED_S = 2.0
 REPEATS = 3
@@ -25,7 +25,7 @@ def main() -> None:
         probe.bind(("127.0.0.1", 0))
         endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
     with tempfile.TemporaryDirectory() as folder:
-        chain = Chain(Path(folder), endpoint)
+        chain = Chain(Path(folder), endpoint, stages=(*STAGES, "viewer"))
         try:
             measure(chain)
         finally:

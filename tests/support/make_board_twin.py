@@ -7,24 +7,49 @@ the rotors of firmware/sim or what the firmware measures have changed.
 
 from __future__ import annotations
 
+import csv
 import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
 from fantwin.simulation.excitation import Excitation, Multisine, Prbs, Staircase
-from tests.support.board_recordings import import_board, run_board, succeed
-from tests.support.fan_board import FANS
+from tests.support.fan_board import FANS, FanBoard
+from tests.support.fantwin_command import fantwin
+from tests.support.firmware_build import firmware_file, simulator_file
 
 BOARD_TWIN = Path(__file__).parent / "data" / "fan_board.onnx"
 LOW, HIGH = 0.15, 1.0
+COMMANDS_HZ = 10
+COLUMNS = ("t", *(f"{column}{fan}" for column in ("duty", "rpm") for fan in range(FANS)))
 
 
 def record(path: Path, profiles: Sequence[Excitation], seconds_each: int) -> Path:
     """Let a board run under profiles, one after another; returns the recording, without the supply."""
+    board = FanBoard(simulator_file(), firmware_file())
+    board.run(0.2)
+    for profile in profiles:
+        for number in range(seconds_each * COMMANDS_HZ):
+            board.command(*profile.command(number / COMMANDS_HZ).tolist())
+            board.run(1 / COMMANDS_HZ)
+    board.close()
     table = path.with_suffix(".csv")
-    run_board(table, profiles, seconds_each)
-    return import_board(table, path, with_supply=False)
+    with table.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(COLUMNS)
+        for sample in board.samples[1:]:
+            assert sample.clock_us is not None
+            writer.writerow([sample.clock_us / 1e6, *map(repr, (*sample.command, *sample.speed))])
+    columns = [word for fan in range(FANS) for word in ("--command", f"duty{fan}", "--speed", f"rpm{fan}:rpm")]
+    succeed("import", table, "--time", "t:s", *columns, "--tacho", "period", "-o", path)
+    return path
+
+
+def succeed(command: str, *words: object) -> None:
+    """Run a command of fantwin, and show what it says."""
+    done = fantwin(command, *words)
+    print(done.stdout, end="", flush=True)
+    assert done.exit_code == 0, done.output
 
 
 def main() -> None:

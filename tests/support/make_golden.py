@@ -67,7 +67,7 @@ def make_golden(path: Path) -> None:
         run("train", healthy, "--model", "physical", "--name", "golden", "-o", folder / "twin.onnx")
         run("calibrate", folder / "twin.onnx", healthy, "--false-alarms-per-day", 24, "--extrapolate")
         (folder / "golden.toml").write_text(CONFIGURATION)
-        chain = Chain(folder, f"tcp/127.0.0.1:{free_port()}", viewer=False, configuration=folder / "golden.toml")
+        chain = Chain(folder, f"tcp/127.0.0.1:{free_port()}", configuration=folder / "golden.toml")
         try:
             record(chain)
         finally:

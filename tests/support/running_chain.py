@@ -10,7 +10,7 @@ import signal
 import subprocess
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,7 @@ from fantwin.pipeline.site.site_watcher import SiteWatcher
 
 DEMO = Path(__file__).parents[2] / "pipeline" / "demo"
 SITE, TRAY, FANS = "demo", "tray1", 8
+STAGES = ("acquisition", "resampler", "twin_integrator", "scorer", "recorder")
 DEADLINE_S = 300.0  # only what hangs takes as long, also on a busy machine
 
 
@@ -113,29 +114,28 @@ class RunningCommand:
 
 
 class Chain:
-    """A tray that sends until stopped, all stages judging it, and a watcher on their bus."""
+    """A tray that sends until stopped, the stages that judge and record it, and a watcher on their bus."""
 
     def __init__(
         self,
         folder: Path,
         endpoint: str,
         *settings: str,
-        viewer: bool = True,
+        stages: Sequence[str] = STAGES,
         configuration: Path = DEMO / "demo.toml",
     ) -> None:
         self.folder = folder
         self.configuration = configuration
         self.endpoint = endpoint
         self.port = folder / "tray"
-        stages = ["acquisition", "resampler", "twin_integrator", "scorer", "recorder", *(["viewer"] if viewer else [])]
         self.settings = [
             *(f"run_folder='{folder}'", f"tray.0.port='{self.port}'", f"bus.endpoint='{endpoint}'"),
-            *("viewer.serve=false", "viewer.file='view.rrd'", f"launcher.stages={json.dumps(stages)}"),
+            *("viewer.serve=false", "viewer.file='view.rrd'", f"launcher.stages={json.dumps(list(stages))}"),
             *("recorder.topics=['raw', 'grid', 'prediction', 'score']", "recorder.flush_interval_s=1"),
             # nothing is late, hangs or is cut short where other tests hold up a process for seconds
             *("resampler.watermark_s=600", "launcher.watchdog_s=300", "launcher.stop_timeout_s=120", *settings),
         ]
-        self.stages = [f"acquisition/{TRAY}", *stages[1:]]
+        self.stages = [f"{stage}/{TRAY}" if stage == "acquisition" else stage for stage in stages]
         self.tray: RunningCommand | None = None
         self.up: RunningCommand | None = None
 

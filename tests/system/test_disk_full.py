@@ -13,7 +13,6 @@ from fantwin.pipeline.recordings import disk_room
 from fantwin.pipeline.recordings.contents import contents_of
 from fantwin.pipeline.recordings.reading import read_metadata, read_recording
 from fantwin.pipeline.recordings.recorder import Recorder
-from fantwin.pipeline.recordings.scan import scan
 from fantwin.stages.recorder import STAGE
 from tests.stages.test_recorder import RAW_KEY, SECOND_NS, context, envelope
 from tests.support.small_disk import SIZE_BYTES, mount, unmount
@@ -122,40 +121,6 @@ def test_messages_that_memory_cannot_hold_are_missing_in_the_ledger(small_disk, 
     assert contents.streams[STREAM].missing == holes + (found[0] - contents.before[STREAM]) == lost > 0
     assert contents.metadata["lost_in_pause"] == str(lost)
     assert found[-1] == run.sent - 1
-
-
-def test_on_a_full_disk_the_oldest_parts_are_deleted(small_disk, monkeypatch):
-    monkeypatch.setattr(disk_room, "PART_BYTES", 1_000_000)
-    run = Run(small_disk, min_free_bytes=3_000_000)
-    for _ in range(300):  # 30 MB, on a disk of 8
-        run.second()
-        assert run.core.problem() == ""
-    run.core.close()
-    assert run.core.counters()["parts_deleted"] > 10
-    sequences = run.sequences()
-    assert sequences == list(range(sequences[0], run.sent)), "the newest, without a gap"
-    assert sequences[0] > 1000
-    assert sum(path.stat().st_size for path in run.parts()) < SIZE_BYTES - 3_000_000 + 1_200_000
-    for path in run.parts():
-        assert_readable(path)
-        assert scan(path).is_intact
-
-
-def test_recordings_keep_their_share_of_a_disk_that_others_fill_too(small_disk):
-    limit_bytes = round(0.3 * SIZE_BYTES)
-    ballast = small_disk / "ballast"
-    run = Run(small_disk, min_free_bytes=1_000_000, keep_share_of_disk=0.3)
-    largest = 0
-    for second in range(200):  # 20 MB
-        ballast.write_bytes(bytes(min(25_000 * second, SIZE_BYTES - limit_bytes - 1_100_000)))
-        run.second()
-        assert run.core.problem() == ""
-        largest = max(largest, sum(path.stat().st_size for path in run.folder.iterdir()))
-    run.core.close()
-    assert 0.8 * limit_bytes < largest <= limit_bytes
-    assert run.core.counters()["lost_unwritten"] == 0 and run.core.counters().get("pauses", 0) == 0
-    sequences = run.sequences()
-    assert sequences == list(range(sequences[0], run.sent)), "the newest, without a gap"
 
 
 def test_an_unmounted_disk_is_waited_for_and_its_mount_point_not_written(small_disk):

@@ -1,16 +1,19 @@
-"""Real measured tables: imported with the counts they have, and good enough to learn a twin from.
+"""Real measured tables: imported with the counts they have, and a twin of one part predicts the rest.
 
 The same commands stand in docs/how-to/datasets.md.
 """
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
 
+from fantwin.pipeline.recordings.reading import read_recording
 from fantwin.pipeline.recordings.runs import read_runs
+from fantwin.schemas.enums import InvalidReason
 from tests.support.fantwin_command import fantwin
 
 pytestmark = pytest.mark.data
@@ -59,3 +62,38 @@ def test_imrclab_is_imported_as_four_fans_of_one_command_without_times(measured_
     ours = pd.read_csv(table)
     assert (result["samples"], result["fans"]) == (len(ours), 4)
     assert result["duration_s"] == pytest.approx((len(ours) - 1) * 0.01)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("file", "columns", "first_part_s", "end_s"),
+    [("esc_test/f40_steps_5-2.csv", ESC_TEST, 80, 115), ("rosa/healthy_103.csv", ROSA, 30, 48)],
+)
+def test_a_twin_of_the_first_part_predicts_the_rest_and_is_believed_only_where_it_was_trained(
+    file, columns, first_part_s, end_s, measured_data, tmp_path
+):
+    recording, twin, judged = (tmp_path / name for name in ("all.mcap", "twin.onnx", "judged.mcap"))
+    imported(measured_data / file, recording, *columns)
+    part = ("--start", first_part_s, "--end", end_s)
+    for words in (
+        ("train", recording, "--model", "physical", "--to", first_part_s, "-o", twin),
+        ("replay", recording, "--offline", "--twin", twin, *part, "-o", judged),
+    ):
+        done = fantwin(*words)
+        assert done.exit_code == 0, done.exception
+    found: dict[str, list[Any]] = {}
+    for entry in read_recording(judged):
+        found.setdefault(entry.topic, []).append(entry.message)
+    valid, reason, command, measured, predicted = (
+        np.concatenate([getattr(message, column) for message in found["prediction"]])
+        for column in ("valid", "invalid_reason", "command", "measured_speed_rad_s", "predicted_speed_rad_s")
+    )
+    scored = np.concatenate([message.valid for message in found["score"]])
+    (card,) = found["twin"]
+    low, high = json.loads(card.card_json)["command_range"]
+    beyond = (command < low - 0.05 * (high - low)) | (command > high + 0.05 * (high - low))
+    assert not valid[beyond].any(), "a twin is not valid beyond its training commands"
+    stands = reason == InvalidReason.STOPPED
+    assert (valid | stands).mean() > 0.25
+    assert scored[valid].all() and not scored[stands].any()
+    assert np.sqrt(np.mean((measured - predicted)[valid] ** 2)) < 0.1 * np.nanmax(measured)

@@ -35,6 +35,8 @@ class Scorer:
         self._state = {"acknowledged": False, "confirmed": False, "shelved_until_t_ns": 0}
 
     def __call__(self, request: Request) -> list[Alarm]:
+        if request.action == Action.FALSE_ALARM:
+            return [replace(marked(Feedback.FALSE_ALARM, 2, request.comment), marked_onset_t_ns=5)]
         transition, change = {
             Action.ACKNOWLEDGE: (Transition.ACKNOWLEDGED, {"acknowledged": True}),
             Action.CONFIRM: (Transition.CONFIRMED, {"confirmed": True}),
@@ -107,12 +109,21 @@ def test_everything_is_done_by_keyboard(gateway, browser):
     assert errors == []
 
 
-def test_the_rate_on_an_open_page_follows_what_is_said_of_an_alarm(gateway, browser):
+def test_what_an_operator_says_of_an_alarm_is_seen_by_a_viewer_who_may_not_act(gateway, browser):
     gateway.feed(golden_twin(), score(2.0), score(6.0), alarm(sequence=1, onset_t_ns=5, t_ns=NOW_NS + 3 * 10**9))
     errors: list[str] = []
-    rate = opened(browser, f"http://127.0.0.1:{gateway.port}/#/alarms", errors).locator("#alarm-rate")
+    ann, vic = (opened(browser, f"http://127.0.0.1:{gateway.port}/#/alarms", errors, name) for name in ("ann", "vic"))
+    shown = vic.locator(f'article[data-fan="{TRAY}/{FAULTY}"]')
+    expect(shown).to_contain_text("vic may view but not act")
+    rate = vic.locator("#alarm-rate")
     expect(rate).to_contain_text("0 false alarms")
-    gateway.feed(replace(marked(Feedback.FALSE_ALARM, 2, "a door was open"), marked_onset_t_ns=5))
+    ann.get_by_role("link", name="History").click()
+    history = ann.locator("tbody")
+    history.locator("tr", has_text="raised").first.get_by_role("button", name="False alarm").click()
+    ann.get_by_label("Reason").fill("a door was open")
+    ann.get_by_role("dialog").get_by_role("button", name="False alarm").click()
+    expect(history).to_contain_text("(false alarm)")
+    expect(shown).to_contain_text("marked as a false alarm by ann: a door was open")
     expect(rate).to_contain_text("1 false alarm in")
     assert errors == []
 

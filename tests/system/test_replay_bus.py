@@ -55,7 +55,7 @@ class Site:
     """Stages of the site of the demo, and the messages received on their bus."""
 
     def __init__(self, folder: Path, endpoint: str, *, listens: bool = True) -> None:
-        self.chain = Chain(folder, endpoint, SILENCE, viewer=False)
+        self.chain = Chain(folder, endpoint, SILENCE)
         self.heard: dict[type[Message], queue.Queue[Message]] = {kind: queue.Queue() for kind in (Grid, Clock, Health)}
         self.bus = Bus(BusConfig(endpoint=endpoint), listens=listens)
         self.watcher = SiteWatcher(self.bus, SITE)
@@ -171,8 +171,8 @@ def test_at_full_speed_stages_take_every_message_change_to_the_learned_twins_and
         recorded_site.put_in_force(f"tray1-{number}", twin.read_bytes())
         recorded_site.run(200)
     source = recorded_site.finished().rename(tmp_path / "source.mcap")
-    settings = [f"launcher.stages={json.dumps(WORKING)}", f"site='{SITE}'", SILENCE]
-    chain = Chain(tmp_path / "run", endpoint, *settings, viewer=False, configuration=tmp_path / "site.toml")
+    settings, file = (f"site='{SITE}'", SILENCE), tmp_path / "site.toml"
+    chain = Chain(tmp_path / "run", endpoint, *settings, stages=WORKING, configuration=file)
     try:
         up = chain.start_up()
         with chain.watcher() as watcher:

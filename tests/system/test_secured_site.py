@@ -29,7 +29,7 @@ def chain(tmp_path: Path, endpoint: str) -> Iterator[Chain]:
     files = {"ca": "ca.pem", "certificate": "{role}.pem", "key": "{role}.key"}
     security = [f"bus.security.{name}='{tmp_path}/certs/{file}'" for name, file in files.items()]
     settings = ["bus.mode=client", *security, "twin_integrator.warm_up_s=2"]
-    chain = Chain(tmp_path, secured, *settings, viewer=False)
+    chain = Chain(tmp_path, secured, *settings)
     try:
         yield chain
     finally:

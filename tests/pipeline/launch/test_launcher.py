@@ -32,7 +32,7 @@ from tests.support.site_certificates import SiteCertificates
 
 @pytest.fixture
 def chain(tmp_path: Path, endpoint: str) -> Iterator[Chain]:
-    chain = Chain(tmp_path, endpoint, viewer=False)
+    chain = Chain(tmp_path, endpoint)
     try:
         yield chain
     finally:
@@ -100,18 +100,6 @@ def test_without_a_learner_a_tray_needs_a_twin_where_its_device_is_read_and_not_
         expected = pytest.raises(UserError, match="tray a has no twin")
     with expected:
         Launcher(load_config(file), (), no_bus).run(threading.Event())
-
-
-def test_the_process_list_has_one_acquisition_for_each_tray_in_the_order_of_the_data_flow(tmp_path):
-    file = tmp_path / "two.toml"
-    trays = "".join(f'[[tray]]\nname = "{name}"\nfans = 2\n' for name in ("a", "b"))
-    file.write_text('[launcher]\nstages = ["scorer", "acquisition", "resampler"]\n' + trays)
-    assert [row.label for row in process_list(load_config(file))] == [
-        "acquisition/a",
-        "acquisition/b",
-        "resampler",
-        "scorer",
-    ]
 
 
 @pytest.mark.slow
