@@ -10,12 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
+from scipy.linalg import get_lapack_funcs
 
 from fantwin.schemas.messages import Array
 from fantwin.scoring.column_state import ColumnState
+
+(_solve_bands,) = get_lapack_funcs(("tbtrs",), dtype=np.float64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +55,6 @@ class TorqueBalance(ColumnState):
         self._lagged = np.full(fans, np.nan)
         self._lag_step_s = np.nan
         self._lag_shares = (np.zeros(fans), np.zeros(fans))
-        load_lfilter()
         self._filtered = np.zeros(fans)
         self._weight = np.zeros(fans)
 
@@ -97,7 +98,7 @@ class TorqueBalance(ColumnState):
     def _all(self, excess: Array, keep: float) -> tuple[Array, Array]:
         both = np.hstack((excess, np.ones_like(excess)))
         state = keep * np.concatenate((self._filtered, self._weight))[np.newaxis]
-        filtered, _ = filter_rows(keep, both, state)
+        filtered = filter_rows(keep, both, state)
         return filtered[:, : excess.shape[1]], filtered[:, excess.shape[1] :]
 
     def _some(self, excess: Array, linked: Array, keep: float) -> tuple[Array, Array]:
@@ -114,7 +115,7 @@ class TorqueBalance(ColumnState):
                 if rows.start > 0:
                     state = np.zeros((1, 2))
                 pair = np.column_stack((excess[rows, fan], np.ones(rows.stop - rows.start)))
-                made, _ = filter_rows(keep, pair, keep * state)
+                made = filter_rows(keep, pair, keep * state)
                 filtered[rows, fan], weight[rows, fan] = made.T
         return filtered, weight
 
@@ -134,7 +135,7 @@ class TorqueBalance(ColumnState):
                 held = given[rows, fan]
                 # a lag that has long settled, where nothing is known from before
                 start = held[:1] if np.isnan(lagged[0]) or rows.start > 0 else lagged
-                after, _ = filter_rows(keep, held[:, np.newaxis], keep * start[np.newaxis])
+                after = filter_rows(keep, held[:, np.newaxis], keep * start[np.newaxis])
                 before = np.concatenate((start, after[:-1, 0]))
                 acting[rows, fan] = held + (before - held) * share
                 lagged = after[-1:, 0]
@@ -168,22 +169,18 @@ def by_rows(rows: int, fans: int) -> bool:
     return rows <= max(FEW_ROWS, ROWS_OF_FAN * fans)
 
 
-def filter_rows(keep: float, rows: Array, state: Array) -> tuple[Array, Array]:
+def filter_rows(keep: float, rows: Array, state: Array) -> Array:
     """y[k] = (1 - keep) x[k] + keep y[k-1] along the first axis, sample by sample, so that cuts change nothing.
 
-    rows: (n, m). state: (1, m), keep times the y before the first. Returns y (n, m) and the state after.
+    It is a lower bidiagonal system of equations: `scipy.signal` has a filter, and takes two seconds to import.
+
+    rows: (n, m). state: (1, m), keep times the y before the first. Returns y (n, m).
     """
-    made: Any = load_lfilter()([1.0 - keep], [1.0, -keep], rows, axis=0, zi=state)
-    return made[0], made[1]
-
-
-def load_lfilter() -> Any:
-    """The filter of SciPy. Whatever filters loads it when built: with the first long block of a line it would make the
-    first scores a second or two late. A process that only shows alarms does without this large import.
-    """
-    from scipy.signal import lfilter  # noqa: PLC0415
-
-    return lfilter
+    right = (1.0 - keep) * rows
+    right[0] += state[0]
+    bands = np.array([[1.0], [-keep]]).repeat(len(rows), axis=1)
+    solved: Array = _solve_bands(bands, np.asfortranarray(right), uplo="L", overwrite_b=1)[0]
+    return solved
 
 
 def unbroken_rows(flags: Array) -> Sequence[slice]:
