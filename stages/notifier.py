@@ -16,7 +16,7 @@ from fantwin.pipeline.outputs.notify.alertmanager import AlertSender
 from fantwin.pipeline.outputs.notify.config import NotifierConfig
 from fantwin.pipeline.outputs.notify.notification_flow import Changes, Notifications
 from fantwin.pipeline.outputs.notify.outbox import Outbox
-from fantwin.pipeline.outputs.notify.sending import Sender
+from fantwin.pipeline.outputs.notify.sending import TargetThread
 from fantwin.pipeline.outputs.notify.targets import problems_of, sender_of
 from fantwin.pipeline.outputs.notify.wording import Place
 from fantwin.pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageError
@@ -46,7 +46,7 @@ class NotifierCore(Core):
         trays: Sequence[TrayConfig],
         notifications: Notifications,
         outbox: Outbox,
-        senders: Mapping[str, Sender | AlertSender],
+        senders: Mapping[str, TargetThread],
     ) -> None:
         """senders: by target; they are started here."""
         self._config = config
@@ -159,9 +159,7 @@ class NotifierCore(Core):
         self._saving, self._saved_ns, self._has_news = "", now_ns, False
         self._notifications.changes = Changes()
         for outgoing in changes.outgoing:
-            sender = self._senders[outgoing.target]
-            if isinstance(sender, Sender):
-                sender.wake()
+            self._senders[outgoing.target].wake()
 
 
 def build(context: Context) -> BuiltStage:
@@ -178,7 +176,7 @@ def build(context: Context) -> BuiltStage:
     fans = {tray.name: tray.fans for tray in context.trays}
     saved, past = outbox.load()
     past = [alarm for alarm in past if alarm.fan < fans.get(alarm.header.tray, 0)]
-    notifications = Notifications(config, place, saved.of_fans(fans), outbox.was_sent, past)
+    notifications = Notifications(config, place, saved.of_fans(fans), past)
     senders = {target.name: sender_of(target, context.resolve, outbox, place) for target in config.target}
     return BuiltStage(NotifierCore(config, context.trays, notifications, outbox, senders))
 

@@ -169,7 +169,7 @@ def test_the_notifier_survives_any_alarm_and_its_outbox_can_be_read_again(sessio
     config = NotifierConfig.model_validate({"target": [target]})
     with TemporaryDirectory() as folder:
         outbox = Outbox(Path(folder) / "outbox", ["hook"])
-        notifications = Notifications(config, Place("hall"), Saved(is_first=False), outbox.was_sent)
+        notifications = Notifications(config, Place("hall"), Saved(is_first=False))
         survives(NotifierCore(config, TRAYS, notifications, outbox, {}), load_stage("notifier"), session)
         left = Outbox(Path(folder) / "outbox", ["hook"])
         left.load()

@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import base64
 import json
-import sqlite3
-import threading
 import time
 import urllib.error
 import urllib.request
@@ -20,12 +18,11 @@ from typing import Any
 from urllib.parse import unquote, urlsplit, urlunsplit
 
 from fantwin.pipeline.errors import UserError
-from fantwin.pipeline.outputs.notify.fan_alarm import FanAlarm
 from fantwin.pipeline.outputs.notify.outbox import FiringKey, Outbox
-from fantwin.pipeline.outputs.notify.sending import FIRST_DELAY_S, LONGEST_DELAY_S, Failure
+from fantwin.pipeline.outputs.notify.sending import Failure, TargetThread
 from fantwin.pipeline.outputs.notify.wording import Place, describe
-from fantwin.schemas.enums import Severity
 from fantwin.schemas.units import NS_PER_S
+from fantwin.scoring.alarms.current_alarms import CurrentAlarm
 
 RESEND_S = 60.0
 EXPIRES_S = 5 * RESEND_S
@@ -74,14 +71,14 @@ class Alertmanager:
         return None
 
 
-def alert(place: Place, alarm: FanAlarm, now_ns: int) -> dict[str, Any]:
+def alert(place: Place, current: CurrentAlarm, now_ns: int) -> dict[str, Any]:
     """An alarm that is active, as Alertmanager takes it. Without another one it expires after EXPIRES_S."""
-    lines = describe(place, alarm)
+    lines = describe(place, current)
     return {
-        **_labels(place, _key(alarm), now_ns),
+        **_labels(place, _key(current), now_ns),
         "endsAt": _rfc3339(now_ns + round(EXPIRES_S * NS_PER_S)),
         "annotations": {"summary": lines[0], "description": "\n".join(lines[1:])},
-        "generatorURL": place.page_of(alarm),
+        "generatorURL": place.page_of(current.newest),
     }
 
 
@@ -101,79 +98,44 @@ def test_alert(place: Place, target: str, now_ns: int) -> dict[str, Any]:
     }
 
 
-class AlertSender:
-    """Keeps an Alertmanager in line with the alarms, in a thread of its own."""
+class AlertSender(TargetThread):
+    """Keeps an Alertmanager in line with the alarms."""
 
     def __init__(self, target: str, manager: Alertmanager, outbox: Outbox, place: Place) -> None:
-        self._target = target
+        super().__init__(target, outbox, RESEND_S)
         self._manager = manager
-        self._outbox = outbox
         self._place = place
-        self._wanted: Sequence[FanAlarm] | None = None
+        self._wanted: Sequence[CurrentAlarm] | None = None
         """None: it is not known yet"""
-        self._stop = threading.Event()
-        self._changed = threading.Event()
-        self._failing = ""
-        self.sent = self.attempts = 0
-        self._thread = threading.Thread(target=self._run, name=f"alerts of {target}", daemon=True)
 
-    def start(self) -> None:
-        """Begin."""
-        self._thread.start()
-
-    def want(self, alarms: Sequence[FanAlarm]) -> None:
+    def want(self, alarms: Sequence[CurrentAlarm]) -> None:
         """These are to be there now, and no others."""
         if alarms != self._wanted:
             self._wanted = alarms
-            self._changed.set()
+            self.wake()
 
-    def stop(self, timeout_s: float) -> None:
-        """End after the request that is under way."""
-        self._stop.set()
-        self._changed.set()
-        self._thread.join(timeout_s)
-
-    def problem(self) -> str:
-        """Why it does not take them; empty if it does."""
-        return self._failing
-
-    def _run(self) -> None:
-        delay_s = 0.0
-        while not self._stop.is_set():
-            self._changed.clear()
-            try:
-                failure = self._send()
-            except sqlite3.Error as error:
-                failure = Failure(f"the outbox cannot be read or written: {error}")
-            if failure is not None:
-                self._failing = f"target {self._target}: not delivered ({failure.reason}); tried again until it is"
-                delay_s = min(LONGEST_DELAY_S, max(FIRST_DELAY_S, 2 * delay_s))
-                self._stop.wait(delay_s)
-            else:
-                self._failing, delay_s = "", 0.0
-                self._changed.wait(RESEND_S)
-
-    def _send(self) -> Failure | None:
+    def _deliver_all(self) -> Failure | None:
         now_ns = time.time_ns()
         wanted = self._wanted
         if wanted is None:
             return None
-        keys = [_key(alarm) for alarm in wanted]
+        keys = [_key(each) for each in wanted]
         still = {key[:3] for key in keys}
         over = sorted(key for key in self._outbox.firing(self._target) if key[:3] not in still)
-        alerts = [alert(self._place, alarm, now_ns) for alarm in wanted]
+        alerts = [alert(self._place, each, now_ns) for each in wanted]
         alerts += [resolved(self._place, key, now_ns) for key in over]
         self.attempts += 1
         if alerts and (failure := self._manager.post(alerts)) is not None:
             return failure
         self.sent += len(alerts)
-        if over or alerts:
+        if alerts:
             self._outbox.set_firing(self._target, keys)
         return None
 
 
-def _key(alarm: FanAlarm) -> FiringKey:
-    return alarm.tray, alarm.fan, Severity(alarm.severity).name.lower(), alarm.onset_t_ns
+def _key(current: CurrentAlarm) -> FiringKey:
+    alarm = current.newest
+    return alarm.header.tray, alarm.fan, alarm.severity.name.lower(), alarm.onset_t_ns
 
 
 def _labels(place: Place, key: FiringKey, now_ns: int) -> dict[str, Any]:

@@ -11,8 +11,9 @@ from enum import StrEnum
 from typing import Self
 
 from fantwin.pipeline.outputs.notify.config import TargetConfig
-from fantwin.pipeline.outputs.notify.fan_alarm import FanAlarm
+from fantwin.schemas.messages import Alarm
 from fantwin.schemas.units import NS_PER_S
+from fantwin.scoring.alarms.alarm_flags import is_silenced
 
 
 class Kind(StrEnum):
@@ -27,17 +28,23 @@ class Kind(StrEnum):
 
 
 @dataclass(frozen=True)
-class Event:
-    """Tray, fan, onset, kind and number identify it: a target hears of it once.
+class Happened:
+    """What happened to a fan since the last message, in order. number: of the last repetition."""
 
-    number: of a repetition, from 1; of the severity that it is worse by; else 0.
-    """
-
-    tray: str
-    fan: int
-    onset_t_ns: int
-    kind: Kind
+    kinds: tuple[Kind, ...] = ()
     number: int = 0
+
+    def then(self, later: Happened) -> Happened:
+        """Both."""
+        return Happened(self.kinds + later.kinds, later.number or self.number)
+
+
+class Told(StrEnum):
+    """How much of an alarm a target has heard."""
+
+    NOTHING = "nothing"
+    BEGUN = "begun"
+    ENDED = "ended"
 
 
 @dataclass(frozen=True)
@@ -45,17 +52,18 @@ class Announced:
     """What a target has heard of the last alarm of a fan.
 
     Attributes:
-        is_open: it has not heard that the alarm is over.
-        last_ns: when it last heard of it, by the clock of the host; not that data do not confirm it.
+        severity: the highest that it has heard of.
+        last_ns: when it last heard of it, by the clock of the host; not that data do not confirm it. Of an alarm of
+            which it has heard nothing: when that came.
         repeats: how many times it was sent again.
         is_stale_said: it has heard that data do not confirm the alarm.
         was_silenced: an operator has silenced the alarm since.
     """
 
     onset_t_ns: int
-    severity: int
-    is_open: bool
+    told: Told
     last_ns: int
+    severity: int = 0
     repeats: int = 0
     is_stale_said: bool = False
     was_silenced: bool = False
@@ -67,71 +75,68 @@ class Announced:
     @classmethod
     def from_json(cls, text: str) -> Self:
         """What `to_json` wrote."""
-        return cls(**json.loads(text))
+        values = json.loads(text)
+        return cls(**values | {"told": Told(values["told"])})
 
 
-def hears_of(target: TargetConfig, alarm: FanAlarm) -> bool:
+def hears_of(target: TargetConfig, alarm: Alarm) -> bool:
     """Whether it hears of such an alarm at all."""
-    return alarm.severity >= target.least_severity and (not target.trays or alarm.tray in target.trays)
+    return alarm.severity >= target.least_severity and _has_tray(target, alarm)
 
 
 def decide(
-    target: TargetConfig, alarm: FanAlarm, announced: Announced | None, now_ns: int
-) -> tuple[list[Event], Announced | None]:
-    """What a target hears of a fan now, and what it has heard then."""
-    has_open = announced is not None and announced.is_open
-    if alarm.silenced:
-        return [], replace(announced, was_silenced=True) if announced and has_open else announced
+    target: TargetConfig, alarm: Alarm, announced: Announced | None, now_ns: int
+) -> tuple[Happened | None, Announced | None]:
+    """What a target hears now of the newest message about a fan, and what it has heard then."""
+    has_begun = announced is not None and announced.told == Told.BEGUN
+    if is_silenced(alarm):
+        return None, replace(announced, was_silenced=True) if announced and has_begun else announced
     if not alarm.active:
-        return _end(alarm, announced, now_ns) if announced and has_open else ([], announced)
-    if hears_of(target, alarm):
-        if announced is None or announced.onset_t_ns != alarm.onset_t_ns:
-            return _begin(target, alarm, announced, now_ns)
-        if has_open:
-            return _continue(target, alarm, announced, now_ns)
-    return [], announced
+        if announced is None or not has_begun:
+            return None, announced
+        return Happened((Kind.CLEARED,)), replace(announced, told=Told.ENDED, last_ns=now_ns)
+    is_other = announced is None or announced.onset_t_ns != alarm.onset_t_ns
+    if not _has_tray(target, alarm) or (is_other and has_begun and not hears_of(target, alarm)):
+        return None, announced
+    if announced is None or is_other:
+        announced = Announced(alarm.onset_t_ns, Told.NOTHING, now_ns)
+    if announced.told == Told.ENDED or not hears_of(target, alarm):
+        return None, announced
+    decided = _begin if announced.told == Told.NOTHING else _continue
+    return decided(target, alarm, announced, now_ns)
 
 
-def _begin(
-    target: TargetConfig, alarm: FanAlarm, announced: Announced | None, now_ns: int
-) -> tuple[list[Event], Announced | None]:
-    if alarm.acknowledged:  # somebody knows
-        return [], announced
-    kind = Kind.RAISED
-    if target.escalation_after_s is not None:
-        if not _has_passed(target.escalation_after_s, alarm.first_heard_ns, now_ns):
-            return [], announced
-        kind = Kind.ESCALATED
-    event = Event(alarm.tray, alarm.fan, alarm.onset_t_ns, kind)
-    return [event], Announced(alarm.onset_t_ns, alarm.severity, True, now_ns, is_stale_said=alarm.stale)
+def _has_tray(target: TargetConfig, alarm: Alarm) -> bool:
+    return not target.trays or alarm.header.tray in target.trays
 
 
-def _end(alarm: FanAlarm, announced: Announced, now_ns: int) -> tuple[list[Event], Announced]:
-    cleared = Event(alarm.tray, alarm.fan, announced.onset_t_ns, Kind.CLEARED)
-    return [cleared], replace(announced, is_open=False, last_ns=now_ns)
+def _begin(target: TargetConfig, alarm: Alarm, announced: Announced, now_ns: int) -> tuple[Happened | None, Announced]:
+    after_s = target.escalation_after_s
+    if alarm.acknowledged or (after_s is not None and not _has_passed(after_s, announced.last_ns, now_ns)):
+        return None, announced
+    kind = Kind.RAISED if after_s is None else Kind.ESCALATED
+    told = replace(announced, told=Told.BEGUN, last_ns=now_ns, severity=int(alarm.severity), is_stale_said=alarm.stale)
+    return Happened((kind,)), told
 
 
 def _continue(
-    target: TargetConfig, alarm: FanAlarm, announced: Announced, now_ns: int
-) -> tuple[list[Event], Announced]:
-    events: list[Event] = []
-
-    def add(kind: Kind, number: int = 0) -> None:
-        events.append(Event(alarm.tray, alarm.fan, alarm.onset_t_ns, kind, number))
-
-    now = replace(announced, severity=alarm.severity, was_silenced=False)
-    if alarm.severity > announced.severity:
-        add(Kind.WORSE, alarm.severity)
+    target: TargetConfig, alarm: Alarm, announced: Announced, now_ns: int
+) -> tuple[Happened | None, Announced]:
+    kinds: list[Kind] = []
+    now = replace(announced, severity=max(announced.severity, int(alarm.severity)), was_silenced=False)
+    if now.severity > announced.severity:
+        kinds.append(Kind.WORSE)
     if alarm.stale and not announced.is_stale_said:
-        add(Kind.NOT_CONFIRMED)
+        kinds.append(Kind.NOT_CONFIRMED)
         now = replace(now, is_stale_said=True)
     is_due = target.repeat_s > 0 and _has_passed(target.repeat_s, announced.last_ns, now_ns)
-    if not alarm.acknowledged and not events and (announced.was_silenced or is_due):
+    if not alarm.acknowledged and not kinds and (announced.was_silenced or is_due):
+        kinds.append(Kind.AGAIN)
         now = replace(now, repeats=announced.repeats + 1)
-        add(Kind.AGAIN, now.repeats)
     # of fans that were raised together, those that data do not confirm stay together with the others
-    is_reminded = any(event.kind != Kind.NOT_CONFIRMED for event in events)
-    return events, replace(now, last_ns=now_ns) if is_reminded else now
+    if set(kinds) - {Kind.NOT_CONFIRMED}:
+        now = replace(now, last_ns=now_ns)
+    return Happened(tuple(kinds), now.repeats * (Kind.AGAIN in kinds)) if kinds else None, now
 
 
 def _has_passed(seconds: float, since_ns: int, now_ns: int) -> bool:

@@ -9,8 +9,8 @@ from datetime import datetime, tzinfo
 from typing import Self
 
 from fantwin.pipeline.outputs.notify.config import QuietHours
-from fantwin.pipeline.outputs.notify.deciding import Kind
-from fantwin.pipeline.outputs.notify.fan_alarm import FanName
+from fantwin.pipeline.outputs.notify.deciding import Happened, Kind
+from fantwin.pipeline.site.fleet import Fan
 from fantwin.schemas.enums import Severity
 from fantwin.schemas.units import NS_PER_S
 
@@ -21,18 +21,6 @@ DIGEST_ABOVE = 3
 DIGEST_WITHIN_S, LONGEST_S = 30.0, 600.0
 """while more fans keep coming, a combined message waits for up to the first, and each further one twice as long as the
 one before, up to the second"""
-
-
-@dataclass(frozen=True)
-class Happened:
-    """What happened to a fan since the last message, in order. number: of the last repetition."""
-
-    kinds: tuple[Kind, ...]
-    number: int = 0
-
-    def then(self, later: Happened) -> Happened:
-        """Both."""
-        return Happened(self.kinds + later.kinds, later.number or self.number)
 
 
 @dataclass
@@ -46,14 +34,14 @@ class Gathered:
     opened_ns: int = 0
     newest_ns: int = 0
     in_a_row: int = 0
-    fans: dict[FanName, Happened] = field(default_factory=dict)
+    fans: dict[Fan, Happened] = field(default_factory=dict)
 
-    def add(self, fan: FanName, happened: Happened, now_ns: int) -> None:
+    def add(self, fan: Fan, happened: Happened, now_ns: int) -> None:
         """Something has happened to one more fan, or more to the same one."""
         if not self.fans:
             self.opened_ns = now_ns
         self.newest_ns = now_ns
-        self.fans[fan] = self.fans.get(fan, Happened(())).then(happened)
+        self.fans[fan] = self.fans.get(fan, Happened()).then(happened)
 
     def to_json(self) -> str:
         """For the outbox."""
@@ -64,7 +52,7 @@ class Gathered:
     def from_json(cls, text: str) -> Self:
         """What `to_json` wrote."""
         opened_ns, newest_ns, in_a_row, fans = json.loads(text)
-        happened = {(t, f): Happened(tuple(map(Kind, kinds)), number) for t, f, kinds, number in fans}
+        happened = {Fan(t, f): Happened(tuple(map(Kind, kinds)), number) for t, f, kinds, number in fans}
         return cls(opened_ns, newest_ns, in_a_row, happened)
 
 

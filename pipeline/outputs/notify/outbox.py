@@ -12,32 +12,26 @@ import threading
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 from fantwin.pipeline.errors import UserError
-from fantwin.pipeline.outputs.notify.deciding import Announced, Event
+from fantwin.pipeline.outputs.notify.deciding import Announced
 from fantwin.pipeline.outputs.notify.gathering import Gathered
 from fantwin.pipeline.outputs.notify.notification_flow import Basket, Changes, Saved
 from fantwin.pipeline.outputs.notify.wording import Level, Text
 from fantwin.pipeline.site.alarm_history import AlarmHistory
+from fantwin.pipeline.site.fleet import Fan
 from fantwin.schemas.messages import Alarm
 from fantwin.schemas.units import NS_PER_S
 
 READER = "notifier"
 MOST_MESSAGES, KEPT_S = 10_000, 3 * 86_400.0
 """that wait for their targets: the oldest beyond that, and those that have waited longer, are lost"""
-MOST_EVENTS = 200_000
-"""of those that were decided, the last are remembered"""
 _SCHEMA = """
-CREATE TABLE IF NOT EXISTS heard (
-    tray TEXT, fan INTEGER, onset_t_ns INTEGER NOT NULL, heard_ns INTEGER NOT NULL, PRIMARY KEY (tray, fan));
 CREATE TABLE IF NOT EXISTS announced (
     target TEXT, tray TEXT, fan INTEGER, state TEXT NOT NULL, PRIMARY KEY (target, tray, fan));
 CREATE TABLE IF NOT EXISTS gathered (target TEXT, basket TEXT, state TEXT NOT NULL, PRIMARY KEY (target, basket));
-CREATE TABLE IF NOT EXISTS event (
-    target TEXT, tray TEXT, fan INTEGER, onset_t_ns INTEGER, kind TEXT, number INTEGER,
-    PRIMARY KEY (target, tray, fan, onset_t_ns, kind, number));
 CREATE TABLE IF NOT EXISTS message (
     number INTEGER PRIMARY KEY AUTOINCREMENT, target TEXT NOT NULL, made_ns INTEGER NOT NULL,
     title TEXT NOT NULL, body TEXT NOT NULL, level TEXT NOT NULL,
@@ -86,7 +80,7 @@ class Outbox:
                 self._store.write("UPDATE message SET under_way = 0, may_be_repeated = 1 WHERE under_way")
                 known = ", ".join("?" * len(names))
                 self._lose(f"target NOT IN ({known})", names)
-                for table in ("announced", "gathered", "lost", "firing"):
+                for table in ("gathered", "lost", "firing"):  # a target that comes back has heard what it had heard
                     self._store.write(f"DELETE FROM {table} WHERE target NOT IN ({known})", names)
         except sqlite3.Error as error:
             raise UserError(f"{path}: messages cannot be kept there: {error}") from error
@@ -98,7 +92,6 @@ class Outbox:
             UserError: it cannot be understood.
         """
         with self._lock:
-            heard = self._store.read("SELECT tray, fan, onset_t_ns, heard_ns FROM heard")
             announced = self._store.read("SELECT target, tray, fan, state FROM announced")
             gathered = self._store.read("SELECT target, basket, state FROM gathered")
             past = self._history.last_occurrences(self._position) if self._position is not None else ()
@@ -106,8 +99,7 @@ class Outbox:
         try:
             saved = Saved(
                 is_first=is_first,
-                heard={(tray, fan): (onset_t_ns, heard_ns) for tray, fan, onset_t_ns, heard_ns in heard},
-                announced={(name, (tray, fan)): Announced.from_json(state) for name, tray, fan, state in announced},
+                announced={(name, Fan(tray, fan)): Announced.from_json(state) for name, tray, fan, state in announced},
                 gathered={(name, Basket(basket)): Gathered.from_json(state) for name, basket, state in gathered},
             )
         except (ValueError, KeyError, TypeError) as error:
@@ -137,17 +129,6 @@ class Outbox:
         """Why transitions cannot be kept or read; empty if they can."""
         return self._history.problem
 
-    def was_sent(self, target: str, event: Event) -> bool:
-        """Whether an event was decided before for a target; of a damaged file, where nothing is saved either: no."""
-        with self._lock, suppress(sqlite3.Error):
-            found = self._store.write(
-                "SELECT 1 FROM event WHERE target = ? AND tray = ? AND fan = ? AND onset_t_ns = ? AND kind = ?"
-                " AND number = ?",
-                (target, *astuple(event)),
-            )
-            return found.fetchone() is not None
-        return False
-
     def save(self, saved: Saved, changes: Changes, now_ns: int) -> None:
         """Save what has changed, all or nothing. Messages that are too old or too many are lost.
 
@@ -157,20 +138,12 @@ class Outbox:
         file = self._store
         with self._lock, file.transaction():
             file.write_many(
-                "INSERT OR REPLACE INTO heard VALUES (?, ?, ?, ?)",
-                [(*name, *saved.heard[name]) for name in changes.heard],
-            )
-            file.write_many(
                 "INSERT OR REPLACE INTO announced VALUES (?, ?, ?, ?)",
                 [(target, *fan, saved.announced[target, fan].to_json()) for target, fan in changes.announced],
             )
             file.write_many(
                 "INSERT OR REPLACE INTO gathered VALUES (?, ?, ?)",
                 [(*key, saved.gathered[key].to_json()) for key in changes.gathered],
-            )
-            file.write_many(
-                "INSERT OR IGNORE INTO event VALUES (?, ?, ?, ?, ?, ?)",
-                [(target, *astuple(event)) for target, event in changes.events],
             )
             file.write_many(
                 "INSERT INTO message (target, made_ns, title, body, level) VALUES (?, ?, ?, ?, ?)",
@@ -180,7 +153,6 @@ class Outbox:
                 ],
             )
             self._history.set_position(READER, self._position or 0)
-            file.write("DELETE FROM event WHERE rowid <= (SELECT MAX(rowid) FROM event) - ?", (MOST_EVENTS,))
             self._lose("made_ns < ?", (now_ns - round(KEPT_S * NS_PER_S),))
             self._lose("number <= (SELECT number FROM message ORDER BY number DESC LIMIT 1 OFFSET ?)", (MOST_MESSAGES,))
 

@@ -45,23 +45,18 @@ def words_sent(waiting: Waiting) -> Text:
     return replace(waiting.text, body="\n".join(lines))
 
 
-class Sender:
-    """Sends the messages of one target, in their order; tries again until they arrive or are lost by their age."""
+class TargetThread:
+    """A thread that delivers to one target, and tries again with growing delays where that fails."""
 
-    def __init__(self, target: str, deliver: Deliver, outbox: Outbox, pause_s: float) -> None:
-        """pause_s: least time between two messages."""
+    def __init__(self, target: str, outbox: Outbox, again_s: float) -> None:
+        """again_s: longest time between two looks at what is to be delivered."""
         self._target = target
-        self._deliver = deliver
         self._outbox = outbox
-        self._pause_s = pause_s
+        self._again_s = again_s
         self._stop = threading.Event()
         self._wake = threading.Event()
         self._failing = ""
-        self._delivery_began_s: float | None = None
-        self._taken: Waiting | None = None
-        """the last message that has arrived, until the outbox knows it"""
-        self._refused_number = self._refusals = 0
-        """of the message that was refused last, how often"""
+        self._delay_s = 0.0
         self.sent = self.attempts = 0
         self._thread = threading.Thread(target=self._run, name=f"sender of {target}", daemon=True)
 
@@ -70,54 +65,75 @@ class Sender:
         self._thread.start()
 
     def wake(self) -> None:
-        """There may be a new message."""
+        """There may be something new."""
         self._wake.set()
 
     def stop(self, timeout_s: float) -> None:
-        """End after the delivery that is under way. One that takes longer is left behind: its message is sent again
-        after a restart."""
+        """End after the delivery that is under way. One that takes longer is left behind."""
         self._stop.set()
         self._wake.set()
         self._thread.join(timeout_s)
 
     def problem(self) -> str:
         """Why nothing arrives at the target; empty if all is well. The same words as long as the reason is the same."""
-        began_s = self._delivery_began_s
-        if began_s is not None and time.monotonic() - began_s > HUNG_AFTER_S:
-            return f"target {self._target}: a delivery has not ended for more than {HUNG_AFTER_S:.0f} s"
         return self._failing
 
+    def _deliver_all(self) -> Failure | None:
+        """Deliver what there is, up to the first failure."""
+        raise NotImplementedError
+
+    def _arrived(self) -> None:
+        self._failing, self._delay_s = "", 0.0
+
     def _run(self) -> None:
-        delay_s = 0.0
         while not self._stop.is_set():
             self._wake.clear()
             try:
-                delay_s = self._send_next(delay_s)
+                failure = self._deliver_all()
             except sqlite3.Error as error:
-                self._failing = f"target {self._target}: the outbox cannot be read or written: {error}"
-                delay_s = LONGEST_DELAY_S
-            if delay_s:
-                self._stop.wait(delay_s)
+                failure = Failure(f"the outbox cannot be read or written: {error}")
+            if failure is None:
+                self._arrived()
+                self._wake.wait(self._again_s)
             else:
-                self._wake.wait(IDLE_S)
+                self._failing = f"target {self._target}: not delivered ({failure.reason}); tried again until it is"
+                self._delay_s = min(LONGEST_DELAY_S, max(FIRST_DELAY_S, 2 * self._delay_s))
+                self._stop.wait(self._delay_s)
 
-    def _send_next(self, delay_s: float) -> float:
-        """Send all that waits, up to the first failure; returns after how long to try again, 0 if nothing waits."""
+
+class Sender(TargetThread):
+    """Sends the messages of one target, in their order; tries again until they arrive or are lost by their age. A
+    message that is left behind by a stop is sent again after a restart."""
+
+    def __init__(self, target: str, deliver: Deliver, outbox: Outbox, pause_s: float) -> None:
+        """pause_s: least time between two messages."""
+        super().__init__(target, outbox, IDLE_S)
+        self._deliver = deliver
+        self._pause_s = pause_s
+        self._delivery_began_s: float | None = None
+        self._taken: Waiting | None = None
+        """the last message that has arrived, until the outbox knows it"""
+        self._refused_number = self._refusals = 0
+        """of the message that was refused last, how often"""
+
+    def problem(self) -> str:
+        """Also a delivery that does not end."""
+        began_s = self._delivery_began_s
+        if began_s is not None and time.monotonic() - began_s > HUNG_AFTER_S:
+            return f"target {self._target}: a delivery has not ended for more than {HUNG_AFTER_S:.0f} s"
+        return super().problem()
+
+    def _deliver_all(self) -> Failure | None:
         self._forget_taken()
-        while not self._stop.is_set():
-            waiting = self._outbox.next_for(self._target)
-            if waiting is None:
-                self._failing = ""
-                return 0.0
+        while not self._stop.is_set() and (waiting := self._outbox.next_for(self._target)) is not None:
             failure = self._attempt(waiting)
             if failure is not None and failure.is_refusal and self._is_refused_alone(waiting):
                 self._outbox.refuse(self._target, waiting)
             elif failure is not None:
-                self._failing = f"target {self._target}: not delivered ({failure.reason}); tried again until it is"
-                return min(LONGEST_DELAY_S, max(FIRST_DELAY_S, 2 * delay_s))
-            self._failing, delay_s = "", 0.0
+                return failure
+            self._arrived()
             self._stop.wait(self._pause_s)
-        return delay_s
+        return None
 
     def _attempt(self, waiting: Waiting) -> Failure | None:
         self._outbox.begin(waiting)

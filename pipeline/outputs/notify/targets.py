@@ -12,7 +12,7 @@ from fantwin.pipeline.outputs.notify.alertmanager import Alertmanager, AlertSend
 from fantwin.pipeline.outputs.notify.apprise_service import Service
 from fantwin.pipeline.outputs.notify.config import NotifierConfig, TargetConfig
 from fantwin.pipeline.outputs.notify.outbox import Outbox
-from fantwin.pipeline.outputs.notify.sending import Failure, Sender
+from fantwin.pipeline.outputs.notify.sending import Failure, Sender, TargetThread
 from fantwin.pipeline.outputs.notify.wording import Place, test_text
 from fantwin.pipeline.sources.secret_file import read_secret, secret_of_environment
 
@@ -46,7 +46,7 @@ def connection_of(target: TargetConfig, resolve: Resolve) -> Service | Alertmana
         raise UserError(f"target {target.name}: {error}") from error
 
 
-def sender_of(target: TargetConfig, resolve: Resolve, outbox: Outbox, place: Place) -> Sender | AlertSender:
+def sender_of(target: TargetConfig, resolve: Resolve, outbox: Outbox, place: Place) -> TargetThread:
     """The thread that sends to it, not yet started.
 
     Raises:

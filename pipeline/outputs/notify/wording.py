@@ -9,12 +9,13 @@ from datetime import datetime, tzinfo
 from enum import StrEnum
 from urllib.parse import quote
 
-from fantwin.pipeline.outputs.notify.deciding import Kind
-from fantwin.pipeline.outputs.notify.fan_alarm import FanAlarm
-from fantwin.pipeline.outputs.notify.gathering import Happened, ranges
+from fantwin.pipeline.outputs.notify.deciding import Happened, Kind
+from fantwin.pipeline.outputs.notify.gathering import ranges
 from fantwin.schemas.enums import Severity
-from fantwin.schemas.messages import Diagnosis
+from fantwin.schemas.messages import Alarm, Diagnosis
 from fantwin.schemas.units import NS_PER_S
+from fantwin.scoring.alarms.alarm_text import deviation_in
+from fantwin.scoring.alarms.current_alarms import CurrentAlarm
 from fantwin.scoring.diagnosis.causes import (
     CANNOT_TELL,
     CAUSES,
@@ -75,9 +76,9 @@ class Place:
             return "at an unknown time"
         return at.strftime("%Y-%m-%d %H:%M:%S %Z")
 
-    def page_of(self, alarm: FanAlarm) -> str:
+    def page_of(self, alarm: Alarm) -> str:
         """The address of a fan on the page; empty without a page."""
-        return f"{self.page.rstrip('/')}/#/fan/{quote(alarm.tray, safe='')}/{alarm.fan}" if self.page else ""
+        return f"{self.page.rstrip('/')}/#/fan/{quote(alarm.header.tray, safe='')}/{alarm.fan}" if self.page else ""
 
 
 def cause_line(causes: Sequence[Diagnosis]) -> str:
@@ -93,38 +94,40 @@ def cause_line(causes: Sequence[Diagnosis]) -> str:
     return f"Cause: {likely_with_share(causes)}{evidence}{''.join(f', or {each}' for each in others)}"
 
 
-def about_fan(place: Place, alarm: FanAlarm, happened: Happened, now_ns: int) -> Text:
+def about_fan(place: Place, current: CurrentAlarm, happened: Happened, now_ns: int) -> Text:
     """A message about one fan."""
-    kinds = happened.kinds
+    kinds, alarm = happened.kinds, current.newest
     if alarm.active:
-        beginning, word = _BEGINNING[min(kinds, key=_BY_IMPORTANCE.index)], alarm.severity_name
+        beginning, word = _BEGINNING[min(kinds, key=_BY_IMPORTANCE.index)], alarm.severity.name
     else:
         is_new = bool({Kind.RAISED, Kind.ESCALATED} & set(kinds))
         beginning, word = "Raised and cleared: " if is_new else _BEGINNING[Kind.CLEARED], "alarm"
-    lines = describe(place, alarm)
+    lines = describe(place, current)
     if kinds[-1] == Kind.AGAIN and happened.number > 1:
         lines.append(f"This is reminder {happened.number}.")
     lines.append(f"As of {place.clock(now_ns)}")
     if address := place.page_of(alarm):
         lines.append(address)
-    return Text(f"{beginning}{word}, fan {alarm.fan} of {alarm.tray} ({place.site})", "\n".join(lines), _level([alarm]))
+    title = f"{beginning}{word}, fan {alarm.fan} of {alarm.header.tray} ({place.site})"
+    return Text(title, "\n".join(lines), _level([alarm]))
 
 
-def describe(place: Place, alarm: FanAlarm) -> list[str]:
+def describe(place: Place, current: CurrentAlarm) -> list[str]:
     """The alarm of a fan: since when, how far it is from its twin, the cause, what to do, and who knows."""
-    fan = f"fan {alarm.fan} of {alarm.tray} at {place.site}"
+    alarm, deviation = current.newest, _deviation(place, current)
+    fan = f"fan {alarm.fan} of {alarm.header.tray} at {place.site}"
     if alarm.onset_t_ns == 0:
         return [f"{fan}: no alarm"]
     if not alarm.active:
         lines = [f"{fan}: back to normal; the alarm began {place.clock(alarm.onset_t_ns)}"]
-        lines += [f"Deviation: {_deviation(place, alarm)}"] if alarm.deviation else []
+        lines += [f"Deviation: {deviation}"] if deviation else []
     else:
-        lines = [f"{fan}: {alarm.severity_name} since {place.clock(alarm.onset_t_ns)}"]
-        lines += [_deviation(place, alarm) or "deviates from its twin", cause_line(alarm.causes)]
-        if to_do := advice(alarm.causes):
+        lines = [f"{fan}: {alarm.severity.name} since {place.clock(alarm.onset_t_ns)}"]
+        lines += [deviation or "deviates from its twin", cause_line(current.causes)]
+        if to_do := advice(current.causes):
             lines.append(f"What to do: {to_do}")
     if alarm.acknowledged:
-        lines.append(f"Acknowledged{f' by {alarm.acknowledged_by}' if alarm.acknowledged_by else ''}.")
+        lines.append(f"Acknowledged{f' by {current.acknowledged_by}' if current.acknowledged_by else ''}.")
     else:
         lines.append("Not acknowledged.")
     if alarm.stale:
@@ -132,18 +135,19 @@ def describe(place: Place, alarm: FanAlarm) -> list[str]:
     return lines
 
 
-def _deviation(place: Place, alarm: FanAlarm) -> str:
-    """With its time: it is not as new as the message."""
-    at = f" at {place.clock(alarm.deviation_t_ns)}" if alarm.deviation and alarm.deviation_t_ns else ""
-    return f"{alarm.deviation}{at}"
+def _deviation(place: Place, current: CurrentAlarm) -> str:
+    """How far the fan is from its twin, as the last message that said so has it, with its time; may be empty."""
+    raised = current.raised
+    deviation = deviation_in(raised.message, raised.fan) if raised else ""
+    return f"{deviation} at {place.clock(raised.t_ns)}" if raised and deviation and raised.t_ns else deviation
 
 
 def about_many(
-    place: Place, fans: Sequence[tuple[FanAlarm, Happened]], now_ns: int, *, were_held: bool = False
+    place: Place, fans: Sequence[tuple[CurrentAlarm, Happened]], now_ns: int, *, were_held: bool = False
 ) -> Text:
     """One message about many fans, or about those of quiet hours."""
-    alarms = [alarm for alarm, _ in fans]
-    trays = sorted({alarm.tray for alarm in alarms})
+    alarms = [each.newest for each, _ in fans]
+    trays = {alarm.header.tray for alarm in alarms}
     active = [alarm for alarm in alarms if alarm.active]
     subject = f"{_count(len(fans), 'alarm')}{'' if active else ' cleared'} in {_count(len(trays), 'tray')}"
     counted = f": {', '.join(_how_many(fans))}" if active else ""
@@ -152,7 +156,7 @@ def about_many(
         lines.insert(0, "Held during quiet hours:")
     lines += _of_each_tray(alarms)
     if active:
-        causes = Counter(likely_causes(each.causes) or "unknown" for each in active)
+        causes = Counter(likely_causes(each.causes) or "unknown" for each, _ in fans if each.newest.active)
         named = [f"{words} {count}" for words, count in causes.most_common(MOST_NAMED_CAUSES)]
         lines.append(f"Most probable causes: {'; '.join(named)}")
         lines.append(f"The first alarm began {place.clock(min(each.onset_t_ns for each in active))}")
@@ -174,10 +178,10 @@ def _with_probability(cause: Diagnosis) -> str:
     return f"{CAUSES.get(cause.cause, cause.cause)}, {100 * cause.probability:.0f} %"
 
 
-def _how_many(fans: Sequence[tuple[FanAlarm, Happened]]) -> list[str]:
+def _how_many(fans: Sequence[tuple[CurrentAlarm, Happened]]) -> list[str]:
     """How many are in alarm, warned of and cleared, and why they are in the message where that is not clear."""
-    alarms = [alarm for alarm, _ in fans]
-    active: Mapping[str, int] = Counter(each.severity_name for each in alarms if each.active)
+    alarms = [each.newest for each, _ in fans]
+    active: Mapping[str, int] = Counter(each.severity.name for each in alarms if each.active)
     parts = [f"{active[name]} {name}" for name in ("ALARM", "WARNING") if active.get(name)]
     if cleared := sum(not each.active for each in alarms):
         parts.append(f"{cleared} cleared")
@@ -188,15 +192,15 @@ def _how_many(fans: Sequence[tuple[FanAlarm, Happened]]) -> list[str]:
         (Kind.NOT_CONFIRMED, "no longer confirmed by data"),
     )
     for kind, words in reasons:
-        if count := sum(a.active and kind in h.kinds and Kind.RAISED not in h.kinds for a, h in fans):
+        if count := sum(c.newest.active and kind in h.kinds and Kind.RAISED not in h.kinds for c, h in fans):
             parts.append(f"{count} {words}")
     return parts
 
 
-def _of_each_tray(alarms: Sequence[FanAlarm]) -> list[str]:
+def _of_each_tray(alarms: Sequence[Alarm]) -> list[str]:
     fans: dict[tuple[str, bool], list[int]] = {}
     for alarm in alarms:
-        fans.setdefault((alarm.tray, not alarm.active), []).append(alarm.fan)
+        fans.setdefault((alarm.header.tray, not alarm.active), []).append(alarm.fan)
     lines: list[str] = []
     for (tray, is_over), numbers in sorted(fans.items()):
         shown = ranges(numbers)
@@ -211,7 +215,7 @@ def _count(number: int, word: str) -> str:
     return f"{number} {word}" if number == 1 else f"{number} {word}s"
 
 
-def _level(alarms: Sequence[FanAlarm]) -> Level:
+def _level(alarms: Sequence[Alarm]) -> Level:
     highest = max((each.severity for each in alarms if each.active), default=0)
     if not highest:
         return Level.GOOD

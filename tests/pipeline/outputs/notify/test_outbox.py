@@ -9,17 +9,18 @@ import pytest
 
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.outputs.notify import outbox as module
-from fantwin.pipeline.outputs.notify.deciding import Announced, Event, Kind
-from fantwin.pipeline.outputs.notify.gathering import Gathered, Happened
+from fantwin.pipeline.outputs.notify.deciding import Announced, Happened, Kind, Told
+from fantwin.pipeline.outputs.notify.gathering import Gathered
 from fantwin.pipeline.outputs.notify.notification_flow import Basket, Changes, Outgoing, Saved
 from fantwin.pipeline.outputs.notify.outbox import Outbox
 from fantwin.pipeline.outputs.notify.wording import Level, Text
+from fantwin.pipeline.site.fleet import Fan
 from fantwin.schemas.units import NS_PER_S
 from tests.support.notified_alarms import START_NS, alarm
 
 TEXT = Text("WARNING, fan 2", "fan 2 of tray1", Level.WARNING)
-FAN = ("tray1", 2)
-EVENT = Event("tray1", 2, START_NS, Kind.RAISED)
+FAN = Fan("tray1", 2)
+ANNOUNCED = {("mail", FAN): Announced(START_NS, Told.BEGUN, START_NS, 1)}
 
 
 def save(outbox: Outbox, saved: Saved, changes: Changes, *, seconds: float = 0.0) -> None:
@@ -44,11 +45,10 @@ def test_all_that_was_decided_is_there_again(outbox, tmp_path):
     assert heard.fan == 2
     saved = Saved(
         is_first=False,
-        heard={FAN: (START_NS, START_NS + 1)},
-        announced={("mail", FAN): Announced(START_NS, 1, True, START_NS)},
+        announced=ANNOUNCED,
         gathered={("mail", Basket.HELD): Gathered(1, 2, 3, {FAN: Happened((Kind.RAISED, Kind.AGAIN), 4)})},
     )
-    changes = Changes({FAN}, {("mail", FAN)}, {("mail", Basket.HELD)}, {("mail", EVENT)}, texts("mail").outgoing)
+    changes = Changes({*ANNOUNCED}, {("mail", Basket.HELD)}, texts("mail").outgoing)
     save(outbox, saved, changes)
     outbox.close()
     again = Outbox(tmp_path / "outbox", ["mail", "chat"])
@@ -56,7 +56,6 @@ def test_all_that_was_decided_is_there_again(outbox, tmp_path):
     assert loaded == saved
     assert [each.fan for each in past] == [2], "the other was not read before the first one was saved"
     assert [each.fan for each in again.news(9)] == [3]
-    assert again.was_sent("mail", EVENT) and not again.was_sent("chat", EVENT)
     waiting = again.next_for("mail")
     assert waiting and waiting.text == TEXT and not waiting.may_be_repeated
     assert again.next_for("chat") is None
@@ -92,20 +91,28 @@ def test_the_oldest_are_lost_and_the_next_one_knows_how_many(outbox, monkeypatch
     assert outbox.next_for("mail").lost == 0, "it was said once"
 
 
-def test_messages_of_a_target_that_is_gone_are_lost_and_counted(outbox, tmp_path):
-    save(outbox, Saved(), texts("mail", "chat", "chat"))
+def test_messages_of_a_target_that_is_gone_are_lost_and_counted_and_one_that_comes_back_hears_nothing_twice(
+    outbox, tmp_path
+):
+    changes = texts("chat", "mail", "mail")
+    changes.announced |= ANNOUNCED.keys()
+    save(outbox, Saved(announced=ANNOUNCED), changes)
     outbox.close()
-    again = Outbox(tmp_path / "outbox", ["mail"])
-    assert (again.count(), again.lost) == (1, {"chat": 2})
+    again = Outbox(tmp_path / "outbox", ["chat"])
+    assert (again.count(), again.lost) == (1, {"mail": 2})
+    assert again.load()[0].announced == ANNOUNCED
 
 
-def test_nothing_is_saved_by_halves(outbox, tmp_path):
+def test_nothing_is_saved_by_halves_and_what_cannot_be_decided_for_good_is_not_sent(outbox, tmp_path):
     outbox.load()
     outbox.hear(alarm())
     assert len(outbox.news(9)) == 1
-    outbox._store.write("DROP TABLE event")
+    outbox._store.write("DROP TABLE gathered")
+    changes = texts("mail")
+    changes.announced |= ANNOUNCED.keys()
     with pytest.raises(sqlite3.Error):
-        save(outbox, Saved(heard={FAN: (1, 2)}), Changes({FAN}, events={("mail", EVENT)}))
+        save(outbox, Saved(announced=ANNOUNCED), changes)
+    assert outbox.next_for("mail") is None
     outbox.close()
     again = Outbox(tmp_path / "outbox", ["mail"])
     assert again.load()[0] == Saved(), "not even that it was read"
@@ -118,11 +125,3 @@ def test_a_file_that_cannot_be_understood_is_named(outbox, tmp_path):
     (tmp_path / "text").write_text("this is no database, and long enough to be seen as such\n" * 20)
     with pytest.raises(UserError, match="the history of alarms cannot be kept there"):
         Outbox(tmp_path / "text", ["mail"])
-
-
-def test_a_file_that_is_damaged_while_it_is_used_ends_nothing(outbox):
-    outbox._store.write("DROP TABLE event")
-    assert not outbox.was_sent("mail", EVENT)
-    with pytest.raises(sqlite3.Error):
-        save(outbox, Saved(), texts("mail"))
-    assert outbox.next_for("mail") is None, "what cannot be decided for good is not sent"
