@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING
 
 from fantwin.pipeline.errors import refusals
 from fantwin.pipeline.extras import missing_extra, require
-from fantwin.pipeline.outputs.opcua.conditions import Condition
 from fantwin.pipeline.outputs.opcua.config import OpcuaConfig
 from fantwin.pipeline.runtime.stage import BuiltStage, Context, Stage
 from fantwin.pipeline.site.alarm_history import FILE, AlarmHistory
@@ -50,10 +49,9 @@ class OpcuaCore(SiteCore):
     def add_alarm(self, alarm: Alarm) -> None:
         """Keep it; a transition becomes an event."""
         is_new = self._model.add_alarm(alarm)
-        fan = Fan(alarm.header.tray, alarm.fan)
-        current = self._model.current_alarm(fan)
+        current = self._model.current_alarm(Fan(alarm.header.tray, alarm.fan))
         if is_new and current is not None and alarm.transition != Transition.REFUSED:
-            self._server.publish(Condition(fan, current))
+            self._server.publish(current)
         self._desk.add(alarm)
 
     def tick(self, now_ns: int) -> Sequence[Message]:

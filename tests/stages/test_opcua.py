@@ -93,7 +93,7 @@ def test_a_session_ends_with_the_password_that_began_it(opcua, tmp_path):
 
 
 def test_a_scorer_that_does_not_answer_is_a_timeout_and_others_are_served_meanwhile(opcua, tmp_path, monkeypatch):
-    monkeypatch.setattr("fantwin.pipeline.site.request_desk.ANSWERED_WITHIN_S", 3.0)
+    monkeypatch.setattr("fantwin.pipeline.site.request_desk.ANSWERED_WITHIN_S", 2.0)
 
     async def acts() -> tuple[str, str]:
         client = await encrypted(opcua, tmp_path, UNHEARD)

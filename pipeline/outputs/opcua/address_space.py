@@ -13,13 +13,13 @@ from asyncua import Node, Server, ua
 from asyncua.server.address_space import AddressSpace
 
 from fantwin.pipeline.config.models import TrayConfig
-from fantwin.pipeline.outputs.opcua.conditions import OWN_FIELDS
-from fantwin.pipeline.outputs.opcua.encoding import STATUS
+from fantwin.pipeline.outputs.opcua.conditions import OWN_FIELDS, condition_fields
+from fantwin.pipeline.outputs.opcua.encoding import STATUS, standard
 from fantwin.pipeline.outputs.opcua.fan_values import VARIABLES
 from fantwin.pipeline.outputs.opcua.identifiers import COMMISSION, FAN_ALARM_TYPE, FAN_TYPE, SITE_FOLDER
 from fantwin.pipeline.outputs.opcua.requests import FAN_METHODS
 from fantwin.pipeline.outputs.opcua.site_nodes import SiteNode, SiteNodes, ValueOf
-from fantwin.pipeline.outputs.opcua.templates import standard
+from fantwin.pipeline.site.fleet import Fan
 
 _NOTIFIES = [ua.EventNotifier.SubscribeToEvents, ua.EventNotifier.HistoryRead]
 _FIRST_DECLARATION = 100
@@ -124,9 +124,9 @@ async def _add_types(server: Server, namespace: int) -> None:
         ua.NodeId(FAN_ALARM_TYPE, namespace), _name("FanAlarmType", namespace)
     )
     number = _FIRST_DECLARATION
-    for name, kind in OWN_FIELDS.items():
-        value = ua.Variant("" if kind == "String" else 0.0, ua.VariantType[kind])
-        declared = await alarm_type.add_property(ua.NodeId(number, namespace), _name(name, namespace), value)
+    fields = condition_fields(Fan("", 0), None, 0, namespace)
+    for name in OWN_FIELDS:
+        declared = await alarm_type.add_property(ua.NodeId(number, namespace), _name(name, namespace), fields[name])
         await declared.set_modelling_rule(True)
         number += 1
     fan_type = await server.nodes.base_object_type.add_object_type(

@@ -9,8 +9,6 @@ from typing import Any
 
 from asyncua import ua
 
-from fantwin.pipeline.outputs.opcua.conditions import OwnNode, StandardNode, Time
-
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 STATUS = {name: ua.StatusCode(ua.UInt32(code)) for name, code in vars(ua.StatusCodes).items() if isinstance(code, int)}
 
@@ -35,29 +33,36 @@ def micros_of(at: datetime) -> int:
     return (at.replace(tzinfo=at.tzinfo or UTC) - _EPOCH) // timedelta(microseconds=1)
 
 
-def node_id(node: StandardNode | OwnNode, namespace: int) -> ua.NodeId:
-    """namespace: index of this server's own nodes."""
-    if isinstance(node, StandardNode):
-        return ua.NodeId(getattr(ua.ObjectIds, node.name))
-    return ua.NodeId(node.identifier, namespace) if node.identifier != "" else ua.NodeId()
+def standard(name: str) -> ua.NodeId:
+    """A node of the standard, by the name of its identifier."""
+    return ua.NodeId(getattr(ua.ObjectIds, name))
 
 
-def variant(kind: str, value: Any, namespace: int) -> ua.Variant:
-    """kind: built-in type by name."""
-    if kind == "LocalizedText":
-        value = ua.LocalizedText(value)
-    elif kind == "NodeId":
-        value = node_id(value, namespace)
-    elif kind == "DateTime":
-        value = time_of(value.t_ns) if isinstance(value, Time) else value
-        if value is None:  # the library cannot send a time that is none
-            return ua.Variant()
-    elif kind == "StatusCode":
-        value = STATUS[value]
+def null_or_time(t_ns: int) -> ua.Variant:
+    """Null for 0: the library cannot send a time that is none."""
+    return ua.Variant(time_of(t_ns), ua.VariantType.DateTime) if t_ns else ua.Variant()
+
+
+def localized(text: str) -> ua.Variant:
+    """A text for people."""
+    return ua.Variant(ua.LocalizedText(text), ua.VariantType.LocalizedText)
+
+
+def string(text: str) -> ua.Variant:
+    """A text for programs."""
+    return ua.Variant(text, ua.VariantType.String)
+
+
+def boolean(value: bool) -> ua.Variant:
+    """A flag."""
+    return ua.Variant(value, ua.VariantType.Boolean)
+
+
+def number(value: float, kind: str = "Double") -> ua.Variant:
+    """A number of a built-in type."""
     return ua.Variant(value, ua.VariantType[kind])
 
 
-def data_value(kind: str, value: Any, status: str, t_ns: int, namespace: int, now: datetime) -> SharedValue:
-    """t_ns: source timestamp. A value with a bad status is none."""
-    found = ua.Variant() if value is None else variant(kind, value, namespace)
-    return SharedValue(found, STATUS[status], time_of(t_ns) or now, now)
+def data_value(value: ua.Variant, status: str, t_ns: int, now: datetime) -> SharedValue:
+    """t_ns: source timestamp."""
+    return SharedValue(value, STATUS[status], time_of(t_ns) or now, now)

@@ -13,6 +13,7 @@ from typing import Any
 
 from asyncua import ua
 
+from fantwin.pipeline.outputs.opcua.encoding import standard
 from fantwin.pipeline.outputs.opcua.identifiers import FAN_ALARM_TYPE
 
 CONDITION_ID = "NodeId"
@@ -34,7 +35,7 @@ def as_the_library_evaluates(clause: ua.ContentFilter, namespace: int) -> ua.Con
     if not clause.Elements:
         return clause
     types = _types(namespace)
-    refresh = _is_one_of(ua.NodeId(getattr(ua.ObjectIds, name)) for name in _OF_REFRESH)
+    refresh = _is_one_of(standard(name) for name in _OF_REFRESH)
     first = ua.ContentFilterElement(
         FilterOperator=ua.FilterOperator.Or,
         FilterOperands=[ua.ElementOperand(Index=ua.UInt32(1)), ua.ElementOperand(Index=ua.UInt32(2))],
@@ -45,8 +46,8 @@ def as_the_library_evaluates(clause: ua.ContentFilter, namespace: int) -> ua.Con
 def _types(namespace: int) -> Mapping[ua.NodeId, Sequence[ua.NodeId]]:
     """The types that are sent, each with those that it is a subtype of."""
     named = {ua.NodeId(FAN_ALARM_TYPE, namespace): _OF_ALARMS}
-    named |= {ua.NodeId(getattr(ua.ObjectIds, name)): _OF_SYSTEM for name in _OF_REFRESH}
-    return {kind: (kind, *(ua.NodeId(getattr(ua.ObjectIds, name)) for name in above)) for kind, above in named.items()}
+    named |= {standard(name): _OF_SYSTEM for name in _OF_REFRESH}
+    return {kind: (kind, *(standard(name) for name in above)) for kind, above in named.items()}
 
 
 def _element(

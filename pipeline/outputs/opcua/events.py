@@ -15,10 +15,12 @@ from asyncua import ua
 from asyncua.server.subscription_service import SubscriptionService
 
 from fantwin.pipeline.config.models import TrayConfig
-from fantwin.pipeline.outputs.opcua.conditions import ALL_FIELDS, Condition
-from fantwin.pipeline.outputs.opcua.encoding import variant
+from fantwin.pipeline.outputs.opcua.conditions import condition_fields
+from fantwin.pipeline.outputs.opcua.encoding import localized, number, standard, string
 from fantwin.pipeline.outputs.opcua.event_filter import CONDITION_ID, path_of
-from fantwin.pipeline.outputs.opcua.identifiers import SITE_FOLDER
+from fantwin.pipeline.outputs.opcua.identifiers import SITE_FOLDER, condition_identifier
+from fantwin.pipeline.site.fleet import Fan
+from fantwin.scoring.alarms.current_alarms import CurrentAlarm
 
 _AT_ONCE = 50
 """events that are delivered before others may do something"""
@@ -41,27 +43,26 @@ class SiteEvent:
         return [self.fields.get(path_of(clause)) or ua.Variant() for clause in clauses]
 
 
-def condition_event(condition: Condition, namespace: int) -> SiteEvent:
+def condition_event(current: CurrentAlarm, namespace: int) -> SiteEvent:
     """The event of a condition as it is."""
-    values = condition.fields(time.time_ns())
-    fields = {path: variant(kind, values[path], namespace) for path, kind in ALL_FIELDS.items()}
-    fields[CONDITION_ID] = ua.Variant(ua.NodeId(condition.identifier, namespace), ua.VariantType.NodeId)
-    return SiteEvent(fields)
+    fan = Fan(current.newest.header.tray, current.newest.fan)
+    node = ua.Variant(ua.NodeId(condition_identifier(fan), namespace), ua.VariantType.NodeId)
+    return SiteEvent({**condition_fields(fan, current, time.time_ns(), namespace), CONDITION_ID: node})
 
 
 def system_event(kind: str, message: str) -> SiteEvent:
     """An event of the server itself. kind: name of its type, of the standard."""
-    now = datetime.now(UTC)
+    now = ua.Variant(datetime.now(UTC), ua.VariantType.DateTime)
     return SiteEvent(
         {
             "EventId": ua.Variant(uuid.uuid4().bytes, ua.VariantType.ByteString),
-            "EventType": ua.Variant(ua.NodeId(getattr(ua.ObjectIds, kind)), ua.VariantType.NodeId),
-            "SourceNode": ua.Variant(ua.NodeId(ua.ObjectIds.Server), ua.VariantType.NodeId),
-            "SourceName": ua.Variant("Server", ua.VariantType.String),
-            "Time": ua.Variant(now, ua.VariantType.DateTime),
-            "ReceiveTime": ua.Variant(now, ua.VariantType.DateTime),
-            "Message": ua.Variant(ua.LocalizedText(message), ua.VariantType.LocalizedText),
-            "Severity": ua.Variant(1, ua.VariantType.UInt16),
+            "EventType": ua.Variant(standard(kind), ua.VariantType.NodeId),
+            "SourceNode": ua.Variant(standard("Server"), ua.VariantType.NodeId),
+            "SourceName": string("Server"),
+            "Time": now,
+            "ReceiveTime": now,
+            "Message": localized(message),
+            "Severity": number(1, "UInt16"),
         }
     )
 
@@ -74,7 +75,7 @@ class EventDelivery:
         self._namespace = namespace
         self._trays = trays
 
-    async def to_all(self, conditions: Sequence[Condition]) -> None:
+    async def to_all(self, conditions: Sequence[CurrentAlarm]) -> None:
         """Send the events of these conditions, in their order."""
         await self._send_conditions(conditions, None)
 
@@ -82,18 +83,18 @@ class EventDelivery:
         """Tell all that events were left out."""
         await self._send(system_event("RefreshRequiredEventType", "events were left out"), self._notifiers(), None)
 
-    async def refresh(self, subscription: int, found: Sequence[Condition]) -> None:
+    async def refresh(self, subscription: int, found: Sequence[CurrentAlarm]) -> None:
         """Send what ConditionRefresh asks for: all conditions that need attention, between a start and an end."""
         await self._send(system_event("RefreshStartEventType", "refresh begins"), self._notifiers(), subscription)
         await self._send_conditions(found, subscription)
         await self._send(system_event("RefreshEndEventType", "refresh ends"), self._notifiers(), subscription)
 
-    async def _send_conditions(self, conditions: Sequence[Condition], subscription: int | None) -> None:
-        for number, condition in enumerate(conditions):
-            fan = condition.fan
-            notifiers = (*self._of_site(), self._node(fan.tray), self._node(str(fan)))
-            await self._send(condition_event(condition, self._namespace), notifiers, subscription)
-            if number % _AT_ONCE == _AT_ONCE - 1:
+    async def _send_conditions(self, conditions: Sequence[CurrentAlarm], subscription: int | None) -> None:
+        for count, current in enumerate(conditions):
+            tray, fan = current.newest.header.tray, current.newest.fan
+            notifiers = (*self._of_site(), self._node(tray), self._node(f"{tray}/{fan}"))
+            await self._send(condition_event(current, self._namespace), notifiers, subscription)
+            if count % _AT_ONCE == _AT_ONCE - 1:
                 await asyncio.sleep(0)
 
     async def _send(self, event: SiteEvent, notifiers: Iterable[ua.NodeId], subscription: int | None) -> None:

@@ -6,27 +6,30 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Sequence
-from datetime import datetime, timedelta
+from datetime import datetime
 from typing import Any
 
 from asyncua import ua
-from asyncua.server.history import HistoryStorageInterface
+from asyncua.server.history import HistoryDict
 
-from fantwin.pipeline.outputs.opcua.conditions import past_condition
 from fantwin.pipeline.outputs.opcua.encoding import micros_of, time_of
 from fantwin.pipeline.outputs.opcua.events import SiteEvent, condition_event
 from fantwin.pipeline.outputs.opcua.identifiers import fan_of
 from fantwin.pipeline.site.site_model import SiteModel
 from fantwin.schemas.enums import Transition
 from fantwin.schemas.messages import Alarm
+from fantwin.scoring.alarms.current_alarms import current_alarm
 
 FIRST_NS, LAST_NS = -(1 << 63), (1 << 63) - 1
 MOST_EVENTS = 10_000
 """of one call; the client goes on from where it ended"""
 
 
-class EventHistory(HistoryStorageInterface):
-    """Of the server and the site's folder: all alarms; of a tray or a fan: its own."""
+class EventHistory(HistoryDict):
+    """That of the library, which is given nothing to keep, with the events of the stage.
+
+    Of the server and the site's folder: all alarms; of a tray or a fan: its own.
+    """
 
     def __init__(self, model: SiteModel, namespace: int) -> None:
         super().__init__()
@@ -52,7 +55,7 @@ class EventHistory(HistoryStorageInterface):
         return [self._event(alarm) for alarm in found[:most] if alarm.transition != Transition.REFUSED], rest
 
     def _event(self, alarm: Alarm) -> SiteEvent:
-        return condition_event(past_condition(alarm), self._namespace)
+        return condition_event(current_alarm([alarm]), self._namespace)
 
     def _transitions(
         self, source: ua.NodeId, stretch: tuple[int, int], most: int, is_backwards: bool
@@ -62,29 +65,3 @@ class EventHistory(HistoryStorageInterface):
             fan = fan_of(source.Identifier)
             tray, number = fan[0] if fan else (source.Identifier, -1)
         return self._model.alarms_between(*stretch, most, tray=tray, fan=number, is_backwards=is_backwards)
-
-    async def init(self) -> None:
-        """Nothing to do."""
-
-    async def stop(self) -> None:
-        """The file is the stage's."""
-
-    async def new_historized_node(self, node_id: ua.NodeId, period: timedelta | None, count: int = 0) -> None:
-        """No values are kept."""
-
-    async def save_node_value(self, node_id: ua.NodeId, datavalue: ua.DataValue) -> None:
-        """No values are kept."""
-
-    async def read_node_history(
-        self, node_id: ua.NodeId, start: datetime | None, end: datetime | None, nb_values: int
-    ) -> tuple[list[ua.DataValue], datetime | None]:
-        """No values are kept."""
-        return [], None
-
-    async def new_historized_event(
-        self, source_id: ua.NodeId, evtypes: list[Any], period: timedelta | None, count: int = 0
-    ) -> None:
-        """The stage keeps them."""
-
-    async def save_event(self, event: Any) -> None:
-        """The stage keeps them."""

@@ -14,7 +14,8 @@ from typing import Any
 
 from asyncua import Server, ua
 
-from fantwin.pipeline.outputs.opcua.conditions import Condition, event_id
+from fantwin.pipeline.outputs.opcua.conditions import event_id
+from fantwin.pipeline.outputs.opcua.encoding import STATUS, standard
 from fantwin.pipeline.outputs.opcua.events import EventDelivery
 from fantwin.pipeline.outputs.opcua.identifiers import ALARM, COMMISSION, SHELVING_STATE
 from fantwin.pipeline.outputs.opcua.requests import (
@@ -38,6 +39,7 @@ from fantwin.pipeline.site.request_form import LONGEST_COMMENT, LONGEST_SHELVING
 from fantwin.pipeline.site.site_model import SiteModel
 from fantwin.schemas.enums import Action
 from fantwin.schemas.messages import Request
+from fantwin.scoring.alarms.alarm_flags import is_retained
 
 _SEARCHED = 200
 """transitions of a fan, among which an event is looked for"""
@@ -61,12 +63,12 @@ class Methods:
         (commission,) = FAN_METHODS
         self._bind(server, ua.NodeId(COMMISSION, namespace), commission, ("",))
         for name in ("ConditionRefresh", "ConditionRefresh2"):
-            refresh = ua.NodeId(getattr(ua.ObjectIds, f"ConditionType_{name}"))
+            refresh = standard(f"ConditionType_{name}")
             server.iserver.isession.add_method_callback(refresh, self._refresh)
 
     def _bind(self, server: Server, node: ua.NodeId, method: ConditionMethod, paths: tuple[str, ...]) -> None:
         async def answer(parent: ua.NodeId, *arguments: ua.Variant) -> ua.StatusCode:
-            return _code(await self._answer(method, paths, parent, arguments))
+            return STATUS[await self._answer(method, paths, parent, arguments)]
 
         if server.iserver.aspace.get(node) is not None:
             server.iserver.isession.add_method_callback(node, answer)
@@ -118,19 +120,14 @@ class Methods:
         """ConditionRefresh of a subscription; ConditionRefresh2, which names one of its items, does the same."""
         numbers = [each.Value for each in arguments]
         if not numbers or not all(isinstance(each, int) for each in numbers):
-            return _code("BadArgumentsMissing" if not numbers else "BadInvalidArgument")
+            return STATUS["BadArgumentsMissing" if not numbers else "BadInvalidArgument"]
         session = CURRENT_SESSION.get()
         subscription = session.subscription_service.subscriptions.get(numbers[0])
         if subscription is None or subscription.session_id != session.session_id:
-            return _code("BadSubscriptionIdInvalid")
-        current = self._model.current_alarms()
-        conditions = [Condition(Fan(each.newest.header.tray, each.newest.fan), each) for each in current]
-        await self._delivery.refresh(numbers[0], [each for each in conditions if each.retain])
-        return _code(GOOD)
-
-
-def _code(name: str) -> ua.StatusCode:
-    return ua.StatusCode(ua.UInt32(getattr(ua.StatusCodes, name)))
+            return STATUS["BadSubscriptionIdInvalid"]
+        retained = [each for each in self._model.current_alarms() if is_retained(each.newest)]
+        await self._delivery.refresh(numbers[0], retained)
+        return STATUS[GOOD]
 
 
 def _refusal(method: ConditionMethod, arguments: tuple[ua.Variant, ...]) -> str:

@@ -18,7 +18,6 @@ from asyncua import Server, ua
 
 from fantwin.pipeline.config.models import TrayConfig
 from fantwin.pipeline.outputs.opcua.address_space import SiteAddressSpace, build_address_space
-from fantwin.pipeline.outputs.opcua.conditions import Condition
 from fantwin.pipeline.outputs.opcua.events import EventDelivery
 from fantwin.pipeline.outputs.opcua.history import EventHistory
 from fantwin.pipeline.outputs.opcua.identifiers import NAMESPACE
@@ -29,6 +28,7 @@ from fantwin.pipeline.outputs.opcua.site_values import SiteValues
 from fantwin.pipeline.runtime.stage import StageError
 from fantwin.pipeline.site.request_desk import RequestDesk
 from fantwin.pipeline.site.site_model import SiteModel
+from fantwin.scoring.alarms.current_alarms import CurrentAlarm
 
 UPDATE_PERIOD_S = 1.0
 START_LIMIT_S, STOP_LIMIT_S = 120.0, 5.0
@@ -73,7 +73,7 @@ class OpcuaServer:
         self._log_in, self._trusted = log_in, trusted
         self._site: str = model.site
         self._trays: Sequence[TrayConfig] = model.trays
-        self._pending: deque[Condition] = deque()
+        self._pending: deque[CurrentAlarm] = deque()
         self._lock = threading.Lock()
         self._lost_unsaid = False
         self._error = ""
@@ -97,14 +97,14 @@ class OpcuaServer:
         """Clients, and events that were sent and left out."""
         return {"clients": self._clients, "events_sent": self._events_sent, "events_left_out": self._events_lost}
 
-    def publish(self, condition: Condition) -> None:
+    def publish(self, current: CurrentAlarm) -> None:
         """Send an event to whoever subscribes; never waits."""
         with self._lock:
             if len(self._pending) >= MOST_PENDING:
                 self._pending.popleft()
                 self._events_lost += 1
                 self._lost_unsaid = True
-            self._pending.append(condition)
+            self._pending.append(current)
         self._wake()
 
     def stop(self) -> None:

@@ -9,13 +9,13 @@ from collections.abc import Callable, Sequence
 from asyncua import ua
 
 from fantwin.pipeline.config.models import TrayConfig
-from fantwin.pipeline.outputs.opcua.encoding import STATUS, SharedValue
+from fantwin.pipeline.outputs.opcua.encoding import STATUS, SharedValue, standard
 from fantwin.pipeline.outputs.opcua.identifiers import SITE_FOLDER, fan_of
-from fantwin.pipeline.outputs.opcua.templates import Template, standard, templates
+from fantwin.pipeline.outputs.opcua.templates import Template, templates
 from fantwin.pipeline.site.fleet import Fan
 
-ValueOf = Callable[[Fan, str, str], SharedValue]
-"""the value of a node: of which fan, its path below the fan, its built-in type"""
+ValueOf = Callable[[Fan, str], SharedValue]
+"""the value of a node: of which fan, and its path below the fan"""
 
 
 class SiteNode:
@@ -82,7 +82,8 @@ class SiteNodes:
             return None
         fan, path = found
         template = self._templates[path]
-        value = (lambda: self._value_of(fan, path, template.kind)) if template.kind else None
+        is_variable = template.node_class == ua.NodeClass.Variable
+        value = (lambda: self._value_of(fan, path)) if is_variable else None
         return SiteNode(nodeid, lambda: self._name(fan, template), template, lambda: self._of_fan(fan, template), value)
 
     def fan(self, nodeid: ua.NodeId) -> tuple[Fan, str] | None:

@@ -7,12 +7,11 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from datetime import UTC, datetime
-from typing import Any
 
 from asyncua import ua
 
-from fantwin.pipeline.outputs.opcua.conditions import Condition
-from fantwin.pipeline.outputs.opcua.encoding import SharedValue, data_value
+from fantwin.pipeline.outputs.opcua.conditions import condition_fields
+from fantwin.pipeline.outputs.opcua.encoding import SharedValue, data_value, number
 from fantwin.pipeline.outputs.opcua.fan_values import GOOD, VARIABLE, FanValues
 from fantwin.pipeline.outputs.opcua.identifiers import ALARM
 from fantwin.pipeline.outputs.opcua.templates import UNIT_RPM
@@ -21,6 +20,7 @@ from fantwin.pipeline.site.site_model import SiteModel
 from fantwin.schemas.messages import ModelCard
 from fantwin.schemas.twin_card import CardError, TwinCard
 from fantwin.schemas.units import RAD_S_PER_UNIT
+from fantwin.scoring.alarms.current_alarms import CurrentAlarm
 
 _CACHED = 1024
 _UNSHELVE_TIME = "ShelvingState/UnshelveTime"
@@ -32,7 +32,7 @@ class SiteValues:
     def __init__(self, model: SiteModel, namespace: int) -> None:
         self._model, self._namespace = model, namespace
         self._values = FanValues()
-        self._fields: dict[Fan, tuple[Condition, Mapping[str, Any]]] = {}
+        self._fields: dict[Fan, tuple[CurrentAlarm | None, Mapping[str, ua.Variant]]] = {}
         self._ranges: dict[str, tuple[ModelCard | None, float]] = {}
 
     def newest(self) -> FanValues:
@@ -43,32 +43,29 @@ class SiteValues:
         """Show these from now on."""
         self._values = values
 
-    def of(self, fan: Fan, path: str, kind: str) -> SharedValue:
-        """The value of a node: path below its fan, and its built-in type."""
+    def of(self, fan: Fan, path: str) -> SharedValue:
+        """The value of a node: path below its fan."""
         now = datetime.now(UTC)
         name, _, below = path.partition("/")
         if name == ALARM:
-            return self._of_condition(fan, below, kind, now)
-        if below == "EURange":
-            value: Any = ua.Range(Low=ua.Double(0.0), High=ua.Double(self._highest_rpm(fan.tray)))
-        elif below:
-            value = UNIT_RPM
-        else:
-            found = self._values.of(fan, VARIABLE[name].name)
-            return data_value(kind, found.value, found.status, found.t_ns, self._namespace, now)
-        return data_value(kind, value, GOOD, 0, self._namespace, now)
+            return self._of_condition(fan, below, now)
+        if below:
+            top = ua.Range(Low=ua.Double(0.0), High=ua.Double(self._highest_rpm(fan.tray)))
+            value = ua.Variant(top if below == "EURange" else UNIT_RPM, ua.VariantType.ExtensionObject)
+            return data_value(value, GOOD, 0, now)
+        found = self._values.of(fan, name)
+        value = ua.Variant() if found.value is None else number(found.value, VARIABLE[name].type)
+        return data_value(value, found.status, found.t_ns, now)
 
-    def _of_condition(self, fan: Fan, field: str, kind: str, now: datetime) -> SharedValue:
+    def _of_condition(self, fan: Fan, field: str, now: datetime) -> SharedValue:
         current = self._model.current_alarm(fan)
         known = self._fields.get(fan)
-        if known is None or known[0].current is not current or field == _UNSHELVE_TIME:
-            condition = Condition(fan, current)
-            known = (condition, condition.fields(time.time_ns()))
+        if known is None or known[0] is not current or field == _UNSHELVE_TIME:
+            known = (current, condition_fields(fan, current, time.time_ns(), self._namespace))
             if len(self._fields) >= _CACHED:
                 self._fields.clear()
             self._fields[fan] = known
-        t_ns = current.newest.t_ns if current else 0
-        return data_value(kind, known[1][field], GOOD, t_ns, self._namespace, now)
+        return data_value(known[1][field], GOOD, current.newest.t_ns if current else 0, now)
 
     def _highest_rpm(self, tray: str) -> float:
         """The highest speed to be expected: that of the twin's training data, or else what the tray may report."""

@@ -11,10 +11,12 @@ from typing import Any
 
 from asyncua import ua
 
-from fantwin.pipeline.outputs.opcua.conditions import ALL_FIELDS, OWN_FIELDS
+from fantwin.pipeline.outputs.opcua.conditions import OWN_FIELDS, condition_fields
+from fantwin.pipeline.outputs.opcua.encoding import standard
 from fantwin.pipeline.outputs.opcua.fan_values import VARIABLES, FanVariable
 from fantwin.pipeline.outputs.opcua.identifiers import ALARM, COMMISSION, FAN_ALARM_TYPE, FAN_TYPE, SHELVING_STATE
 from fantwin.pipeline.outputs.opcua.requests import METHODS, SHELVING_METHODS, ConditionMethod
+from fantwin.pipeline.site.fleet import Fan
 
 OBJECT_NOTIFIES = ua.Byte(5)
 """SubscribeToEvents and HistoryRead"""
@@ -25,15 +27,6 @@ UNIT_RPM = ua.EUInformation(
     Description=ua.LocalizedText("revolutions per minute"),
 )
 _DURATIONS = {"ShelvingState/UnshelveTime", "MaxTimeShelved"}
-_TWO_STATES = {
-    "EnabledState",
-    "AckedState",
-    "ConfirmedState",
-    "ActiveState",
-    "SuppressedState",
-    "OutOfServiceState",
-    "LatchedState",
-}
 _CONDITION_VARIABLES = {"Quality", "LastSeverity", "Comment"}
 _METHOD_TYPES = (
     "ShelvedStateMachineType",
@@ -53,7 +46,6 @@ class Template:
         type: its type definition.
         by: the reference from its parent.
         attributes: all but NodeId, Value, and the names of a fan.
-        kind: built-in type of a variable; empty: it is an object.
         children: paths.
         methods: identifiers of methods that it shares with its type.
     """
@@ -64,14 +56,8 @@ class Template:
     type: ua.NodeId
     by: ua.NodeId
     attributes: Mapping[int, ua.DataValue]
-    kind: str = ""
     children: list[str] = field(default_factory=list)
     methods: Sequence[ua.NodeId] = ()
-
-
-def standard(name: str) -> ua.NodeId:
-    """A node of the standard."""
-    return ua.NodeId(getattr(ua.ObjectIds, name))
 
 
 def method_nodes(method: ConditionMethod) -> list[ua.NodeId]:
@@ -95,15 +81,16 @@ def templates(namespace: int) -> dict[str, Template]:
     for variable in VARIABLES:
         add(_fan_variable(variable, namespace))
         if variable.unit:
-            add(_property(f"{variable.name}/EURange", "ExtensionObject", standard("Range")))
-            add(_property(f"{variable.name}/EngineeringUnits", "ExtensionObject", standard("EUInformation")))
+            add(_property(f"{variable.name}/EURange", "Range"))
+            add(_property(f"{variable.name}/EngineeringUnits", "EUInformation"))
     methods = [node for method in METHODS for node in method_nodes(method)]
     add(_object(ALARM, ALARM, namespace, alarm_type, "HasComponent", methods, ua.Byte(0)))
     shelving = [node for method in SHELVING_METHODS for node in method_nodes(method)[:1]]
     machine = standard("ShelvedStateMachineType")
     add(_object(SHELVING_STATE, "ShelvingState", 0, machine, "HasComponent", shelving, ua.Byte(0)))
-    for path, kind in ALL_FIELDS.items():
-        add(_condition_field(path, kind, namespace))
+    fields = condition_fields(Fan("", 0), None, 0, namespace)
+    for path, value in fields.items():
+        add(_condition_field(path, value.VariantType, f"{path}/Id" in fields, namespace))
     return made
 
 
@@ -134,41 +121,41 @@ def _object(
     return Template(path, browse_name, ua.NodeClass.Object, kind, standard(by), attributes, methods=methods)
 
 
-def _variable(
-    path: str, namespace: int, kind: str, data_type: ua.NodeId, type_of: str, by: str, about: str = ""
-) -> Template:
+def _variable(path: str, namespace: int, data_type: str, type_of: str, by: str, about: str = "") -> Template:
     browse_name = ua.QualifiedName(path.rpartition("/")[2], ua.UInt16(namespace))
     attributes = _attributes(
         browse_name,
         ua.NodeClass.Variable,
         Description=ua.Variant(ua.LocalizedText(about)),
-        DataType=ua.Variant(data_type, ua.VariantType.NodeId),
+        DataType=ua.Variant(standard(data_type), ua.VariantType.NodeId),
         ValueRank=ua.Variant(-1, ua.VariantType.Int32),
         AccessLevel=ua.Variant(1, ua.VariantType.Byte),
         UserAccessLevel=ua.Variant(1, ua.VariantType.Byte),
         MinimumSamplingInterval=ua.Variant(1000.0, ua.VariantType.Double),
         Historizing=ua.Variant(False, ua.VariantType.Boolean),
     )
-    return Template(path, browse_name, ua.NodeClass.Variable, standard(type_of), standard(by), attributes, kind)
+    return Template(path, browse_name, ua.NodeClass.Variable, standard(type_of), standard(by), attributes)
 
 
 def _fan_variable(variable: FanVariable, namespace: int) -> Template:
     type_of = "AnalogItemType" if variable.unit else "BaseDataVariableType"
-    data_type = standard(variable.type)
-    return _variable(variable.name, namespace, variable.type, data_type, type_of, "HasComponent", variable.about)
+    return _variable(variable.name, namespace, variable.type, type_of, "HasComponent", variable.about)
 
 
-def _property(path: str, kind: str, data_type: ua.NodeId, namespace: int = 0) -> Template:
-    return _variable(path, namespace, kind, data_type, "PropertyType", "HasProperty")
+def _property(path: str, data_type: str, namespace: int = 0) -> Template:
+    return _variable(path, namespace, data_type, "PropertyType", "HasProperty")
 
 
-def _condition_field(path: str, kind: str, namespace: int) -> Template:
-    data_type = standard("Duration" if path in _DURATIONS else "UtcTime" if kind == "DateTime" else kind)
+def _condition_field(path: str, kind: ua.VariantType, has_id: bool, namespace: int) -> Template:
+    """kind: built-in type; null of a time that there is not."""
+    data_type = "Duration" if path in _DURATIONS else kind.name
+    if kind in (ua.VariantType.Null, ua.VariantType.DateTime):
+        data_type = "UtcTime"
     below = f"{ALARM}/{path}"
-    if path in _TWO_STATES:
-        return _variable(below, 0, kind, data_type, "TwoStateVariableType", "HasComponent")
-    if path in _CONDITION_VARIABLES:
-        return _variable(below, 0, kind, data_type, "ConditionVariableType", "HasComponent")
     if path == "ShelvingState/CurrentState":
-        return _variable(below, 0, kind, data_type, "FiniteStateVariableType", "HasComponent")
-    return _property(below, kind, data_type, namespace if path in OWN_FIELDS else 0)
+        return _variable(below, 0, data_type, "FiniteStateVariableType", "HasComponent")
+    if has_id:
+        return _variable(below, 0, data_type, "TwoStateVariableType", "HasComponent")
+    if path in _CONDITION_VARIABLES:
+        return _variable(below, 0, data_type, "ConditionVariableType", "HasComponent")
+    return _property(below, data_type, namespace if path in OWN_FIELDS else 0)

@@ -15,10 +15,8 @@ from asyncua import ua
 from asyncua.server.address_space import AddressSpace
 from asyncua.server.monitored_item_service import WhereClauseEvaluator
 
-from fantwin.pipeline.outputs.opcua.conditions import Condition
 from fantwin.pipeline.outputs.opcua.event_filter import as_the_library_evaluates
 from fantwin.pipeline.outputs.opcua.events import condition_event, system_event
-from fantwin.pipeline.site.fleet import Fan
 from fantwin.scoring.alarms.current_alarms import current_alarm
 from tests.stages.test_gateway import alarm
 
@@ -69,6 +67,6 @@ def of_type(name: str) -> ua.ContentFilterElement:
 def test_a_filter_knows_subtypes_and_fields_below_others_and_lets_the_events_of_a_refresh_pass(elements, is_alarm_sent):
     clause = as_the_library_evaluates(ua.ContentFilter(Elements=elements), NAMESPACE)
     evaluator = WhereClauseEvaluator(logging.getLogger("test"), AddressSpace(), clause)
-    raised = condition_event(Condition(Fan("tray1", 2), current_alarm([alarm()])), NAMESPACE)
+    raised = condition_event(current_alarm([alarm()]), NAMESPACE)
     assert evaluator.eval(raised) == is_alarm_sent
     assert evaluator.eval(system_event("RefreshStartEventType", "refresh begins"))
