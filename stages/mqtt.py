@@ -15,9 +15,8 @@ from fantwin.pipeline.extras import require
 from fantwin.pipeline.outputs.mqtt.config import MqttConfig
 from fantwin.pipeline.outputs.mqtt.fan_states import FanStates, shown_alarm
 from fantwin.pipeline.outputs.mqtt.home_assistant import OFFLINE, ONLINE, HomeAssistant
-from fantwin.pipeline.outputs.mqtt.json_text import json_text
 from fantwin.pipeline.outputs.mqtt.link import BrokerLink
-from fantwin.pipeline.outputs.mqtt.outbox import REMOVED, Outbox, Outgoing
+from fantwin.pipeline.outputs.mqtt.outbox import REMOVED, Outbox, Outgoing, text_of
 from fantwin.pipeline.outputs.mqtt.requests import Requests
 from fantwin.pipeline.outputs.mqtt.topics import Topics, do_overlap
 from fantwin.pipeline.outputs.mqtt.transition_queue import TransitionQueue
@@ -158,7 +157,7 @@ class MqttCore(SiteCore):
             self._has_news = True
         for fan in self._changed_alarms:
             current = self._model.current_alarm(fan)
-            text = json_text(shown_alarm(current) if current else None)
+            text = text_of(shown_alarm(current) if current else None)
             self._outbox.retain(self._topics.alarm(fan), text, is_urgent=True)
         is_full = abs(now_ns - self._full_ns) >= PERIOD_S * NS_PER_S
         if is_full:
@@ -170,7 +169,7 @@ class MqttCore(SiteCore):
             self._full_ns = now_ns if is_full else self._full_ns
             self._changes_ns, self._has_news = now_ns, False
             for fan, state in self._states.changed(is_full=is_full, with_silent=knows_all).items():
-                self._outbox.retain(self._topics.state(fan), json_text(state))
+                self._outbox.retain(self._topics.state(fan), text_of(state))
         self._changed_alarms.clear()
         if abs(now_ns - self._site_ns) >= SITE_PERIOD_NS:
             self._site_ns = now_ns
@@ -178,8 +177,8 @@ class MqttCore(SiteCore):
 
     def _update_site(self) -> None:
         fans = sum(tray.fans for tray in self._model.trays)
-        self._outbox.retain(self._topics.summary, json_text({"fans": fans} | self._model.counts()))
-        self._outbox.retain(self._topics.stages, json_text(stages_json(self._model.stages())))
+        self._outbox.retain(self._topics.summary, text_of({"fans": fans} | self._model.counts()))
+        self._outbox.retain(self._topics.stages, text_of(stages_json(self._model.stages())))
         if not self._has_devices:
             self._has_devices = True
             is_removing = self._config.home_assistant == "remove"
@@ -194,7 +193,7 @@ class MqttCore(SiteCore):
         room = self._link.room()
         for number, alarm in self._queue.take((room + 1) // 2):
             topic = self._topics.transitions(Fan(alarm.header.tray, alarm.fan))
-            sent = self._link.publish(Outgoing(topic, json_text(transition_json(number, alarm)), is_retained=False))
+            sent = self._link.publish(Outgoing(topic, text_of(transition_json(number, alarm)), is_retained=False))
             self._numbers[sent] = number
             self._counts["published_transitions"] += 1
             room -= 1

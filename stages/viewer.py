@@ -23,16 +23,13 @@ from pydantic import Field
 from fantwin.pipeline.config.models import TrayConfig, nearest
 from fantwin.pipeline.errors import refusals
 from fantwin.pipeline.extras import missing_extra, require
+from fantwin.pipeline.outputs.rerun.fleet_view import is_fleet
 from fantwin.pipeline.runtime.stage import BuiltStage, Context, Stage, StageConfig, StageError
 from fantwin.pipeline.site.fleet import Fan
 from fantwin.pipeline.site.loopback import check_free
 
 FILE_BYTES = 1_000_000_000
 """size at which the view's file ends"""
-FLEET_ABOVE = 64
-"""with more fans than this on the site, only those in alarm and those in `show` are drawn"""
-ALARM_PLOT_HOLD_S = 60.0
-"""how long the plot of a fan of a fleet stays after its alarm has cleared"""
 READS = ("score", "alarm", "snapshot")
 
 
@@ -94,29 +91,20 @@ def build(context: Context) -> BuiltStage:
         StageError: Rerun is not installed, a port is taken, the file cannot be written, or `show` names no fan.
     """
     require("stage viewer", "view", "rerun")
-    from fantwin.pipeline.outputs.rerun.view_of_site import ViewOptions, view_of_site  # noqa: PLC0415  an extra
+    from fantwin.pipeline.outputs.rerun.rerun_sink import ViewOptions  # noqa: PLC0415  an extra
+    from fantwin.pipeline.outputs.rerun.view_of_site import view_of_site  # noqa: PLC0415  an extra
 
     config: ViewerConfig = context.config
-    ports = _ports(context)
     options = ViewOptions(
         layout=config.layout,
         window_s=config.window_s,
-        fleet_above=FLEET_ABOVE,
-        alarm_plot_hold_s=ALARM_PLOT_HOLD_S,
         show=shown_fans(config.show, context.trays),
         memory_limit=config.memory_limit,
         file_bytes=FILE_BYTES,
+        **_ports(context),
     )
-    core = view_of_site(
-        context.site,
-        context.trays,
-        context.started_t_ns,
-        context.own_file(Path(config.file)) if config.file else None,
-        options,
-        grpc_port=ports.get("grpc_port"),
-        web_port=ports.get("web_port"),
-    )
-    return BuiltStage(core)
+    file = context.own_file(Path(config.file)) if config.file else None
+    return BuiltStage(view_of_site(context.site, context.trays, context.started_t_ns, file, options))
 
 
 def _ports(context: Context) -> dict[str, int]:
@@ -140,8 +128,7 @@ def check(context: Context) -> list[str]:
 
 def topics_read(_config: ViewerConfig, trays: Sequence[TrayConfig]) -> tuple[str, ...]:
     """Topics of trays. Of a fleet, the wear is not drawn: the snapshots of its scorers are many megabytes a minute."""
-    is_fleet = sum(tray.fans for tray in trays) > FLEET_ABOVE
-    return tuple(topic for topic in READS if not (is_fleet and topic == "snapshot"))
+    return tuple(topic for topic in READS if topic != "snapshot" or not is_fleet(trays))
 
 
 STAGE = Stage(

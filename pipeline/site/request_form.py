@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import time
 from typing import Annotated, Literal, Self
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
 from fantwin.pipeline.site.one_line import one_line
 from fantwin.schemas.enums import Action
+from fantwin.schemas.messages import Request
 from fantwin.scoring.alarms.fan_condition import GIVES_FEEDBACK
 
 LONGEST_SHELVING_S = 30 * 86400.0
@@ -60,3 +62,15 @@ class RequestForm(BaseModel):
     def message_action(self) -> Action:
         """As the scorer is asked."""
         return Action[self.action.upper()]
+
+    def message(self, fan: int, operator_name: str) -> Request:
+        """The request to the scorer. fan: -1 for all of the tray."""
+        return Request(
+            t_ns=time.time_ns(),
+            action=self.message_action,
+            fan=fan,
+            duration_s=self.duration_s,
+            operator_name=operator_name,
+            comment=self.comment,
+            onset_t_ns=self.onset_t_ns,
+        )

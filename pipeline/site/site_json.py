@@ -16,7 +16,7 @@ from fantwin.pipeline.site.fleet import SHOWN_CLASSES, Fan, FanGroup, FanNow
 from fantwin.pipeline.site.site_model import SiteModel
 from fantwin.pipeline.site.site_state import StageState
 from fantwin.schemas.channels import CHANNELS
-from fantwin.schemas.enums import Feedback
+from fantwin.schemas.enums import Feedback, Transition
 from fantwin.schemas.messages import Alarm, Array, ModelCard
 from fantwin.schemas.twin_card import CardError, TwinCard
 from fantwin.schemas.units import RAD_S_PER_UNIT
@@ -195,6 +195,17 @@ def rates_json(model: SiteModel) -> dict[str, Any]:
     rates = model.observed_rates()
     trays = {tray: rate.as_json() for tray, rate in rates.items()}
     return {"trays": trays, "site": together(list(rates.values())).as_json()}
+
+
+def answers_json(answers: Sequence[Alarm]) -> dict[str, Any]:
+    """What the scorer says to a request, with an `error` if it has refused it for every fan."""
+    body: dict[str, Any] = {
+        "answers": [
+            {"fan": each.fan, "transition": each.transition.name.lower(), "message": each.message} for each in answers
+        ]
+    }
+    is_refused = all(each.transition == Transition.REFUSED for each in answers)
+    return {"error": answers[0].message} | body if is_refused else body
 
 
 def stages_json(states: Iterable[StageState]) -> list[dict[str, Any]]:

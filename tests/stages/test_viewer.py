@@ -14,7 +14,9 @@ import pytest
 
 from fantwin.pipeline.config.models import TrayConfig
 from fantwin.pipeline.outputs.rerun.alarm_log import LogLine
+from fantwin.pipeline.outputs.rerun.rerun_sink import RerunSink
 from fantwin.pipeline.outputs.rerun.viewer_core import (
+    FLUSH_PERIOD_NS,
     REPEAT_STATES_NS,
     SAMPLES_HELD,
     ViewerCore,
@@ -36,7 +38,7 @@ LATER_NS = START_NS + 400 * 86_400 * 1_000_000_000  # the host's time while what
 
 
 @dataclass
-class FakeSink:
+class FakeSink(RerunSink):
     """Remembers the items it received."""
 
     traces: list[Trace] = field(default_factory=list)
@@ -136,17 +138,24 @@ def test_a_lane_follows_the_states_to_the_sample_and_repeats_a_steady_one_for_vi
     assert (np.diff(times)[1:] * 1e9 >= REPEAT_STATES_NS).all()
 
 
-def test_the_file_holds_every_sample_with_its_unit_its_states_and_its_alarms(tmp_path: Path) -> None:
+def test_the_file_of_a_replay_holds_every_sample_with_its_unit_its_states_and_its_alarms_also_after_a_kill(
+    tmp_path: Path,
+) -> None:
     scores, alarms = made_up_tray(seconds=20)
     half = len(scores) // 2
     volts = [np.full(score.score.shape, 12.0 + number, np.float32) for number, score in enumerate(scores)]
     measured_beside = [replace(score, supply_voltage_v=of) for score, of in zip(scores, volts, strict=True)]
     core = build(context(tmp_path, speed_unit="rpm")).core
-    for item in (*scores[:half], *measured_beside[half:], *alarms):
+    for number, item in enumerate((*scores[:half], *measured_beside[half:], *alarms)):
         core.step(sent(item))
-        core.tick(item.t_ns if isinstance(item.t_ns, int) else int(item.t_ns[-1]))
+        core.tick(LATER_NS + number * FLUSH_PERIOD_NS)
+    left = Path(shutil.copy(tmp_path / "view.rrd", tmp_path / "left.rrd"))  # what a process that is killed now leaves
     core.close()
+    assert len(rows_of(left)["/tray1/fan_0/speed"]) >= 1900
+    assert styles_of(left, "/tray1/fan_0/speed", "Measurements:names")[0] == "measured (rpm)"
     rows = rows_of(tmp_path / "view.rrd")
+    times = [t_ns for entity in rows.values() for t_ns, _ in entity]
+    assert (min(times), max(times)) == (int(scores[0].t_ns[0]), int(scores[-1].t_ns[-1])), "none is the host's"
     speed = rows["/tray1/fan_2/speed"]
     assert [t for t, _ in speed] == np.concatenate([score.t_ns for score in scores]).tolist()
     measured, predicted, lowest, highest = np.array([row["Measurements:values"] for _, row in speed]).T
@@ -201,16 +210,6 @@ def test_live_viewers_are_served_on_the_loopback_only_and_a_second_shard_takes_a
         build(context(tmp_path / "other", serve=True, grpc_port=port, web_port=0))
     assert not (tmp_path / "other").exists(), "no file was begun"
     core.close()
-
-
-def test_a_killed_viewer_leaves_a_file_that_opens_and_holds_what_was_flushed(tmp_path: Path) -> None:
-    core = build(context(tmp_path)).core
-    play(core, made_up_tray(seconds=20)[0])
-    left = Path(shutil.copy(tmp_path / "view.rrd", tmp_path / "left.rrd"))  # what a process that is killed now leaves
-    core.close()
-    rows = rows_of(left)
-    assert len(rows["/tray1/fan_0/speed"]) >= 1900
-    assert styles_of(left, "/tray1/fan_0/speed", "Measurements:names")[0] == "measured (rad/s)"
 
 
 def context(folder: Path, *, fans: int = 3, speed_unit: Any = "rad/s", serve: bool = False, **config: Any) -> Context:

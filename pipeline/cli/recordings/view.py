@@ -82,7 +82,7 @@ def view(
             shown = f"fans {', '.join(map(str, drawn))}"
         else:
             from fantwin.pipeline.outputs.rerun.recorded_view import recorded_site, write_view  # noqa: PLC0415  an extra
-            from fantwin.pipeline.outputs.rerun.view_of_site import ViewOptions  # noqa: PLC0415
+            from fantwin.pipeline.outputs.rerun.rerun_sink import ViewOptions  # noqa: PLC0415
 
             site = recorded_site(scored.files)
             output.unlink(missing_ok=True)

@@ -6,7 +6,6 @@ device is one retained message on PREFIX/device/NODE/OBJECT/config; an empty one
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Mapping, Sequence
 from importlib.metadata import version
@@ -14,7 +13,7 @@ from typing import Any
 
 from fantwin.pipeline.config.models import TrayConfig
 from fantwin.pipeline.outputs.mqtt.config import MqttConfig
-from fantwin.pipeline.outputs.mqtt.json_text import json_text
+from fantwin.pipeline.outputs.mqtt.outbox import text_of
 from fantwin.pipeline.outputs.mqtt.topics import Topics
 from fantwin.pipeline.site.fleet import Fan
 from fantwin.schemas.topics import ALL_TRAYS
@@ -49,7 +48,7 @@ class HomeAssistant:
         """The text of each device by its topic."""
         devices = {SITE_DEVICE: self._site()}
         devices |= {f"{fan.tray}-{fan.number}": self._fan(fan, unit) for fan, unit in self._fans}
-        return {f"{self._path}/{name}/config": json_text(device) for name, device in devices.items()}
+        return {f"{self._path}/{name}/config": text_of(device) for name, device in devices.items()}
 
     def _site(self) -> dict[str, Any]:
         def count(name: str, key: str, icon: str) -> dict[str, Any]:
@@ -118,7 +117,7 @@ class HomeAssistant:
                 "button",
                 "Acknowledge",
                 command_topic=self._topics.request(fan.tray, fan.number),
-                payload_press=json.dumps({"action": ACKNOWLEDGE, "comment": "from Home Assistant"}),
+                payload_press=text_of({"action": ACKNOWLEDGE, "comment": "from Home Assistant"}),
                 icon="mdi:check",
             )
         about = {"name": f"{fan.tray} fan {fan.number}", "model": "fan", "via_device": self._identifier(SITE_DEVICE)}

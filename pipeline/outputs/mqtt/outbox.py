@@ -6,7 +6,9 @@ It holds one text a topic, however long the broker is away or slow.
 from __future__ import annotations
 
 from collections import deque
-from typing import NamedTuple
+from typing import Any, NamedTuple
+
+from pydantic_core import to_json
 
 MOST_ANSWERS = 256
 """that wait; of more, the oldest are dropped: whoever asked has long given up"""
@@ -72,3 +74,8 @@ class Outbox:
         topic = next(iter(waiting))
         del waiting[topic]
         return Outgoing(topic, self._texts[topic], is_retained=True)
+
+
+def text_of(value: Any) -> str:
+    """JSON that any program reads: an infinite number, which it does not have, is null."""
+    return to_json(value, inf_nan_mode="null").decode()

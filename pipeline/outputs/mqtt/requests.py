@@ -7,17 +7,17 @@ import time
 from collections import Counter
 from collections.abc import Sequence
 from concurrent.futures import Future
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
 from pydantic import Field, ValidationError
 
 from fantwin.pipeline.config.models import TrayConfig
-from fantwin.pipeline.outputs.mqtt.json_text import json_text
+from fantwin.pipeline.outputs.mqtt.outbox import text_of
 from fantwin.pipeline.outputs.mqtt.topics import ALL_FANS, ANSWER, REQUEST, Topics
 from fantwin.pipeline.site.request_desk import ANSWERED_WITHIN_S, RequestDesk
 from fantwin.pipeline.site.request_form import LONGEST_COMMENT, OneLine, RequestForm
-from fantwin.schemas.enums import Transition
+from fantwin.pipeline.site.site_json import answers_json
 from fantwin.schemas.messages import Alarm, Request
 
 LARGEST_REQUEST_BYTES, LONGEST_ID = 4096, 64
@@ -34,11 +34,11 @@ class MqttRequestForm(RequestForm):
     id: Annotated[str, Field(max_length=LONGEST_ID)] = ""
     name: Annotated[OneLine, Field(max_length=64)] = ""
 
-    @property
-    def full_comment(self) -> str:
-        """The comment, and who says that he asks."""
+    def message(self, fan: int, operator_name: str) -> Request:
+        """The request, with who says that he asks in its comment."""
         says = f"sent as {self.name}" if self.name else ""
-        return " ".join(filter(None, (self.comment, f"({says})" if self.comment and says else says)))[:LONGEST_COMMENT]
+        comment = " ".join(filter(None, (self.comment, f"({says})" if self.comment and says else says)))
+        return replace(super().message(fan, operator_name), comment=comment[:LONGEST_COMMENT])
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,15 +92,7 @@ class Requests:
         if error or fans is None:
             self.counts["refused_requests"] += 1
             return _answer(topic, form.id, {"error": error})
-        asked = Request(
-            t_ns=time.time_ns(),
-            action=form.message_action,
-            fan=-1 if parts[1] == ALL_FANS else fans[0],
-            duration_s=form.duration_s,
-            operator_name=self._operator_name,
-            comment=form.full_comment,
-            onset_t_ns=form.onset_t_ns,
-        )
+        asked = form.message(-1 if parts[1] == ALL_FANS else fans[0], self._operator_name)
         try:
             answers = self._desk.begin(parts[0], asked, fans)
         except TimeoutError as busy:
@@ -116,7 +108,7 @@ class Requests:
         found: list[tuple[str, str]] = []
         for each in list(self._waiting):
             if each.answers.done():
-                found.append(_answer(each.topic, each.form.id, _granted(each.answers.result())))
+                found.append(_answer(each.topic, each.form.id, answers_json(each.answers.result())))
             elif now_s > each.until_s:
                 self.counts["unanswered_requests"] += 1
                 found.append(_answer(each.topic, each.form.id, {"error": f"tray {each.tray}: no scorer has answered"}))
@@ -133,19 +125,8 @@ class Requests:
         return [int(fan)] if is_one else None
 
 
-def _granted(answers: Sequence[Alarm]) -> dict[str, Any]:
-    body: dict[str, Any] = {
-        "answers": [
-            {"fan": each.fan, "transition": each.transition.name.lower(), "message": each.message} for each in answers
-        ]
-    }
-    if all(each.transition == Transition.REFUSED for each in answers):
-        body["error"] = answers[0].message
-    return body
-
-
 def _answer(topic: str, name: str, body: dict[str, Any]) -> tuple[str, str]:
-    return f"{topic}/{ANSWER}", json_text(({"id": name} if name else {}) | {"ok": "error" not in body} | body)
+    return f"{topic}/{ANSWER}", text_of(({"id": name} if name else {}) | {"ok": "error" not in body} | body)
 
 
 def _id_of(payload: bytes) -> str:

@@ -16,8 +16,18 @@ from fantwin.pipeline.site.trace import MEASURED_COLUMNS
 from fantwin.schemas.messages import Score
 from fantwin.schemas.units import NS_PER_S
 
+FLEET_ABOVE = 64
+"""with more fans than this on the site, only those in alarm and those asked for are drawn"""
+ALARM_PLOTS = 8
+HOLD_S = 60.0
+"""how long the plot of a fan stays after its alarm has cleared"""
 ADDED_EVERY_NS = NS_PER_S // 2
 """the newest samples come no faster"""
+
+
+def is_fleet(trays: Sequence[TrayConfig]) -> bool:
+    """Whether a site has more fans than are drawn at once."""
+    return sum(tray.fans for tray in trays) > FLEET_ABOVE
 
 
 class FleetView:

@@ -8,7 +8,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import groupby
 from operator import itemgetter
 from pathlib import Path
@@ -19,6 +19,7 @@ import rerun.blueprint as rrb
 
 from fantwin.pipeline.config.models import TrayConfig
 from fantwin.pipeline.outputs.rerun.alarm_log import LogLine
+from fantwin.pipeline.outputs.rerun.fleet_view import is_fleet
 from fantwin.pipeline.outputs.rerun.rerun_bands import RerunBands
 from fantwin.pipeline.outputs.rerun.rerun_layout import LayoutName, TrayLayout, log_styles, site_blueprint
 from fantwin.pipeline.outputs.rerun.rerun_paths import ALARMS_PATH, TIMELINE
@@ -37,6 +38,27 @@ FLUSH_LIMIT_S = 2.0
 """how long a flush may take; it is called twice a second and usually takes milliseconds"""
 # Rerun's page server runs in a shell that ends with this process, even when it is killed: the pipe to its input closes.
 _PAGE_SCRIPT = '"$@" >/dev/null 2>&1 & cat >/dev/null; kill $!'
+
+
+@dataclass(frozen=True)
+class ViewOptions:
+    """What the view itself depends on, with the defaults of `[viewer]`.
+
+    Attributes:
+        show: fans of a fleet that always have a plot.
+        memory_limit: of the history kept for viewers that join late.
+        file_bytes: size at which the file ends; the viewer sets one.
+        grpc_port: where data are served to viewers on this host; None: nowhere.
+        web_port: where the page of the browser viewer is served; None: nowhere.
+    """
+
+    layout: LayoutName = "all"
+    window_s: float = 30.0
+    show: Sequence[Fan] = ()
+    memory_limit: str = "256MB"
+    file_bytes: float = math.inf
+    grpc_port: int | None = None
+    web_port: int | None = None
 
 
 def rerun_program() -> Path:
@@ -77,53 +99,39 @@ class RerunSink:
     """A Rerun recording, written to a file and served to viewers."""
 
     def __init__(
-        self,
-        *,
-        name: str,
-        trays: Sequence[TrayConfig],
-        is_fleet: bool,
-        started_t_ns: int,
-        layout: LayoutName,
-        window_s: float,
-        file: Path | None,
-        grpc_port: int | None,
-        web_port: int | None,
-        memory_limit: str,
-        file_bytes: float = math.inf,
+        self, name: str, trays: Sequence[TrayConfig], started_t_ns: int, file: Path | None, options: ViewOptions
     ) -> None:
-        """Open `file`, a data server at `grpc_port` and a page for browsers at `web_port`; None leaves one out.
-
-        file_bytes: the size at which the file ends. layout: which of the layouts is shown. is_fleet: only the fans that
+        """Open `file`, and serve what the options name; None leaves the file out. Of a fleet, only the fans that
         `show_fans` names are shown.
 
         Raises:
             StageError: the file cannot be written, or a port is taken.
         """
+        grpc_port, web_port = options.grpc_port, options.web_port
         for key, port in (("grpc_port", grpc_port), ("web_port", web_port)):
             if port is not None:
                 check_free(port, f"viewer.{key}", "viewer.serve = false")
         self._recording = rr.RecordingStream(APPLICATION)
         self._bands = RerunBands(self._recording)
-        self._is_fleet = is_fleet
-        self._trays = {each.name: TrayLayout(each.name, each.fans, each.speed_unit, is_fleet) for each in trays}
+        self._is_fleet = is_fleet(trays)
+        self._trays = {each.name: TrayLayout(each.name, each.fans, each.speed_unit, self._is_fleet) for each in trays}
         self._styled: set[Fan] = set()
-        self._window_s = window_s
+        self._options = options
         self._wear = RerunWear(self._recording)
-        self._layout_name: LayoutName = layout
         self._late = False
-        self._file = _open_view(file, file_bytes) if file is not None else None
+        self._file = _open_view(file, options.file_bytes) if file is not None else None
         sinks: list[rr.FileSink | rr.GrpcServerSink] = []
         if self._file is not None:
             # Without a footer, memory does not grow with the file, and the file can be opened after a crash.
             sinks.append(rr.FileSink(self._file.pipe, write_footer=False))
         if grpc_port is not None:
-            server = rr.GrpcServerSink(LOOPBACK, grpc_port, server_memory_limit=memory_limit)
+            server = rr.GrpcServerSink(LOOPBACK, grpc_port, server_memory_limit=options.memory_limit)
             sinks.append(server)
         self._recording.set_sinks(*sinks, default_blueprint=self._blueprint())
         if self._file is not None:
             self._file.release_pipe()
         self._recording.send_recording_name(f"{name} {np.datetime64(started_t_ns, 'ns').astype('datetime64[s]')} UTC")
-        if not is_fleet:
+        if not self._is_fleet:
             self._style([Fan(each.name, number) for each in trays for number in range(each.fans)])
         self.flush()  # the styles reach the file first, so that the file of a killed viewer has them
         self._page = _serve_page(web_port, grpc_port) if web_port is not None and grpc_port is not None else None
@@ -155,7 +163,7 @@ class RerunSink:
         if not trace.auxiliary.keys() <= {column.name for column in tray.auxiliary}:
             shown = [each for each in CHANNELS if each in tray.auxiliary or each.name in trace.auxiliary]
             tray = replace(tray, auxiliary=shown)
-        if self._layout_name == "alarms" and not self._is_fleet:
+        if self._options.layout == "alarms" and not self._is_fleet:
             in_alarm = [trace.fan_numbers[column] for column in np.flatnonzero(trace.in_alarm.any(axis=0)).tolist()]
             if new := [fan for fan in in_alarm if fan not in tray.alarmed]:
                 tray = replace(tray, alarmed=(*tray.alarmed, *new))
@@ -164,7 +172,7 @@ class RerunSink:
             self._recording.send_blueprint(self._blueprint())
 
     def _blueprint(self) -> rrb.Blueprint:
-        return site_blueprint(self._layout_name, list(self._trays.values()), self._window_s)
+        return site_blueprint(self._options.layout, list(self._trays.values()), self._options.window_s)
 
     def draw_wear(self, tray: str, points: Sequence[WearPoints]) -> None:
         """Send the newest points of the wear of some fans."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,7 +13,6 @@ from fantwin.pipeline.config.models import TrayConfig
 from fantwin.pipeline.outputs.rerun.alarm_log import LogLine, log_line
 from fantwin.pipeline.outputs.rerun.alarm_table import alarm_table
 from fantwin.pipeline.outputs.rerun.fleet_view import FleetView
-from fantwin.pipeline.outputs.rerun.view_sink import ViewSink
 from fantwin.pipeline.outputs.rerun.wear_points import WearPoints, wear_points
 from fantwin.pipeline.site.fleet import SILENT, Fan
 from fantwin.pipeline.site.site_core import SAMPLED_S, SiteCore
@@ -21,6 +21,9 @@ from fantwin.pipeline.site.trace import MEASURED_COLUMNS, Trace, state_changes, 
 from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.messages import Alarm, Message, Score, ScorerSnapshot
 from fantwin.schemas.units import NS_PER_S
+
+if TYPE_CHECKING:
+    from fantwin.pipeline.outputs.rerun.rerun_sink import RerunSink
 
 FLUSH_PERIOD_NS = 500_000_000
 REPEAT_STATES_NS = 5_000_000_000  # a viewer that joins late finds a state at most this old
@@ -56,7 +59,7 @@ class _TrayView:
 class ViewerCore(SiteCore):
     """Collects scores and passes them to a sink in few, long pieces."""
 
-    def __init__(self, site: str, trays: Sequence[TrayConfig], sink: ViewSink, fleet: FleetView | None = None) -> None:
+    def __init__(self, site: str, trays: Sequence[TrayConfig], sink: RerunSink, fleet: FleetView | None = None) -> None:
         """fleet: which fans are drawn; None: all."""
         self._now_ns: int | None = None
         """host time of the last tick"""

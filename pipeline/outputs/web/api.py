@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -28,6 +27,7 @@ from fantwin.pipeline.site.request_desk import RequestDesk
 from fantwin.pipeline.site.request_form import RequestForm
 from fantwin.pipeline.site.site_json import (
     alarms_json,
+    answers_json,
     clip_json,
     curves_json,
     fan_in_full,
@@ -39,8 +39,6 @@ from fantwin.pipeline.site.site_json import (
     transition_json,
 )
 from fantwin.pipeline.site.site_model import SiteModel
-from fantwin.schemas.enums import Transition
-from fantwin.schemas.messages import Request as OperatorRequest
 from fantwin.schemas.units import NS_PER_S
 
 MOST_LISTED = 500
@@ -217,26 +215,14 @@ class Api:
         """Send an operator's request about a fan, or all fans of a tray, and answer what the scorer says."""
         name = self.access.visitor(request).name
         fans = range(self._tray(tray).fans) if fan == ALL_FANS else [self._fan(tray, fan).number]
-        asked = OperatorRequest(
-            t_ns=time.time_ns(),
-            action=form.message_action,
-            fan=-1 if fan == ALL_FANS else fan,
-            duration_s=form.duration_s,
-            operator_name=name,
-            comment=form.comment,
-            onset_t_ns=form.onset_t_ns,
-        )
+        asked = form.message(-1 if fan == ALL_FANS else fan, name)
         self.access.log.add("request", user=name, action=form.action, fan=f"{tray} {fan}", **address_of(request))
         try:
             said = await self.desk.ask(tray, asked, fans)
         except TimeoutError as error:
             raise HTTPException(504, str(error) or f"tray {tray}: no scorer has answered") from error
-        answers = [
-            {"fan": each.fan, "transition": each.transition.name.lower(), "message": each.message} for each in said
-        ]
-        if all(each.transition == Transition.REFUSED for each in said):
-            return JSONResponse({"error": said[0].message, "answers": answers}, 409)
-        return {"answers": answers}
+        body = answers_json(said)
+        return JSONResponse(body, 409) if "error" in body else body
 
     def _answer(self, name: str, make: Callable[[], Any]) -> SharedAnswer:
         """The one for all who ask for this."""

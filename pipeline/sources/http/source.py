@@ -10,6 +10,7 @@ import hmac
 import threading
 from collections import deque
 from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -178,15 +179,7 @@ class HttpSource:
 
     def _limits(self) -> dict[str, Any]:
         limits = self._context.limits
-        if limits is None:
-            return {}
-        return {
-            "fans": limits.fans,
-            "command_min": limits.command_min,
-            "command_max": limits.command_max,
-            "speed_max": limits.speed_max,
-            "speed_unit": self._context.speed_unit,
-        }
+        return {**asdict(limits), "speed_unit": self._context.speed_unit} if limits else {}
 
     def _counts(self) -> dict[str, int]:
         with self._changed:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -41,17 +42,23 @@ def reports(viewer: Any) -> dict[str, list[str]]:
     return {view.name: [str(report) for report in view.reports] for view in viewer.get_state().views}
 
 
+def is_drawn(viewer: Any) -> bool:
+    """Whether it has drawn its window in the time that it allows itself, which a busy machine may not be given."""
+    with suppress(TimeoutError):
+        return bool(viewer.take_screenshot())
+    return False
+
+
 @pytest.mark.slow
 @needs_a_driver
-def test_each_layout_of_a_live_view_a_recording_and_a_fleet_opens_without_a_report(
+def test_each_other_layout_of_a_live_view_a_recording_and_a_fleet_opens_without_a_report(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made = {
-        live_view(tmp_path, window_s=1.0): plots("tray1/0", "tray1/1", "tray1/2") | {"temperature (°C)"},
         live_view(tmp_path / "wear", "wear"): {"tray1 / speed since commissioning (%)"},
         recorded_view(tmp_path, "alarms"): plots("tray1/2") | {"temperature (°C)"},
     }
-    monkeypatch.setattr("fantwin.stages.viewer.FLEET_ABOVE", 3)
+    monkeypatch.setattr("fantwin.pipeline.outputs.rerun.fleet_view.FLEET_ABOVE", 3)
     made[fleet_view(tmp_path / "fleet")] = plots("tray1/0", "tray2/2")
     for path, names in made.items():
         with rerun_picture.headless_viewer() as viewer:
@@ -59,7 +66,7 @@ def test_each_layout_of_a_live_view_a_recording_and_a_fleet_opens_without_a_repo
             eventually(lambda: reports(viewer).keys() == names, f"the views of {path}")  # noqa: B023  at once
             axes = [part["TimeAxis"] for part in viewer.get_blueprint().blueprint.values() if "TimeAxis" in part]
             assert len([axis for axis in axes if "view_range" in axis]) == 1, "all others are linked to it"
-            viewer.take_screenshot()
+            eventually(lambda: is_drawn(viewer), f"{path} is drawn")
             assert {name: of for name, of in reports(viewer).items() if of} == {}
             assert [entry for entry in viewer.get_logs() if entry.level.lower() in ("warn", "error")] == []
 

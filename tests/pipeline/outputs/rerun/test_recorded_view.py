@@ -13,18 +13,15 @@ import pytest
 from fantwin.pipeline.cli.options import ViewLayout
 from fantwin.pipeline.cli.recordings.view import view
 from fantwin.pipeline.errors import UserError
-from fantwin.pipeline.outputs.rerun.view_of_site import ViewOptions
 from fantwin.pipeline.recordings.writing import RecordingWriter
 from fantwin.schemas.messages import Alarm, Message, Score
 from fantwin.schemas.topics import tray_key
 from fantwin.stages.viewer import build
 from tests.stages.test_viewer import chunks_of, context, rows_of, sent
-from tests.stages.test_viewer_fleet import TRAYS, messages_of
 from tests.support.score_data import START_NS, made_up_tray
 from tests.support.wear_data import worn_snapshot
 
 pytest.importorskip("rerun")
-recorded = pytest.importorskip("fantwin.pipeline.outputs.rerun.recorded_view")
 TOPICS = {"Score": "score", "Alarm": "alarm", "ScorerSnapshot": "snapshot"}
 HOLE_S = (4.0, 6.0)
 
@@ -113,16 +110,3 @@ def test_an_existing_view_is_kept_and_a_recording_without_scores_is_one_line(tmp
     with pytest.raises(UserError, match="holds no scores to show"):
         view([writer.path], tmp_path / "new.rrd")
     assert not (tmp_path / "new.rrd").exists()
-
-
-def test_a_recording_of_a_fleet_has_a_plot_for_the_fan_in_alarm(tmp_path: Path) -> None:
-    trays = {f"fans.{tray}": "3" for tray in TRAYS}
-    with RecordingWriter(tmp_path / "fleet.mcap", {"trays": ",".join(TRAYS), **trays}, {}) as writer:
-        for number, message in enumerate(messages_of()):
-            header = replace(message.header, sequence=number)
-            key = tray_key("site", message.header.tray, TOPICS[type(message).__name__])
-            writer.add_message(key, replace(message, header=header), last_t_ns(message))
-    fleet = recorded.recorded_site([writer.path])
-    assert recorded.write_view(fleet, tmp_path / "fleet.rrd", ViewOptions(fleet_above=3)) == []
-    rows = rows_of(tmp_path / "fleet.rrd")
-    assert {entity for entity in rows if entity.endswith("/speed")} == {"/tray2/fan_2/speed"}

@@ -10,7 +10,7 @@ import pytest
 
 from fantwin.pipeline.config.models import TrayConfig
 from fantwin.pipeline.outputs.rerun import view_file
-from fantwin.pipeline.outputs.rerun.rerun_sink import RerunSink
+from fantwin.pipeline.outputs.rerun.rerun_sink import RerunSink, ViewOptions
 from fantwin.pipeline.outputs.rerun.view_file import ViewFile
 from fantwin.pipeline.outputs.rerun.viewer_core import ViewerCore
 from fantwin.schemas.units import NS_PER_S
@@ -35,18 +35,7 @@ def test_what_is_written_is_in_the_file_after_a_flush(tmp_path: Path) -> None:
 
 def test_row_09_a_view_on_a_full_disk_is_reported_and_the_viewer_goes_on_and_ends(small_disk: Path) -> None:
     trays = (TrayConfig(name="tray1", fans=3),)
-    sink = RerunSink(
-        name="x",
-        trays=trays,
-        is_fleet=False,
-        started_t_ns=START_NS,
-        layout="all",
-        window_s=30.0,
-        file=small_disk / "view.rrd",
-        grpc_port=None,
-        web_port=None,
-        memory_limit="256MB",
-    )
+    sink = RerunSink("x", trays, START_NS, small_disk / "view.rrd", ViewOptions())
     core = ViewerCore("site", trays, sink)
     with (small_disk / "ballast").open("wb", buffering=0) as ballast, pytest.raises(OSError, match="No space"):
         while True:
