@@ -40,8 +40,8 @@ from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Alarm, Score
 from fantwin.schemas.topics import BY_NAME, tray_key
 from tests.support.notified_alarms import alarm
+from tests.support.ports import free_port
 from tests.support.running_chain import RunningCommand, eventually
-from tests.support.running_gateway import free_port
 
 SITE, TRAY, FANS = "hall", "tray1", 500
 ALARM_EVERY_S, SCORE_EVERY_S = 1.0, 1.0

@@ -31,7 +31,7 @@ from fantwin.pipeline.sources.mqtt.client import new_client
 from fantwin.pipeline.sources.mqtt.settings import BrokerSettings
 from fantwin.pipeline.sources.source import SourceContext
 from fantwin.stages import gateway, opcua
-from tests.support.running_gateway import free_port
+from tests.support.ports import free_port
 from tests.support.site_certificates import SiteCertificates
 
 CERTIFICATE, KEY, CA = "own.pem", "own.key", "ca.pem"

@@ -302,6 +302,13 @@ def test_a_proxy_names_the_user_and_others_cannot(opened, tmp_path):
     client, path, asked = Client(gateway), f"/api/v1/fans/{TRAY}/2/requests", {"action": "acknowledge"}
     assert client.ask("GET", "/api/v1/site")[0] == 401
     assert client.ask("GET", "/api/v1/site", None, {"X-User": "vic"})[1]["site"] == SITE
+    twice = http.client.HTTPConnection("127.0.0.1", gateway.port, timeout=20)
+    twice.putrequest("GET", "/api/v1/site")
+    for name in ("ann", "vic"):
+        twice.putheader("X-User", name)
+    twice.endheaders()
+    assert twice.getresponse().status == 401, "a header that comes twice names nobody"
+    twice.close()
     status, answer, _ = client.ask("POST", path, asked)
     assert (status, answer["error"][:31]) == (401, "the proxy has sent no X-User wi")
     assert client.ask("POST", path, asked, {"X-User": "vic"})[0] == 403

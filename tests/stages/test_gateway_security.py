@@ -167,17 +167,6 @@ def test_through_a_proxy_that_knows_no_users_nobody_reads_without_a_login(opened
     assert logged_in(gateway).ask("GET", "/api/v1/site")[0] == 200
 
 
-def test_a_header_of_the_proxy_that_comes_twice_names_nobody(opened, tmp_path):
-    gateway = opened(tmp_path, granted, user_header="X-User", operators=("ann",))
-    connection = http.client.HTTPConnection("127.0.0.1", gateway.port, timeout=20)
-    connection.putrequest("GET", "/api/v1/site")
-    connection.putheader("X-User", "ann")
-    connection.putheader("X-User", "vic")
-    connection.endheaders()
-    assert connection.getresponse().status == 401
-    connection.close()
-
-
 def test_what_fails_in_the_gateway_is_logged_and_says_nothing_to_whoever_asks(gateway, capfd, monkeypatch):
     assert Client(gateway).ask("POST", "/api/v1/login", {}, {"Origin": "http://["})[0] == 403
     said(capfd)

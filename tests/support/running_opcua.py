@@ -13,8 +13,8 @@ from asyncua.server.internal_server import InternalServer
 
 from fantwin.pipeline.outputs.opcua.config import OpcuaConfig
 from fantwin.stages.opcua import STAGE, OpcuaCore
+from tests.support.ports import free_port
 from tests.support.running_core import FANS, Answer, RunningCore
-from tests.support.running_gateway import free_port
 from tests.support.site_users import make_users
 
 _make_standard_nodes = InternalServer.load_standard_address_space

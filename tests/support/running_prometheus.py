@@ -15,8 +15,8 @@ from typing import Any
 import pytest
 import yaml
 
+from tests.support.ports import free_port
 from tests.support.running_chain import eventually
-from tests.support.running_gateway import free_port
 
 DEPLOY = Path(__file__).parents[2] / "deploy"
 INTERVAL = "500ms"

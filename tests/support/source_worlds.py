@@ -30,7 +30,8 @@ from fantwin.schemas.units import RAD_S_PER_UNIT
 from fantwin.schemas.wire import Sample, encode
 from tests.support.hwmon_trees import add_chip
 from tests.support.modbus_server import modbus_server
-from tests.support.mqtt_broker import MqttBroker, free_port
+from tests.support.mqtt_broker import MqttBroker
+from tests.support.ports import free_port
 from tests.support.redfish_server import Controller, redfish_server
 
 COMMAND = 0.5

@@ -11,8 +11,9 @@ import typer
 
 from fantwin.pipeline.cli.watch.doctor import doctor
 from tests.support.fantwin_command import error_of, fantwin, usage_error_of
-from tests.support.message_receivers import HttpReceiver, free_port
+from tests.support.message_receivers import HttpReceiver
 from tests.support.notified_alarms import secret
+from tests.support.ports import free_port
 
 CONFIGURATION = """
 site = "hall"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from pathlib import Path
 from typing import Any
 
@@ -63,21 +62,6 @@ def device(port: int, *fans: dict[str, Any], **settings: Any) -> ModbusDevice:
     return made
 
 
-def test_registers_of_all_types_are_read_by_one_request_and_a_command_moves_the_rotor() -> None:
-    with modbus_server({3: drive()}) as port:
-        made = device(port)
-        assert [(each.first.address, each.count) for each in made._requests] == [(SPEED, 7)]
-        first = made.read()
-        assert first.measured[of.CURRENT] == (1.5,) and first.measured[of.SUPPLY_VOLTAGE] == pytest.approx((540.25,))
-        assert first.measured[of.TEMPERATURE] == pytest.approx((24.5,))
-        made.write((0.9,), ())
-        time.sleep(0.8)
-        second = made.read()
-        assert second.command == (0.9,) and second.speed[0] > first.speed[0] + 500.0
-        assert second.speed[0] % 2.0 == 0.0
-        made.disconnect()
-
-
 def test_what_a_drive_refuses_is_nan_or_an_error_and_a_command_must_be_there() -> None:
     without = {key: value for key, value in FAN.items() if key != "write"}
     with modbus_server({3: drive()}) as port:
@@ -104,25 +88,25 @@ def over_serial(line: SerialLine, **settings: Any) -> tuple[ModbusConfig, Source
     return ModbusConfig.model_validate(values), SourceContext(1, "rpm", Path())
 
 
-def test_frames_of_modbus_rtu_go_over_a_serial_line_both_ways() -> None:
+def test_registers_of_all_types_are_read_by_one_request_and_a_command_moves_the_rotor() -> None:
     with modbus_line({3: drive()}) as line:
         made = ModbusDevice(*over_serial(line))
         made.connect()
         first = made.read()
         assert (first.measured[of.CURRENT], first.measured[of.SUPPLY_VOLTAGE]) == ((1.5,), pytest.approx((540.25,)))
+        assert first.measured[of.TEMPERATURE] == pytest.approx((24.5,))
         made.write((0.9,), ())
-        time.sleep(0.8)
+        eventually(lambda: made.read().speed[0] > first.speed[0] + 500.0, "it turns faster")
         second = made.read()
-        assert second.command == (0.9,) and second.speed[0] > first.speed[0] + 500.0
+        assert second.command == (0.9,)
+        assert second.speed[0] % 2.0 == 0.0
         with pytest.raises(DeviceError, match=r"unit 3 refuses 1.5 for register 100 \(exception 3\)"):
             made.write((1.5,), ())
         made.disconnect()
     # unit, function, address, count or value, CRC: seven registers from 10 on, and 900 to register 100
     read, write = bytes.fromhex("0303000a000725e8"), bytes.fromhex("031000640001020384b787")
     assert line.transferred["device"].startswith(read + write + read)
-    assert (
-        line.transferred["host"].startswith(bytes.fromhex("03030e")) and len(line.transferred["host"]) == 2 * 19 + 8 + 5
-    )
+    assert line.transferred["host"].startswith(bytes.fromhex("03030e"))
 
 
 def test_the_registers_say_what_is_measured_where_the_averaging_time_is_known() -> None:
@@ -142,14 +126,17 @@ def test_the_registers_say_what_is_measured_where_the_averaging_time_is_known() 
         assert "\n" not in str(caught.value)
 
 
-def test_a_unit_that_is_too_slow_on_a_serial_line_is_a_failed_poll_and_the_next_one_works() -> None:
+def test_a_unit_that_is_too_slow_on_a_serial_line_is_a_failed_poll_and_the_next_one_works(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("fantwin.pipeline.sources.modbus.source.TIMEOUT_S", 2.0)
     slow = drive()
     with modbus_line({3: slow}) as line:
         made = ModbusDevice(*over_serial(line))
         made.connect()
         made.read()
         slow.is_silent = True
-        with pytest.raises(DeviceError, match=r"unit 3 does not answer within 5 s; check unit and wiring") as caught:
+        with pytest.raises(DeviceError, match=r"unit 3 does not answer within 2 s; check unit and wiring") as caught:
             made.read()
         assert not caught.value.is_lost
         received = len(line.transferred["host"])

@@ -115,16 +115,3 @@ def test_transitions_are_done_without_a_gap_only(tmp_path):
     assert [number for number, _ in TransitionQueue(store, 100).take(9)] == [4, 5]
     queue.acknowledge(77)
     assert [number for number, _ in queue.take(9)] == [4, 5]
-
-
-def test_of_too_many_that_wait_the_oldest_are_lost(tmp_path):
-    store = filled(tmp_path, 2)
-    queue = TransitionQueue(store, 3)
-    queue.take(1)
-    for number in range(2, 8):
-        store.add(alarm(sequence=number))
-        queue.notice_new()
-    assert queue.lost == 4
-    assert [number for number, _ in queue.take(9)] == [6, 7, 8]
-    queue.acknowledge(1)
-    assert queue.waiting == 3

@@ -7,7 +7,8 @@ import pytest
 from fantwin.pipeline.outputs.notify.apprise_service import Service
 from fantwin.pipeline.outputs.notify.wording import Level, Text
 from fantwin.scoring.diagnosis.causes import CANNOT_TELL, CAUSES, WHAT_TO_DO
-from tests.support.message_receivers import HttpReceiver, MailServer, free_port
+from tests.support.message_receivers import HttpReceiver, MailServer
+from tests.support.ports import free_port
 
 
 def test_no_reason_of_a_failure_shows_a_secret(capfd):

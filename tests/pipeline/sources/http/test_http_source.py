@@ -20,7 +20,7 @@ from pydantic import ValidationError
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.runtime.stage import Context
 from fantwin.pipeline.sources.http.config import HttpConfig
-from fantwin.pipeline.sources.http.source import MOST_WAITING, HttpSource
+from fantwin.pipeline.sources.http.source import HttpSource
 from fantwin.pipeline.sources.json_samples import LARGEST_BYTES
 from fantwin.pipeline.sources.source import (
     LinkUp,
@@ -31,7 +31,7 @@ from fantwin.pipeline.sources.source import (
     SourceEvent,
 )
 from fantwin.stages.acquisition import STAGE
-from tests.support.mqtt_broker import free_port
+from tests.support.ports import free_port
 from tests.support.running_acquisition import push_config
 from tests.support.running_chain import eventually
 
@@ -97,7 +97,8 @@ def test_an_answer_says_what_became_of_each_sample() -> None:
     assert isinstance(events[1], ReadingBatch) and isinstance(events[1].items[0], Reading)
 
 
-def test_an_acquisition_that_is_behind_turns_samples_away_and_says_so() -> None:
+def test_an_acquisition_that_is_behind_turns_samples_away_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("fantwin.pipeline.sources.http.source.MOST_WAITING", 20)
     source, may_go_on, delivered = source_of(), threading.Event(), []
 
     def deliver(event: SourceEvent) -> None:
@@ -106,14 +107,14 @@ def test_an_acquisition_that_is_behind_turns_samples_away_and_says_so() -> None:
 
     with running(source, deliver):
         eventually(source.check, "it listens")
-        samples = [{"command": [0, 0], "speed": [1, 1]}] * (MOST_WAITING // 2)
+        samples = [{"command": [0, 0], "speed": [1, 1]}] * 10
         assert [ask(source, samples)[0] for _ in range(2)] == [200, 200]
         status, answer, headers = ask(source, SAMPLE)
         assert (status, answer, headers["Retry-After"]) == (429, {"error": "acquisition is behind", "accepted": 0}, "1")
         assert ask(source)[1]["turned_away"] == 1
         may_go_on.set()
         eventually(lambda: ask(source, SAMPLE)[0] == 200, "there is room again")
-        eventually(lambda: len(delivered) == 2 + MOST_WAITING, "what was accepted is delivered")
+        eventually(lambda: len(delivered) == 2 + 20, "what was accepted is delivered")
 
 
 def test_a_token_is_asked_for_and_beyond_loopback_it_is_required(tmp_path: Path) -> None:

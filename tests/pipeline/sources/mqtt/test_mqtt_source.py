@@ -33,7 +33,8 @@ from fantwin.pipeline.sources.source import (
     SourceContext,
     SourceEvent,
 )
-from tests.support.mqtt_broker import MqttBroker, free_port
+from tests.support.mqtt_broker import MqttBroker
+from tests.support.ports import free_port
 from tests.support.running_chain import eventually
 
 SAMPLE = '{"t": 1.0, "command": [0.5, 0.5], "speed": [100, 200]}'
