@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import http.client
 import json
 import ssl
@@ -14,14 +15,12 @@ from unittest.mock import Mock
 
 import pytest
 from starlette.requests import Request
-from starlette.responses import Response
 
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.outputs.web.shared_answer import SharedAnswer
 from fantwin.pipeline.site import login_failures
 from fantwin.pipeline.site.users import UserRole
 from tests.stages.test_gateway import SCRIPT, alarm, granted, score
-from tests.support.running_chain import eventually
 from tests.support.running_core import TRAY
 from tests.support.running_gateway import Client, RunningGateway
 from tests.support.site_certificates import SiteCertificates
@@ -234,43 +233,21 @@ def test_by_https_the_cookie_goes_at_logout_and_a_certificate_that_is_over_is_na
     assert "page.pem: expired on" in gateway.problem()
 
 
-def test_what_all_pages_ask_for_at_once_is_made_for_all_of_them_and_is_never_older_than_the_question(
-    gateway, monkeypatch
-):
-    goes_on, is_making, made = threading.Event(), threading.Event(), []
-    make = gateway.core._model.current_alarms
+def test_what_all_pages_ask_for_at_once_is_made_for_all_of_them_and_is_never_older_than_the_question():
+    goes_on, made = threading.Event(), list[int]()
 
-    def slowly() -> list[Any]:
-        made.append(make())
-        is_making.set()
+    def make() -> int:
+        made.append(len(made))
         assert goes_on.wait(30)
         return made[-1]
 
-    asked: list[Request] = []
-    answer = SharedAnswer.to
+    async def all_ask() -> list[int]:
+        shared, request = SharedAnswer(make), Request({"type": "http", "headers": []})
+        pages = [asyncio.create_task(shared.to(request))]
+        while not made:
+            await asyncio.sleep(0.001)
+        pages += [asyncio.create_task(shared.to(request)) for _ in range(8)]
+        asyncio.get_running_loop().call_soon(goes_on.set)
+        return [int((await each).body) for each in pages]
 
-    async def counted(shared: SharedAnswer, request: Request) -> Response:
-        asked.append(request)
-        return await answer(shared, request)
-
-    monkeypatch.setattr(SharedAnswer, "to", counted)
-    monkeypatch.setattr(gateway.core._model, "current_alarms", slowly)
-    answers: list[int] = []
-    pages = [
-        threading.Thread(target=lambda: answers.append(len(Client(gateway).ask("GET", "/api/v1/alarms")[1]["alarms"])))
-        for _ in range(9)
-    ]
-    pages[0].start()
-    assert is_making.wait(30)
-    gateway.feed(alarm())
-    for page in pages[1:]:
-        page.start()
-    assert Client(gateway).ask("GET", "/healthz")[0] == 200, "whoever asks for something else does not wait"
-    eventually(lambda: len(asked) == len(pages), "all have asked")
-    goes_on.set()
-    for page in pages:
-        page.join()
-    assert sorted(answers) == [0] + [1] * 8
-    assert len(made) == 2
-    headers = Client(gateway).ask("GET", "/api/v1/alarms?all=1", None, {"Accept-Encoding": "identity"})[2]
-    assert headers["content-type"] == "application/json"
+    assert asyncio.run(all_ask()) == [0] + [1] * 8

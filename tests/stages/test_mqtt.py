@@ -251,11 +251,17 @@ def test_a_broker_that_refuses_a_password_or_whose_certificate_is_unknown_is_nam
     broker.start()
     password.touch(0o600)
     known: dict[str, Any] = {"tls": True, "ca": "ca.pem", "username": "plant", "password_file": "password"}
+    unknown: dict[str, Any] = {"tls": True}
     try:
-        for text, settings, problem in (
-            ("secret", known, ""),
-            ("wrong", known, "the broker refuses this client"),
-            ("secret", dict[str, Any](tls=True), "is away, or TLS fails: `fantwin doctor` says which"),
+        for text, settings, problem, of_doctor in (
+            ("secret", known, "", ""),
+            ("wrong", known, "the broker refuses this client", "check username and password"),
+            (
+                "secret",
+                unknown,
+                "is away, or TLS fails: `fantwin doctor` says which",
+                "check ca, and that host is a name in the certificate of the broker",
+            ),
         ):
             password.write_text(f"{text}\n")
             stage = RunningMqtt(tmp_path, broker.port, **settings)
@@ -264,14 +270,12 @@ def test_a_broker_that_refuses_a_password_or_whose_certificate_is_unknown_is_nam
                 problem or "it is let in",
             )
             stage.close()
-        config = MqttConfig(host="127.0.0.1", port=broker.port, **settings)
-        context = Context(SITE, (), config, tmp_path, tmp_path, 0)
-        assert "check username and password" in check(context)[0]
+            config = MqttConfig(host="127.0.0.1", port=broker.port, **settings)
+            found = check(Context(SITE, (), config, tmp_path, tmp_path, 0))
+            assert [of_doctor in each for each in found] == [True] * bool(of_doctor)
         password.chmod(0o644)
-        assert "chmod 600" in check(context)[0]
-        stage = RunningMqtt(tmp_path, broker.port, tls=True)
-        assert stage.problem().endswith("is away, or TLS fails: `fantwin doctor` says which")
-        stage.close()
+        config = MqttConfig(host="127.0.0.1", port=broker.port, **known)
+        assert "chmod 600" in check(Context(SITE, (), config, tmp_path, tmp_path, 0))[0]
     finally:
         broker.stop()
 

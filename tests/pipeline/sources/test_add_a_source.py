@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from fantwin.pipeline.acquisition.sample_blocks import BlockEvent, SampleBlocks
@@ -15,7 +13,7 @@ from fantwin.pipeline.plugins import SourceKind
 from fantwin.pipeline.runtime.stage import BuiltStage, Context
 from fantwin.pipeline.sources.kinds import SOURCE_KINDS
 from fantwin.pipeline.sources.serial.config import SerialConfig
-from fantwin.schemas.messages import Command, Raw, StatedTacho
+from fantwin.schemas.messages import Raw, StatedTacho
 from fantwin.schemas.tacho import Tacho
 from fantwin.stages.acquisition import STAGE
 from tests.support.toy_source import ToyConfig, ToySource
@@ -66,23 +64,6 @@ def test_the_configuration_of_a_new_kind_is_checked_by_its_own_model() -> None:
         parse_config(CONFIGURATION.replace("2000.0", '"fast"'), Path("fantwin.toml"))
 
 
-def test_a_new_source_shares_range_checks_units_blocks_and_loss_counting() -> None:
-    parts, _ = built()
-    (raw,) = (message for event in events_of(parts) for message in parts.core.step(event))
-    assert isinstance(raw, Raw)
-    expected = np.array([[2 * math.pi] * 2, [math.nan] * 2, [4 * math.pi] * 2])
-    np.testing.assert_allclose(raw.speed_rad_s, expected, rtol=1e-15)
-    assert raw.device_sequence.tolist() == [0, 2, 4]
-    assert raw.device_clock_us.tolist() == []
-    counts = parts.core.counters()
-    assert (counts["samples"], counts["absurd_speed"], counts["lost_on_line"]) == (3, 2, 2)
-    parts.core.tick(10_000_000_000)
-    assert parts.core.problem().startswith("toy: nothing received for 2 s")
-    others, _ = built(CONFIGURATION.replace("fans = 2", "fans = 3"))
-    assert [message for event in events_of(others) for message in parts.core.step(event)] == []
-    assert parts.core.counters()["wrong_fan_count"] == 3
-
-
 def test_what_a_source_states_to_measure_is_in_its_messages_unless_the_tray_says_otherwise() -> None:
     def messages(text: str, says: tuple[Tacho, ...] = ()) -> list[Raw]:
         parts, source = built(text)
@@ -100,17 +81,6 @@ def test_what_a_source_states_to_measure_is_in_its_messages_unless_the_tray_says
     # A configuration that says it of a source that does not know is no statement of the source.
     assert [raw.tachos for raw in messages(overridden.replace("average_s = 0.5, ", ""))] == [()]
     assert [raw.tachos for raw in messages(stated, (count, count))] == [(StatedTacho.of(count),)]
-
-
-def test_commands_reach_a_new_source_in_the_unit_of_its_tray() -> None:
-    parts, source = built()
-    parts.core.step(Command(fans=2, t_ns=0, command=np.array([0.25, math.nan]), set_point_rad_s=np.array([])))
-    parts.core.step(Command(fans=2, t_ns=0, command=np.array([]), set_point_rad_s=np.array([2 * math.pi, 0.0])))
-    parts.core.step(Command(fans=2, t_ns=0, command=np.array([2.0, 0.0]), set_point_rad_s=np.array([])))
-    (first, _), (_, second) = source.sent
-    assert first[0] == 0.25 and math.isnan(first[1])
-    assert second == pytest.approx((60.0, 0.0))
-    assert parts.core.counters()["refused_commands"] == 1
 
 
 @pytest.mark.parametrize(

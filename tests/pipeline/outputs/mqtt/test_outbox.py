@@ -10,7 +10,7 @@ import pytest
 
 from fantwin.pipeline.config.models import TrayConfig
 from fantwin.pipeline.outputs.mqtt.fan_states import FanStates
-from fantwin.pipeline.outputs.mqtt.outbox import MOST_ANSWERS, Outbox, Outgoing
+from fantwin.pipeline.outputs.mqtt.outbox import Outbox, Outgoing
 from fantwin.pipeline.outputs.mqtt.topics import do_overlap
 from fantwin.pipeline.outputs.mqtt.transition_queue import READER, TransitionQueue
 from fantwin.pipeline.site.alarm_history import AlarmHistory
@@ -48,14 +48,6 @@ def test_after_a_new_connection_all_that_is_retained_is_sent_again():
     outbox.take(100)
     outbox.renew()
     assert outbox.take(100) == [Outgoing("a", "1", is_retained=True)]
-
-
-def test_answers_do_not_pile_up():
-    outbox = Outbox()
-    for number in range(2 * MOST_ANSWERS):
-        outbox.answer("a", str(number))
-    assert len(outbox) == MOST_ANSWERS
-    assert texts(outbox)[0] == f"a {MOST_ANSWERS}"
 
 
 @pytest.mark.parametrize(

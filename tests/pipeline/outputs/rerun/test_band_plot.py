@@ -19,7 +19,6 @@ from fantwin.pipeline.outputs.rerun import band_plot
 from fantwin.pipeline.outputs.rerun.band_plot import Fault, plot_bands, plot_recording, read_trace
 from fantwin.pipeline.recordings.writing import RecordingWriter
 from fantwin.pipeline.site.trace import trace_of
-from fantwin.schemas.enums import FanState
 from fantwin.schemas.messages import Alarm, Score
 from fantwin.schemas.topics import tray_key
 from tests.support.score_data import START_NS, made_up_tray
@@ -48,19 +47,6 @@ def test_what_was_measured_beside_has_a_panel_with_its_unit_below_each_fan() -> 
     assert np.nanmax(np.asarray(line.get_ydata(), float)) == 12.0
     unknown = [replace(score, supply_voltage_v=np.full(score.command.shape, np.nan, np.float32)) for score in scores]
     assert len(band_plot._figure(trace_of("tray1", unknown, "rpm"), [1, 2], [FAULT]).axes) == 4
-
-
-def test_a_title_has_the_time_of_each_alarm_once_however_often_it_begins_to_return() -> None:
-    scores, _ = made_up_tray(fans=1, faulty_fan=None, gap_fan=None)
-    trace = trace_of("tray1", scores, "rad/s")
-    state = np.full(trace.state.shape, int(FanState.NORMAL), trace.state.dtype)
-    for first, last in ((100, 160), (170, 200), (300, 310)):
-        state[first:last] = int(FanState.ALARM)
-    state[160:170] = int(FanState.RETURNING)
-    in_alarm = state != int(FanState.NORMAL)
-    figure = band_plot._figure(replace(trace, state=state, in_alarm=in_alarm), [0], [])
-    raised_s = (trace.t_ns[[100, 300]] - trace.t_ns[0]) / 1e9
-    assert f"alarm at {raised_s[0]:.1f} s, {raised_s[1]:.1f} s" in figure.axes[0].get_title(loc="left")
 
 
 def test_no_line_is_drawn_across_missing_samples() -> None:

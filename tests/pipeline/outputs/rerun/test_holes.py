@@ -6,7 +6,6 @@ import numpy as np
 
 from fantwin.pipeline.site.trace import SILENT, state_changes, trace_of, with_holes
 from fantwin.schemas.messages import Score
-from tests.stages.test_viewer import FakeSink, core_of, sent
 from tests.support.score_data import START_NS, STEP_NS, made_up_tray
 
 MISSING_S = (1.0, 2.0)
@@ -29,17 +28,3 @@ def test_a_hole_begins_where_samples_begin_to_be_missing_and_one_missing_sample_
     assert not trace.valid[row, 0] and np.delete(trace.t_ns, row).tolist() == samples.t_ns.tolist()
     times, names = state_changes(trace, 0, "normal")
     assert ((times - START_NS) / 1e9).tolist() == [1.0, 2.0] and names == [SILENT, "normal"]
-
-
-def test_a_hole_between_two_flushes_is_one_too_and_a_recording_that_goes_back_has_none() -> None:
-    sink = FakeSink()
-    core = core_of(sink, fans=1)
-    blocks = scores()
-    for number, block in enumerate([*blocks, *blocks[:50]]):
-        core.step(sent(block))
-        core.tick((number + 1) * 1_000_000_000)
-    core.close()
-    empty = [(int(t) - START_NS) / 1e9 for trace in sink.traces for t in trace.t_ns[np.isnan(trace.predicted[:, 0])]]
-    assert empty == [1.0]
-    assert core.counters()["samples_drawn"] == len(blocks) + 50
-    assert [name for at_s, name in sink.lane(0) if 0.99 < at_s < 2.01] == [SILENT, "normal"]

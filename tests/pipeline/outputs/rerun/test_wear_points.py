@@ -10,7 +10,6 @@ import pytest
 
 from fantwin.pipeline.outputs.rerun.wear_points import wear_points
 from fantwin.schemas.messages import ScorerSnapshot
-from tests.stages.test_viewer import FLUSH_PERIOD_NS, FakeSink, core_of
 from tests.support.score_data import START_NS
 from tests.support.wear_data import LOSS, worn_snapshot
 
@@ -36,13 +35,3 @@ def test_the_points_of_every_fan_are_read_as_they_are_shown(snapshot: ScorerSnap
 def test_a_snapshot_without_wear_or_of_an_unknown_version_has_no_points(snapshot: ScorerSnapshot) -> None:
     for text in ("{}", '{"wear": {"fans": [{}], "state": {"value": [0]}}}', '{"wear": {"fans": 3}}', "not JSON"):
         assert wear_points(replace(snapshot, state_json=text)) == []
-
-
-def test_the_wear_is_drawn_once_with_each_snapshot(snapshot: ScorerSnapshot) -> None:
-    sink = FakeSink()
-    core = core_of(sink)
-    for number in range(4):
-        if number % 2 == 0:
-            core.step(replace(snapshot, t_ns=START_NS + number))
-        core.tick((number + 1) * FLUSH_PERIOD_NS)
-    assert len(sink.wear) == 2 * FANS and {tray for tray, _ in sink.wear} == {"tray1"}

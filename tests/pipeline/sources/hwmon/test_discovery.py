@@ -48,17 +48,16 @@ def test_each_chip_with_fans_is_a_tray_that_reads_what_is_there(root: Path) -> N
     assert any("not known" in note for note in found[2].notes)
 
 
-def test_files_that_may_not_be_written_are_named(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(os, "access", lambda path, _mode: not str(path).endswith("pwm1"))
-    assert "this user may not write pwm1" in next(iter(discover_hwmon(root))).missing[-1]
-
-
-def test_a_tree_without_fans_or_no_tree_says_what_is_missing(tmp_path: Path) -> None:
+def test_no_tree_one_without_fans_and_one_that_may_not_be_written_say_what_is_missing(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (none,) = discover_hwmon(tmp_path / "none")
     assert not none.tray and none.missing[0].startswith("no such folder: this system has no hwmon")
-    add_chip(tmp_path / "hwmon", 0, "k10temp", "pci/0", {"temp1_input": 1})
-    (bare,) = discover_hwmon(tmp_path / "hwmon")
+    add_chip(tmp_path / "bare", 0, "k10temp", "pci/0", {"temp1_input": 1})
+    (bare,) = discover_hwmon(tmp_path / "bare")
     assert bare.missing[0].startswith("no chip with a fan; chips: k10temp; load the driver")
+    monkeypatch.setattr(os, "access", lambda path, _mode: not str(path).endswith("pwm1"))
+    assert "this user may not write pwm1" in next(iter(discover_hwmon(root))).missing[-1]
 
 
 def test_the_command_writes_a_new_configuration_and_prints_json(root: Path, tmp_path: Path) -> None:

@@ -13,19 +13,13 @@ from typing import Any
 
 import paho.mqtt.client as paho
 import pytest
-import trustme
 from paho.mqtt.enums import CallbackAPIVersion
-from pwdlib import PasswordHash
-from pwdlib.hashers.argon2 import Argon2Hasher
 from pydantic import ValidationError
 
-from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.sources.fan_values import FanValues
-from fantwin.pipeline.sources.mqtt import source as mqtt_source
 from fantwin.pipeline.sources.mqtt.config import MqttConfig
 from fantwin.pipeline.sources.mqtt.source import MqttSource
 from fantwin.pipeline.sources.source import (
-    LinkDown,
     LinkUp,
     Reading,
     ReadingBatch,
@@ -101,21 +95,6 @@ def test_a_message_that_the_broker_sends_again_is_left_out(broker: MqttBroker) -
     assert [getattr(item, "kind", "reading") for item in items] == ["reading", "repeated", "reading"]
     ((retained,),) = (batch.items for batch in source.batches("plant/tray1", SAMPLE.encode(), 0, is_retained=True))
     assert isinstance(retained, Rejected) and (retained.kind, retained.harmless) == ("retained", True)
-
-
-def test_an_error_that_no_code_expects_costs_one_message_and_not_the_source(
-    broker: MqttBroker, publish: Callable[..., None], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with running(source_of(broker.port)) as events:
-        with monkeypatch.context() as broken:
-            broken.setattr(mqtt_source, "parse_samples", lambda _payload: 1 / 0)
-            publish("plant/tray1", SAMPLE)
-            eventually(lambda: events.items, "it is refused")
-        publish("plant/tray1", SAMPLE.replace("1.0", "2.0"))
-        eventually(lambda: len(events.items) == 2, "the next is read")
-    refused, reading = events.items
-    assert isinstance(refused, Rejected) and refused.kind == "malformed" and "ZeroDivisionError" in refused.detail
-    assert isinstance(reading, Reading)
 
 
 @pytest.mark.parametrize(
@@ -197,38 +176,6 @@ def test_commands_are_published(broker: MqttBroker, topic: str, expected: list[t
     client.disconnect()
     client.loop_stop()
     assert "no send_topic" in source_of(broker.port).send((0.5, 0.5), ())
-
-
-def test_a_user_and_a_broker_that_proves_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    authority = trustme.CA()
-    authority.cert_pem.write_to_path(str(tmp_path / "ca.pem"))
-    authority.issue_cert("127.0.0.1").private_key_and_cert_chain_pem.write_to_path(str(tmp_path / "server.pem"))
-    (tmp_path / "users").write_text(f"plant:{PasswordHash((Argon2Hasher(1, 8, 1),)).hash('secret')}\n")
-    plugin = {"amqtt.plugins.authentication.FileAuthPlugin": {"password_file": str(tmp_path / "users")}}
-    server = str(tmp_path / "server.pem")
-    broker = MqttBroker(plugin, ssl=True, certfile=server, keyfile=server)
-    broker.start()
-    settings: dict[str, Any] = {"topic": "a", "tls": True, "ca": "ca.pem", "username": "plant"}
-    monkeypatch.setenv("PLANT_PASSWORD", "secret")
-    assert source_of(broker.port, tmp_path, **settings, password_env="PLANT_PASSWORD").check() == []
-    password = tmp_path / "password"
-    password.write_text("wrong\n")
-    password.chmod(0o600)
-    with running(source_of(broker.port, tmp_path, **settings, password_file="password")) as events:
-        eventually(lambda: len(events) > 1, "it is tried again")
-        assert all("the broker refuses this client: " in event.reason for event in events.of(LinkDown))
-    (problem,) = source_of(broker.port, tmp_path, **settings, password_file="password").check()
-    assert "check username and password" in problem
-    (problem,) = source_of(broker.port, tmp_path, topic="a", tls=True).check()
-    assert "check ca, and that host is a name in the certificate of the broker" in problem
-    password.chmod(0o644)
-    with pytest.raises(UserError, match="others may read it: chmod 600"):
-        source_of(broker.port, tmp_path, **settings, password_file="password")
-    with pytest.raises(UserError, match="the environment has no OTHER"):
-        source_of(broker.port, tmp_path, **settings, password_env="OTHER")
-    with pytest.raises(UserError, match=r"none\.pem: No such file"):
-        source_of(broker.port, tmp_path, topic="a", tls=True, ca="none.pem")
-    broker.close()
 
 
 @pytest.mark.parametrize(
