@@ -176,7 +176,7 @@ def build(context: Context) -> BuiltStage:
     fans = {tray.name: tray.fans for tray in context.trays}
     saved, past = outbox.load()
     past = [alarm for alarm in past if alarm.fan < fans.get(alarm.header.tray, 0)]
-    notifications = Notifications(config, place, saved.of_fans(fans), past)
+    notifications = Notifications(config, place, saved, past)
     senders = {target.name: sender_of(target, context.resolve, outbox, place) for target in config.target}
     return BuiltStage(NotifierCore(config, context.trays, notifications, outbox, senders))
 

@@ -36,28 +36,13 @@ class Basket(StrEnum):
 
 @dataclass
 class Saved:
-    """All that survives a restart. `is_first`: there was nothing."""
+    """All that survives a restart, also of fans that are not there any more. `is_first`: there was nothing."""
 
     is_first: bool = True
     announced: dict[tuple[str, Fan], Announced] = field(default_factory=dict)
     """by target and fan"""
     gathered: dict[tuple[str, Basket], Gathered] = field(default_factory=dict)
     """by target"""
-
-    def of_fans(self, fans: Mapping[str, int]) -> Saved:
-        """Without what is about fans that are not there any more. fans: how many each tray has."""
-
-        def is_there(fan: Fan) -> bool:
-            return fan.number < fans.get(fan.tray, 0)
-
-        return Saved(
-            self.is_first,
-            {key: announced for key, announced in self.announced.items() if is_there(key[1])},
-            {
-                key: replace(each, fans={fan: happened for fan, happened in each.fans.items() if is_there(fan)})
-                for key, each in self.gathered.items()
-            },
-        )
 
 
 @dataclass(frozen=True)

@@ -97,7 +97,7 @@ class SiteNodes:
 
     def trays_in_folder(self) -> list[ua.ReferenceDescription]:
         """The references of the site's folder to its trays."""
-        return [self._to_tray(name, is_forward=True) for name in self._trays]
+        return [self._to_folder(name, name, is_forward=True) for name in self._trays]
 
     def _own_name(self, name: str) -> ua.QualifiedName:
         return ua.QualifiedName(name, ua.UInt16(self._namespace))
@@ -107,31 +107,12 @@ class SiteNodes:
         return template.browse_name if template.path else self._own_name(f"Fan{fan.number}")
 
     def _of_tray(self, name: str) -> list[ua.ReferenceDescription]:
-        fan_type = self._templates[""].type
-        fans = [
-            _reference(
-                standard("Organizes"),
-                ua.NodeId(f"{name}/{number}", self._namespace),
-                self._own_name(f"Fan{number}"),
-                ua.NodeClass.Object,
-                fan_type,
-            )
-            for number in range(self._trays[name].fans)
-        ]
-        site = ua.NodeId(SITE_FOLDER, self._namespace)
-        parent = _reference(
-            standard("Organizes"),
-            site,
-            self._own_name(self._site),
-            ua.NodeClass.Object,
-            standard("FolderType"),
-            is_forward=False,
-        )
+        fans = [self._to(Fan(name, number), "", standard("Organizes")) for number in range(self._trays[name].fans)]
+        parent = self._to_folder(SITE_FOLDER, self._site)
         return [_type_reference(standard("FolderType"), "FolderType", 0), parent, *fans]
 
-    def _to_tray(self, name: str, *, is_forward: bool) -> ua.ReferenceDescription:
-        target = ua.NodeId(name, self._namespace)
-        folder = standard("FolderType")
+    def _to_folder(self, identifier: str | int, name: str, *, is_forward: bool = False) -> ua.ReferenceDescription:
+        target, folder = ua.NodeId(identifier, self._namespace), standard("FolderType")
         return _reference(
             standard("Organizes"), target, self._own_name(name), ua.NodeClass.Object, folder, is_forward=is_forward
         )
@@ -142,7 +123,7 @@ class SiteNodes:
         if template.path:
             found.append(self._to(fan, template.path.rpartition("/")[0], template.by, is_forward=False))
         else:
-            found.append(self._to_tray(fan.tray, is_forward=False))
+            found.append(self._to_folder(fan.tray, fan.tray))
         found += [self._to(fan, path, self._templates[path].by) for path in template.children]
         if not template.path:
             found.append(self._to(fan, "Alarm", standard("HasCondition")))
