@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -12,12 +11,11 @@ pytest.importorskip("asyncua")
 from asyncua import ua
 from asyncua.ua.ua_binary import variant_to_binary
 
-from fantwin.pipeline.outputs.opcua.conditions import condition_fields, event_id
+from fantwin.pipeline.outputs.opcua.conditions import condition_fields
 from fantwin.pipeline.outputs.opcua.events import condition_event, system_event
 from fantwin.pipeline.site.fleet import Fan
 from fantwin.schemas.enums import Severity, Transition
-from fantwin.schemas.header import Header
-from fantwin.schemas.messages import Alarm, Diagnosis
+from fantwin.schemas.messages import Alarm
 from fantwin.scoring.alarms.current_alarms import current_alarm
 from fantwin.scoring.alarms.fan_condition import UNTIL_IT_CLEARS_T_NS
 from tests.stages.test_gateway import NOW_NS, TRAY, alarm
@@ -52,12 +50,6 @@ def test_a_comment_stays_until_the_next_and_that_of_a_refused_request_does_not_c
     assert (fields["Comment"], fields["ClientUserId"]) == ("seen", "ann")
 
 
-def test_the_cause_names_all_that_are_as_likely():
-    tie = (Diagnosis(cause="blocked", probability=0.4), Diagnosis(cause="no_power", probability=0.4))
-    fields = after(alarm(causes=tie))
-    assert (fields["Cause"], fields["CauseProbability"]) == ("blocked or no power", 0.4)
-
-
 def test_shelving_counts_down():
     shelved = alarm(Transition.SHELVED, shelved_until_t_ns=NOW_NS + 60 * 10**9)
     fields = after(shelved, now_ns=NOW_NS + 10 * 10**9)
@@ -65,13 +57,6 @@ def test_shelving_counts_down():
     assert fields["SuppressedOrShelved"] is True
     once = after(alarm(Transition.SHELVED, shelved_until_t_ns=UNTIL_IT_CLEARS_T_NS))
     assert once["ShelvingState/CurrentState"] == "One Shot Shelved"
-
-
-def test_events_have_different_names_which_a_restart_does_not_change():
-    first, second = alarm(), alarm(Transition.CLEARED, 1)
-    assert event_id(first) != event_id(second)
-    assert event_id(first) == event_id(alarm())
-    assert event_id(replace(first, header=Header("another", 0, TRAY))) != event_id(first)
 
 
 @pytest.mark.parametrize(

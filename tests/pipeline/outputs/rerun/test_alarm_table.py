@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
-
-import numpy as np
 
 from fantwin.pipeline.outputs.rerun.alarm_table import ALARMS_LISTED, alarm_table
 from fantwin.pipeline.site.alarm_book import AlarmBook
 from fantwin.schemas.enums import Severity, Statistic, Transition
 from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Alarm, Diagnosis
-from tests.stages.test_viewer import FLUSH_PERIOD_NS, REPEAT_STATES_NS, FakeSink, core_of, sent
-from tests.support.score_data import START_NS, made_up_tray
+from tests.support.score_data import START_NS
 
 
 class Table:
@@ -70,23 +66,3 @@ def test_of_many_alarms_the_newest_are_listed_and_the_rest_counted() -> None:
         alarms.add(fan, Transition.RAISED)
     assert len(rows(table)) == ALARMS_LISTED and rows(table)[0].startswith(f"| **tray1/{ALARMS_LISTED + 4}**")
     assert "and 5 more: `fantwin alarms` lists them" in table.text()
-
-
-def test_the_table_is_shown_when_it_changes_and_repeated_for_viewers_that_join_late() -> None:
-    sink = FakeSink()
-    scores, alarms = made_up_tray(seconds=20)
-    core = core_of(sink)
-    alarms = [replace(alarm, header=replace(alarm.header, sequence=n)) for n, alarm in enumerate(alarms)]
-    for number, item in enumerate(sorted([*scores, *alarms], key=lambda item: int(max_of(item)))):
-        core.step(sent(item))
-        core.tick(number * FLUSH_PERIOD_NS)
-    heads = [((t_ns - START_NS) / 1e9, table.splitlines()[0]) for t_ns, table in sink.tables]
-    changes = [head for before, head in zip(["", *(h for _, h in heads)], (h for _, h in heads), strict=False)]
-    assert list(dict.fromkeys(changes)) == ["#### No alarms", "#### 1 active, 0 over", "#### 0 active, 1 over"]
-    times = [at_s for at_s, _ in heads]
-    assert times[0] < 1.0 and times[-1] > 14.5 and max(np.diff(times)) < REPEAT_STATES_NS / 1e9 + 0.6
-    assert len(times) <= 8
-
-
-def max_of(item: Any) -> int:
-    return item.t_ns if isinstance(item.t_ns, int) else int(item.t_ns[-1])
