@@ -31,8 +31,8 @@ from fantwin.twin.fitting.model_fits import FitRequest, Trainer
 from fantwin.twin.fitting.model_uncertainty import model_uncertainty
 from fantwin.twin.fitting.reference_choice import behind_a_drive, identify_at_reference
 from fantwin.twin.fitting.standstill import find_standstill
-from fantwin.twin.fitting.training import MOST_NETWORKS, Physics
-from fantwin.twin.kinds import BOTH_INPUTS, ModelKind, find_kind
+from fantwin.twin.fitting.training import MOST_NETWORKS
+from fantwin.twin.kinds import ModelKind, find_kind
 from fantwin.twin.models.fan_ode import NetworkOde
 from fantwin.twin.models.model import Model
 from fantwin.twin.models.physics import PARAMETER_NAMES
@@ -50,8 +50,6 @@ def train_twin(
     seed: int = 0,
     trainer: Trainer = "levenberg-marquardt",
     max_iterations: int | None = None,
-    network_inputs: tuple[str, ...] = BOTH_INPUTS,
-    physics: Physics = "refined",
     networks: int = 1,
     each_network: ForEachNetwork = one_after_another,
     command_unit: str = "",
@@ -64,10 +62,9 @@ def train_twin(
     """Build a twin of healthy runs.
 
     validation_runs: held out of the fit; they choose the best weights and give the healthy sigmas and the card's
-    figures. If empty, the training runs are used instead, and the card says so. network_inputs: of the hybrid's and
-    neural ODE's network. physics: whether a hybrid's physics are refined along with its network, or stay as they were
-    identified. networks: how many are trained and averaged, 1 to MOST_NETWORKS. trainer "adam" trains one, keeps the
-    physics as identified, and keeps the weights with the smallest training error. each_network: who trains them.
+    figures. If empty, the training runs are used instead, and the card says so. networks: how many are trained and
+    averaged, 1 to MOST_NETWORKS. trainer "adam" trains one, keeps the physics as identified, and keeps the weights with
+    the smallest training error. each_network: who trains them.
     fan_numbers (what the recordings call the runs' fans; default: counted from 0), command_unit, data and
     validation_data (the files that the runs are from) and created (default: now) go into the card. The same seed and
     runs give the same model.
@@ -75,8 +72,7 @@ def train_twin(
     as a twin.
     """
     model_kind = find_kind(kind)
-    _require_trainer(model_kind, trainer)
-    _require_networks(model_kind, trainer, networks)
+    _require_possible(model_kind, trainer, networks)
     fans = common_fans([*runs, *validation_runs])
     numbers = tuple(range(fans) if fan_numbers is None else fan_numbers)
     if model_kind.predicts == "readings":
@@ -105,8 +101,6 @@ def train_twin(
             seed,
             trainer,
             max_iterations,
-            network_inputs,
-            physics,
             progress,
             drive,
             networks,
@@ -120,9 +114,11 @@ def train_twin(
     if isinstance(model, NetworkOde) and model.has_physics:
         progress("uncertainty", 0, 0, np.nan)
         commanded, of_physics = drive.raised(runs) if drive else runs, parameters[:, : len(PARAMETER_NAMES)]
-        uncertainty = model_uncertainty(model, of_physics, commanded, acting, identification)
+        friction = drive.friction if drive else np.zeros(fans)
+        uncertainty = model_uncertainty(model, of_physics, commanded, acting, friction, identification)
+    physics = "refined" if fitted.is_refined else "fixed"
     training = TrainingCard(
-        trainer, fitted.physics, seed, fitted.iterations, round(duration_s, 3), tuple(data), numbers, networks
+        trainer, physics, seed, fitted.iterations, round(duration_s, 3), tuple(data), numbers, networks
     )
     return finish_twin(
         model,
@@ -213,17 +209,15 @@ def _as_if_instantaneous(runs: Sequence[Run]) -> list[Run]:
     return [replace(run, tacho=INSTANTANEOUS) for run in runs]
 
 
-def _require_trainer(kind: ModelKind, trainer: str) -> None:
+def _require_possible(kind: ModelKind, trainer: str, networks: int) -> None:
+    """Raises TwinError where such networks of the kind cannot be trained so."""
     if trainer not in get_args(Trainer):
         raise TwinError(f"trainer {trainer!r} is unknown; use one of {', '.join(get_args(Trainer))}")
-    if trainer not in kind.trainers:
-        raise TwinError(f"trainer {trainer!r} cannot train the {kind.name} model; use {' or '.join(kind.trainers)}")
-
-
-def _require_networks(kind: ModelKind, trainer: str, networks: int) -> None:
+    if trainer == "adam" and not kind.has_ode_network:
+        raise TwinError(f"trainer {trainer!r} cannot train the {kind.name} model; use levenberg-marquardt")
     if not 1 <= networks <= MOST_NETWORKS:
         raise TwinError(f"{networks} networks cannot be averaged; ask for 1 to {MOST_NETWORKS}")
-    if networks > 1 and not (kind.averages_networks and trainer == "levenberg-marquardt"):
+    if networks > 1 and (trainer == "adam" or not kind.has_ode_network):
         raise TwinError(
             f"several networks cannot be averaged with model {kind.name} and trainer {trainer}; use the hybrid or the "
             "neural ODE, with trainer levenberg-marquardt"

@@ -12,7 +12,7 @@ from fantwin.twin.errors import TwinError
 from fantwin.twin.evaluation.accuracy import Evaluation, evaluation_pieces, free_run_residuals, pooled_rmse_rad_s
 from fantwin.twin.export.fan_rows import measured_as_in_card
 from fantwin.twin.finishing import TrainedTwin
-from fantwin.twin.kinds import KINDS, Variant
+from fantwin.twin.kinds import ModelKind
 from fantwin.twin.models.physics import LAG, PARAMETER_NAMES
 from fantwin.twin.progress import Progress, unreported
 from fantwin.twin.runs import Run
@@ -22,33 +22,14 @@ Source = Literal["test", "held-out", "training"]
 sigma. training: fitted, so too optimistic."""
 
 
-@dataclass(frozen=True)
-class Candidate:
-    """A model to train: a kind of model with certain network inputs. title: for people."""
-
-    name: str
-    kind: str
-    title: str
-    network_inputs: tuple[str, ...]
-
-
-def all_candidates() -> tuple[Candidate, ...]:
-    """Every variant of every kind, in the order of twin.kinds."""
-    return tuple(
-        Candidate(variant.name, kind.name, variant.title, variant.network_inputs)
-        for kind in KINDS
-        for variant in kind.variants or (Variant(kind.name, kind.title),)
-    )
-
-
 @dataclass(frozen=True, eq=False)
 class Contender:
-    """A candidate once trained. twin is None where it could not be, and invalid_reason says why, in a line.
+    """A kind of model once trained. twin is None where it could not be, and invalid_reason says why, in a line.
 
     training_rmse_rad_s: free run over the training runs. held_out, test: None without such runs.
     """
 
-    candidate: Candidate
+    kind: ModelKind
     twin: TrainedTwin | None = None
     invalid_reason: str = ""
     training_rmse_rad_s: float = np.nan
@@ -71,12 +52,12 @@ class Contender:
 
 
 def source_of(validation_runs: Sequence[Run], test_runs: Sequence[Run]) -> Source:
-    """The data for comparing candidates: the test runs, or else the held-out ones, or else the training runs."""
+    """The data for comparing models: the test runs, or else the held-out ones, or else the training runs."""
     return "test" if test_runs else "held-out" if validation_runs else "training"
 
 
 def contend(
-    candidate: Candidate,
+    kind: ModelKind,
     runs: Sequence[Run],
     validation_runs: Sequence[Run],
     test_runs: Sequence[Run],
@@ -89,19 +70,18 @@ def contend(
     validation_data: Sequence[DataCard] = (),
     progress: Progress = unreported,
 ) -> Contender:
-    """Train one candidate and evaluate it. Arguments as of build.train_twin; test_runs take no part in training.
+    """Train one kind and evaluate it. Arguments as of build.train_twin; test_runs take no part in training.
 
-    A candidate that cannot be trained, while others can, is a result and not an error.
+    A kind that cannot be trained, while others can, is a result and not an error.
     """
     try:
         trained = train_twin(
             runs,
             validation_runs,
-            candidate.kind,
-            name=candidate.title,
+            kind.name,
+            name=kind.title,
             seed=seed,
             max_iterations=max_iterations,
-            network_inputs=candidate.network_inputs,
             command_unit=command_unit,
             fan_numbers=fan_numbers,
             data=data,
@@ -109,11 +89,11 @@ def contend(
             progress=progress,
         )
     except TwinError as error:
-        return Contender(candidate, invalid_reason=str(error))
+        return Contender(kind, invalid_reason=str(error))
     pieces = evaluation_pieces(measured_as_in_card(trained.card, range(trained.card.fans), runs))
     residual = free_run_residuals(trained.model, trained.parameters, pieces)
     return Contender(
-        candidate,
+        kind,
         trained,
         training_rmse_rad_s=pooled_rmse_rad_s(residual),
         training=None if validation_runs else trained.validation,

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
@@ -23,7 +22,6 @@ from fantwin.schemas.twin_card import (
 from fantwin.twin.errors import TwinError
 from fantwin.twin.evaluation.accuracy import (
     Evaluation,
-    Figures,
     UnseenStd,
     evaluation_pieces,
     free_run_readings,
@@ -111,6 +109,8 @@ def finish_twin(
     else:
         balance = fit_balance(drive.raised(runs), drive.raised(validation_runs), identification)
     settings = drive.settings if drive else np.zeros((len(parameters), 0))
+    figures = validation.pooled
+    counts = any(its.window_s > 0.0 for its in pieces[0].tacho)
     speeds = np.concatenate([run.speed_rad_s.ravel() for run in runs])
     commands = np.concatenate([run.command.ravel() for run in runs])
     card = TwinCard(
@@ -137,16 +137,25 @@ def finish_twin(
         rate_hz=1.0 / float(np.median(np.concatenate([np.diff(run.t_s) for run in runs]))),
         network=model.network_card,
         training=training,
-        validation=_validation_card(
-            validation.pooled, "held-out" if validation_runs else "training", tuple(validation_data)
+        validation=ValidationCard(
+            source="held-out" if validation_runs else "training",
+            data=tuple(validation_data),
+            samples=figures.samples,
+            rmse=finite_or_none(figures.rmse_rad_s),
+            max_error=finite_or_none(figures.max_error_rad_s),
+            r2=finite_or_none(figures.r2),
+            one_step_rmse=finite_or_none(figures.one_step_rmse_rad_s),
+            coverage_2_sigma=finite_or_none(figures.coverage_2_sigma),
         ),
-        versions=_versions(),
+        versions={package: _version(package) for package in ("fantwin", "numpy", "onnx")},
         command_unit=command_unit,
         tacho=tacho[:1] if len(set(tacho)) == 1 else tacho,
         standstill=standstill,
         conditions=conditions,
         drive=drive.card if drive else None,
-        reading_sigma_rad_s=_reading_sigma_rad_s(model, parameters, sigma_rad_s, standstill, pieces),
+        reading_sigma_rad_s=tuple(
+            reading_sigma_rad_s(model, parameters, sigma_rad_s, standstill, pieces).tolist() if counts else ()
+        ),
         model_uncertainty=uncertainty,
     )
     return TrainedTwin(model, parameters, card, identification, validation)
@@ -157,33 +166,6 @@ def unseen_std_of(table: ModelUncertainty | None, drive: DriveCard | None) -> Un
     if table is None:
         return None
     return lambda speed_rad_s, command: table.unseen_std_at(speed_rad_s, drive.raised(command) if drive else command)
-
-
-def _reading_sigma_rad_s(
-    model: Model, parameters: Array, sigma_rad_s: Array, standstill: Standstill | None, pieces: Sequence[Run]
-) -> tuple[float, ...]:
-    if all(tacho.window_s == 0.0 for tacho in pieces[0].tacho):
-        return ()
-    return tuple(reading_sigma_rad_s(model, parameters, sigma_rad_s, standstill, pieces).tolist())
-
-
-def _validation_card(
-    figures: Figures, source: Literal["held-out", "training"], data: tuple[DataCard, ...]
-) -> ValidationCard:
-    return ValidationCard(
-        source=source,
-        data=data,
-        samples=figures.samples,
-        rmse=finite_or_none(figures.rmse_rad_s),
-        max_error=finite_or_none(figures.max_error_rad_s),
-        r2=finite_or_none(figures.r2),
-        one_step_rmse=finite_or_none(figures.one_step_rmse_rad_s),
-        coverage_2_sigma=finite_or_none(figures.coverage_2_sigma),
-    )
-
-
-def _versions() -> dict[str, str]:
-    return {package: _version(package) for package in ("fantwin", "numpy", "onnx")}
 
 
 def _version(package: str) -> str:

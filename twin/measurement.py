@@ -59,13 +59,17 @@ class Measurement:
 
     def noise_rad_s(self, expected_rad_s: Array) -> Array:
         """(n, batch) standard deviation of readings about the expected ones (n, batch); 0 for instantaneous tachos."""
-        step_s = np.diff(self.t_s, axis=0)
-        rise = np.diff(expected_rad_s, axis=0)
-        slope = np.divide(rise, step_s, out=np.zeros_like(rise), where=step_s > 0.0)
-        slope = (np.concatenate((slope[:1], slope)) + np.concatenate((slope, slope[-1:]))) / 2.0
-        of_age = np.array([each.held_s for each in self.tacho]) * slope / np.sqrt(12.0)
+        of_age = np.array([each.held_s for each in self.tacho]) * self.slope(expected_rad_s) / np.sqrt(12.0)
         graded = [each.resolution_rad_s / np.sqrt(each.resolution_steps) for each in self.tacho]
         return np.hypot(of_age, np.array(graded))
+
+    def slope(self, signal: Array) -> Array:
+        """(n, batch) change of a signal in a second, the mean of before and after each sample; 0 over padding."""
+        step_s = np.diff(self.t_s, axis=0)
+        with np.errstate(invalid="ignore", over="ignore"):
+            rise = np.diff(signal, axis=0)
+            slope = np.divide(rise, step_s, out=np.zeros_like(rise), where=step_s > 0.0)
+            return (np.concatenate((slope[:1], slope)) + np.concatenate((slope, slope[-1:]))) / 2.0
 
     @cached_property
     def _on_speeds(self) -> "_Operator":

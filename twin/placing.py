@@ -16,7 +16,6 @@ from fantwin.twin.fitting.drive_fit import FoundDrive
 from fantwin.twin.fitting.placed_uncertainty import placed_uncertainty
 from fantwin.twin.fitting.placement import place_fans
 from fantwin.twin.fitting.standstill import find_standstill
-from fantwin.twin.models.drive import DRIVE_PARAMETERS
 from fantwin.twin.models.hybrid import Hybrid
 from fantwin.twin.models.physics import PARAMETER_NAMES
 from fantwin.twin.progress import Progress, unreported
@@ -60,7 +59,7 @@ def place_twin(
     identification, of_unknowns = place_fans(model.network, card, acting, _correlated_samples(card, runs), progress)
     uncertainty = None
     if card.model_uncertainty:
-        friction = drive.settings[:, DRIVE_PARAMETERS.index("friction")] if drive else np.zeros(fans)
+        friction = drive.friction if drive else np.zeros(fans)
         top_speed_rad_s = float(identification.top_speed_rad_s[0])
         uncertainty = placed_uncertainty(
             card.model_uncertainty, model, identification.parameters, of_unknowns, top_speed_rad_s, friction

@@ -95,8 +95,6 @@ class Run:
 
     def fan(self, index: int) -> "Run":
         """The run of one fan alone."""
-        if not 0 <= index < self.fans:
-            raise TwinError(f"run {self.name!r}: no fan {index} among {self.fans}; count from 0")
         column = slice(index, index + 1)
         return replace(
             self,
@@ -132,12 +130,12 @@ class Run:
         cuts = np.linspace(0, self.samples, count + 1).astype(int).tolist()
         return [(first, last) for first, last in pairwise(cuts) if last - first >= 2]
 
-    def split_at_gaps(self, max_gap_s: float | None = None) -> list["Run"]:
-        """The stretches between steps longer than max_gap_s (default: five median steps).
+    def split_at_gaps(self) -> list["Run"]:
+        """The stretches between steps longer than five median ones.
 
         A held command says nothing about a long gap. Stretches of a single sample hold no step and are left out.
         """
-        limit_s = GAP_IN_MEDIAN_PERIODS * self.median_period_s if max_gap_s is None else max_gap_s
+        limit_s = GAP_IN_MEDIAN_PERIODS * self.median_period_s
         cuts = [0, *(np.flatnonzero(np.diff(self.t_s) > limit_s) + 1).tolist(), self.samples]
         spans = [(first, last) for first, last in pairwise(cuts) if last - first >= 2]
         return [self.rows(first, last) for first, last in spans]

@@ -14,7 +14,8 @@ import typer
 from bench.printing import JsonOption, progress, show
 from bench.training.four_models import held_out_figures, trained_in_s
 from bench.training.measured_sets import Split, splits
-from fantwin.twin.comparison import Contender, all_candidates, contend
+from fantwin.twin.comparison import Contender, contend
+from fantwin.twin.kinds import KINDS
 
 
 def main(
@@ -29,15 +30,13 @@ def main(
         if not split.name.startswith(only):
             continue
         learned = []
-        for candidate in all_candidates():
-            progress(f"{split.name} ({split.how}): {candidate.title}")
-            learned.append(contend(candidate, split.training, [], [], seed=seed))
+        for kind in KINDS:
+            progress(f"{split.name} ({split.how}): {kind.title}")
+            learned.append(contend(kind, split.training, [], [], seed=seed))
         rows[split.covered] += _rows(split, learned)
         notes.append(f"{split.name}, held out: {split.how}")
         notes += [
-            f"{split.name}: {found.candidate.title}: {found.invalid_reason}"
-            for found in learned
-            if found.invalid_reason
+            f"{split.name}: {found.kind.title}: {found.invalid_reason}" for found in learned if found.invalid_reason
         ]
     titles = {True: "held out at levels that training covers", False: "held out beyond the levels of training"}
     show({titles[covered]: found for covered, found in rows.items() if found}, notes, as_json=json_output)
@@ -49,7 +48,7 @@ def _rows(split: Split, learned: list[Contender]) -> list[dict[str, Any]]:
     return [
         {
             "set": split.name,
-            "model": one.candidate.title,
+            "model": one.kind.title,
             "rmse": found.rmse_rad_s / split.rad_s_per_unit,
             "unit": split.unit,
             "max error": found.max_error_rad_s / split.rad_s_per_unit,

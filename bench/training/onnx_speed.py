@@ -54,7 +54,7 @@ def main(
     """Print how near the ONNX file is to torch over 60 s, and steps per second of each engine as ratios."""
     torch.set_num_threads(1)
     progress("training the hybrid")
-    twin = train_twin([rough_run(1, 40.0).run], [], "hybrid", name="bench", physics="fixed")
+    twin = train_twin([rough_run(1, 40.0).run], [], "hybrid", name="bench")
     if np.any(twin.parameters[:, LAG]):
         raise SystemExit("the fan was given a lag that it does not have; the other engines know none")
     with tempfile.TemporaryDirectory() as folder:

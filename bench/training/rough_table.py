@@ -18,7 +18,8 @@ from bench.training.published_fan import RATE_HZ, SimulatedRun, random_stairs
 from fantwin.simulation.excitation import Manual
 from fantwin.simulation.plant import FanParameters, advance, at_rest
 from fantwin.simulation.tacho import NoisyTacho
-from fantwin.twin.comparison import Contender, all_candidates, contend
+from fantwin.twin.comparison import Contender, contend
+from fantwin.twin.kinds import KINDS
 from fantwin.twin.runs import Array, Run
 
 DUTY_RANGE = (0.0, 1.0)
@@ -39,11 +40,11 @@ def main(
             "a hand at the knob": simulated_plant(_by_hand(2000 + seed, 80.0), 2000 + seed),
         }
         learned = []
-        for candidate in all_candidates():
-            progress(f"repetition {seed + 1} of {runs}: {candidate.title}")
-            learned.append(contend(candidate, [training.run], [], [], seed=seed))
-        for kind, test in tests.items():
-            tables[f"held out: {kind}, seed {seed}"] = _rows(learned, test)
+        for kind in KINDS:
+            progress(f"repetition {seed + 1} of {runs}: {kind.title}")
+            learned.append(contend(kind, [training.run], [], [], seed=seed))
+        for how, test in tests.items():
+            tables[f"held out: {how}, seed {seed}"] = _rows(learned, test)
     notes = [
         f"asked of the hybrid: {MUST_REACH} x the floor or less, R2 {MUST_R2} or more, {MUST_BE_NEARER:g} times nearer "
         "to the floor than the physical model"
@@ -78,7 +79,7 @@ def _rows(learned: list[Contender], test: SimulatedRun) -> list[dict[str, Any]]:
     physical_distance = figures[0].rmse_rad_s - floor_rad_s
     return [
         {
-            "model": one.candidate.title,
+            "model": one.kind.title,
             "rmse": found.rmse_rad_s,
             "floor": floor_rad_s,
             "to floor": found.rmse_rad_s / floor_rad_s,

@@ -20,13 +20,12 @@ NETWORKS = 4
 
 @dataclass(frozen=True)
 class TrainingSettings:
-    """How a twin is trained; see the options of the command. network_inputs: None for those of the kind of model."""
+    """How a twin is trained; see the options of the command."""
 
     model: str = "hybrid"
     seed: int = 0
     trainer: Trainer = "levenberg-marquardt"
     iterations: int | None = None
-    network_inputs: tuple[str, ...] | None = None
     networks: int | None = None
     command_unit: str = ""
 
@@ -50,10 +49,10 @@ def fit_twin(
     """
     from fantwin.twin.build import train_twin  # noqa: PLC0415  the command line loads twin only when it is needed
     from fantwin.twin.each_network import one_after_another  # noqa: PLC0415
-    from fantwin.twin.kinds import BOTH_INPUTS, find_kind  # noqa: PLC0415
+    from fantwin.twin.kinds import find_kind  # noqa: PLC0415
     from fantwin.twin.progress import unreported  # noqa: PLC0415
 
-    can_average = find_kind(settings.model).averages_networks and settings.trainer == DEFAULT_SETTINGS.trainer
+    can_average = find_kind(settings.model).has_ode_network and settings.trainer == DEFAULT_SETTINGS.trainer
     return train_twin(
         training_data.runs,
         held_out.runs if held_out else [],
@@ -62,7 +61,6 @@ def fit_twin(
         seed=settings.seed,
         max_iterations=settings.iterations,
         trainer=settings.trainer,
-        network_inputs=settings.network_inputs or BOTH_INPUTS,
         networks=settings.networks if settings.networks is not None else NETWORKS if can_average else 1,
         each_network=each_network or one_after_another,
         command_unit=settings.command_unit,

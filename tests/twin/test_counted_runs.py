@@ -21,7 +21,7 @@ TACHO = Tacho(kind="count", window_s=0.53)
 
 @pytest.fixture(scope="module")
 def runs() -> tuple[Run, Run]:
-    return counted_run(1, TACHO, 200.0), counted_run(2, TACHO, 100.0)
+    return counted_run(1, TACHO, 200.0), counted_run(2, TACHO, 60.0)
 
 
 @pytest.fixture(scope="module")
@@ -75,24 +75,10 @@ def test_a_fan_that_slows_down_more_slowly_than_it_speeds_up_keeps_its_steady_sp
     wrong = np.zeros_like(run.speed_rad_s)
     wrong[1000] = wrong_rad_s
     run = replace(run, speed_rad_s=run.speed_rad_s + wrong)
-    _, alpha, drag, _ = identify([run], with_lag=False).parameters[0]
+    _, alpha, drag, _ = identify([run]).parameters[0]
     steady = np.linspace(0.25, 1.0, 4)
     found = 2.0 * steady / (alpha + np.sqrt(alpha**2 + 4.0 * drag * steady))
     np.testing.assert_allclose(found, 200.0 * steady, atol=1.0)  # 3.7 if all readings counted alike
-
-
-def test_all_readings_of_a_tacho_that_does_not_count_count_alike_whatever_the_fan_beside_it() -> None:
-    alone, counted = uneven_run(Tacho()), uneven_run(TACHO)
-    beside = Run(
-        "made",
-        alone.t_s,
-        np.hstack((alone.command, counted.command)),
-        np.hstack((alone.speed_rad_s, counted.speed_rad_s)),
-        (Tacho(), TACHO),
-    )
-    of_both = identify([beside], with_lag=False).parameters
-    np.testing.assert_allclose(of_both[0], identify([alone], with_lag=False).parameters[0], rtol=1e-2)
-    np.testing.assert_allclose(of_both[1], identify([counted], with_lag=False).parameters[0], rtol=1e-2)
 
 
 def test_a_narx_predicts_readings_as_they_are(runs: tuple[Run, Run]) -> None:

@@ -47,6 +47,13 @@ def physical(others: tuple[Run, Run]) -> TrainedTwin:
     return train_twin([others[0]], [], "physical", name="physical")
 
 
+def test_fans_that_differ_share_one_network_and_keep_their_own_physics(type_twin: Path) -> None:
+    twin = OnnxTwin(type_twin)
+    assert np.ptp(twin.parameters[:, 0]) > 0.1 * twin.parameters[:, 0].mean()
+    other_stairs = thinned(fan_data.rough_run(3, 30.0, 5), 2)
+    assert evaluate(twin, [other_stairs]).pooled.rmse_rad_s < 1.1 * fan_data.NOISE_RAD_S
+
+
 def test_fans_that_were_never_trained_on_are_predicted_to_the_noise(
     type_twin: Path, others: tuple[Run, Run], placed: TrainedTwin, physical: TrainedTwin, tmp_path: Path
 ) -> None:

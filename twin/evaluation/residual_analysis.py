@@ -20,7 +20,6 @@ from scipy.fft import next_fast_len
 from scipy.special import chdtrc
 
 from fantwin.schemas.twin_card import HealthyCard
-from fantwin.twin.errors import TwinError
 from fantwin.twin.evaluation.accuracy import healthy_sigma_rad_s, sums_by_fan
 from fantwin.twin.runs import Array, Run
 
@@ -98,13 +97,13 @@ class ResidualGrid:
     window: int
 
 
-def residual_grid(period_s: float, longest_s: float, max_lag_s: float = MAX_LAG_S) -> ResidualGrid:
+def residual_grid(period_s: float, longest_s: float) -> ResidualGrid:
     """The grid for runs of a median step, of which the longest without a gap lasts so long.
 
-    Lags go to max_lag_s, but not beyond a quarter of that or 1000 steps.
+    Lags go to MAX_LAG_S, but not beyond a quarter of that or 1000 steps.
     """
     longest = int(LONGEST_LAG_OF_RUN * (max(round(longest_s / period_s), 1) + 1))
-    lags = max(1, min(round(max_lag_s / period_s), longest, MAX_LAGS))
+    lags = max(1, min(round(MAX_LAG_S / period_s), longest, MAX_LAGS))
     return ResidualGrid(period_s, lags, max(lags, min(round(WINDOW_S / period_s), longest)))
 
 
@@ -140,8 +139,7 @@ def residual_sums(
 ) -> ResidualSums:
     """The sums over pieces. residual_rad_s: (samples, fans) as free_run_residuals gives it for them.
 
-    settling_s: left out at the start of each piece, but at most half of it. Raises TwinError when residual and pieces
-    are not of one length.
+    settling_s: left out at the start of each piece, but at most half of it.
     """
     settled = _settled(residual_rad_s, pieces, settling_s)
     ends = np.cumsum([piece.samples for piece in pieces])
@@ -194,13 +192,11 @@ def _sums_of_piece(settled: Array, piece: Run, grid: ResidualGrid) -> ResidualSu
 
 
 def analyse_residual(
-    residual_rad_s: Array, pieces: Sequence[Run], *, settling_s: float = SETTLING_S, max_lag_s: float = MAX_LAG_S
+    residual_rad_s: Array, pieces: Sequence[Run], *, settling_s: float = SETTLING_S
 ) -> tuple[ResidualAnalysis, ...]:
-    """The analysis of each fan. residual_rad_s, settling_s, and what is raised: as for residual_sums. max_lag_s: as for
-    residual_grid.
-    """
+    """The analysis of each fan. Arguments as of residual_sums."""
     period_s = float(np.median(np.concatenate([np.diff(piece.t_s) for piece in pieces])))
-    grid = residual_grid(period_s, max(piece.duration_s for piece in pieces), max_lag_s)
+    grid = residual_grid(period_s, max(piece.duration_s for piece in pieces))
     return analysis_of(residual_sums(residual_rad_s, pieces, grid, settling_s), grid)
 
 
@@ -209,16 +205,11 @@ def analysis_of(sums: ResidualSums, grid: ResidualGrid) -> tuple[ResidualAnalysi
     return tuple(_of_fan(sums, fan, grid) for fan in range(len(sums.count)))
 
 
-def healthy_residual(
-    residual_rad_s: Array, pieces: Sequence[Run], *, settling_s: float = SETTLING_S
-) -> tuple[Array, HealthyCard]:
-    """(fans,) healthy standard deviation, rad/s, and the healthy residual for a card.
-
-    Arguments and errors as of analyse_residual.
-    """
-    settled = _settled(residual_rad_s, pieces, settling_s)
+def healthy_residual(residual_rad_s: Array, pieces: Sequence[Run]) -> tuple[Array, HealthyCard]:
+    """(fans,) healthy standard deviation, rad/s, and the healthy residual for a card. Arguments as of residual_sums."""
+    settled = _settled(residual_rad_s, pieces, SETTLING_S)
     sigma_rad_s = healthy_sigma_rad_s(settled)
-    analyses = analyse_residual(residual_rad_s, pieces, settling_s=settling_s)
+    analyses = analyse_residual(residual_rad_s, pieces)
     with np.errstate(invalid="ignore", divide="ignore"):
         in_sigma = np.abs(settled) / sigma_rad_s
     quantiles = [tuple(map(finite_or_none, _quantiles(fan[np.isfinite(fan)]).tolist())) for fan in in_sigma.T]
@@ -243,9 +234,6 @@ def _quantiles(in_sigma: Array) -> Array:
 
 def _settled(residual: Array, pieces: Sequence[Run], settling_s: float) -> Array:
     """The residual without the first part of each run, which depends on its start. A divergence is never left out."""
-    samples = sum(piece.samples for piece in pieces)
-    if len(residual) != samples or samples == 0:
-        raise TwinError(f"a residual of {len(residual)} samples, runs of {samples}; give the runs that it was made of")
     age_s = [piece.t_s - piece.t_s[0] for piece in pieces]
     young = np.concatenate([age < min(settling_s, SHARE_SETTLING * age[-1]) for age in age_s])
     return np.where(young[:, np.newaxis] & np.isfinite(residual), np.nan, residual)

@@ -15,7 +15,7 @@ import numpy as np
 from fantwin.twin.errors import TwinError
 from fantwin.twin.evaluation.accuracy import evaluation_pieces, free_run_residuals
 from fantwin.twin.fitting.identification import identify
-from fantwin.twin.fitting.training import GRID_PRIOR_STD, Physics, train_network
+from fantwin.twin.fitting.training import GRID_PRIOR_STD, train_network
 from fantwin.twin.models.fan_ode import NetworkOde
 from fantwin.twin.progress import Progress, unreported, within
 from fantwin.twin.runs import Array, Run
@@ -25,9 +25,7 @@ FOLDS = 3
 ITERATIONS = 25
 
 
-def choose_prior_std(
-    model: NetworkOde, runs: Sequence[Run], *, seed: int, physics: Physics, progress: Progress = unreported
-) -> float:
+def choose_prior_std(model: NetworkOde, runs: Sequence[Run], *, seed: int, progress: Progress = unreported) -> float:
     """The prior standard deviation for training.train_network.
 
     GRID_PRIOR_STD where there is a single run, or where the runs are too few to leave some out.
@@ -55,7 +53,6 @@ def choose_prior_std(
                 identification,
                 max_iterations=ITERATIONS,
                 seed=seed,
-                physics=physics,
                 prior_std=prior_std,
                 progress=within(f"choice {index + 1} of {len(prior_stds)}", of_fold),
             )

@@ -71,6 +71,11 @@ class FoundDrive:
         return [replace(run, command=self.card.raised(run.command)) for run in runs]
 
     @property
+    def friction(self) -> Array:
+        """(fans,) what the drive takes of the command of each fan before it acts."""
+        return self.settings[:, DRIVE_PARAMETERS.index("friction")]
+
+    @property
     def card(self) -> DriveCard:
         """What readers of a twin have to know of it."""
         drive = self.drive

@@ -4,18 +4,16 @@ The error is a weighted sum of functions of speed and command (`Basis`). Filtere
 speed (twin.fitting.filtering), and the squares of the filtered functions say how well the runs determine the weights.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fantwin.twin.evaluation.accuracy import evaluation_pieces
-from fantwin.twin.fitting.filtering import Basis, filtered_regression
+from fantwin.twin.fitting.filtering import Basis, filtered_regression, with_lagged_command
 from fantwin.twin.fitting.trajectories import MAX_SAMPLES
-from fantwin.twin.measurement import with_measured_command
 from fantwin.twin.models.fan_ode import FanOde
-from fantwin.twin.models.lag import effective_command
 from fantwin.twin.models.physics import LAG
 from fantwin.twin.runs import Array, Run
 
@@ -27,12 +25,11 @@ HELD = 2.0
 class FanEvidence:
     """Of one fan. squares: (C, C) of the filtered functions, relative to the variance of what the model misses.
     held_command: (m,) after the lag, of the samples in which the fan turned and was held, or turned at least; empty if
-    it never did. friction: what a drive takes of the command before it acts.
+    it never did.
     """
 
     squares: Array
     held_command: Array
-    friction: float
 
 
 def evidence_of_fans(
@@ -49,42 +46,31 @@ def evidence_of_fans(
 
     least_noise_rad_s: what the model misses is not taken for less. stands_below_rad_s: at such speeds a fan stands.
     """
-    sizes = len(basis(np.zeros(1), np.zeros(1))[0])
+    parts, acting = _parts(runs, parameters[:, LAG]), _parts(acting_runs, parameters[:, LAG])
     found: list[FanEvidence] = []
-    missed, motion, speed, acting = (_columns(len(parameters)) for _ in range(4))
-    for fan, t_s, speed_rad_s, command in _measured(acting_runs, parameters):
-        target, explained = filtered_regression(
-            t_s, speed_rad_s, command, acceleration_of(model, parameters[fan]), lambda_per_s
-        )
-        known = np.isfinite(speed_rad_s)
-        for column, values in (
-            (missed, target - explained[:, 0]),
-            (motion, target),
-            (speed, speed_rad_s[known]),
-            (acting, command[known]),
-        ):
-            column[fan].append(values)
-    turns = [np.abs(_joined(of)) > stands_below_rad_s for of in speed]
-    std = [
-        _relative_std(_joined(its), _joined(moved), turned, least_noise_rad_s)
-        for its, moved, turned in zip(missed, motion, turns, strict=True)
-    ]
-    squares, command_of = np.zeros((len(parameters), sizes, sizes)), _columns(len(parameters))
-    first = [0] * len(parameters)
-    for fan, t_s, speed_rad_s, command in _measured(runs, parameters):
-        _, columns = filtered_regression(t_s, speed_rad_s, command, basis, lambda_per_s)
-        part = slice(first[fan], first[fan] + len(columns))
-        columns /= std[fan][part, np.newaxis]
-        squares[fan] += columns.T @ columns
-        command_of[fan].append(command[np.isfinite(speed_rad_s)])
-        first[fan] = part.stop
-    for fan, turned in enumerate(turns):
-        command = _joined(command_of[fan])
-        held = turned & (std[fan] < HELD)
-        held = held if held.any() else turned
-        noise = variance_of_independent(_joined(missed[fan]) / std[fan]) if len(command) else 0.0
-        friction = float(np.median((command - _joined(acting[fan]))[held])) if held.any() else 0.0
-        found.append(FanEvidence(squares[fan] / max(noise, least_noise_rad_s**2), command[held], friction))
+    for fan, own in enumerate(parameters):
+        seen = [pair for pair in zip(parts, acting, strict=True) if np.isfinite(pair[0].speed_rad_s[:, fan]).sum() >= 2]
+        acceleration = acceleration_of(model, own)
+        missed, motion, speed, commands = (list[Array]() for _ in range(4))
+        for part, driven in seen:
+            target, explained = _regression(driven, fan, acceleration, lambda_per_s)
+            known = np.isfinite(part.speed_rad_s[:, fan])
+            missed.append(target - explained[:, 0])
+            motion.append(target)
+            speed.append(part.speed_rad_s[known, fan])
+            commands.append(part.command[known, fan])
+        turns = np.abs(_joined(speed)) > stands_below_rad_s
+        std = _relative_std(_joined(missed), _joined(motion), turns, least_noise_rad_s)
+        ends = np.cumsum([len(part) for part in missed])
+        squares = np.zeros((len(basis(np.zeros(1), np.zeros(1))[0]),) * 2)
+        for (part, _), of_part in zip(seen, np.split(std, ends[:-1]) if seen else (), strict=True):
+            _, columns = _regression(part, fan, basis, lambda_per_s)
+            columns /= of_part[:, np.newaxis]
+            squares += columns.T @ columns
+        held = turns & (std < HELD)
+        noise = variance_of_independent(_joined(missed) / std) if seen else 0.0
+        held_command = _joined(commands)[held if held.any() else turns]
+        found.append(FanEvidence(squares / max(noise, least_noise_rad_s**2), held_command))
     return found
 
 
@@ -105,32 +91,18 @@ def variance_of_independent(missed: Array) -> float:
     return float(correlation[0] + 2.0 * correlation[1 : negative[0] if len(negative) else None].sum())
 
 
-def _columns(fans: int) -> list[list[Array]]:
-    return [[] for _ in range(fans)]
-
-
 def _joined(parts: Sequence[Array]) -> Array:
     return np.concatenate(parts) if parts else np.zeros(0)
 
 
-def _measured(runs: Sequence[Run], parameters: Array) -> Iterator[tuple[int, Array, Array, Array]]:
-    """Fan, times, speeds and commands after the lag of the parts of runs in which a fan was measured: (n,) each.
-
-    Parts bound the memory for the filtered functions, however long the runs are.
-    """
-    for run in evaluation_pieces(runs):
-        command = _lagged(run, parameters[:, LAG])
-        for first, end in run.equal_parts(MAX_SAMPLES):
-            part = slice(first, end)
-            for fan in range(len(parameters)):
-                if np.isfinite(run.speed_rad_s[part, fan]).sum() >= 2:
-                    yield fan, run.t_s[part], run.speed_rad_s[part, fan], command[part, fan]
+def _parts(runs: Sequence[Run], lag_s: Array) -> list[Run]:
+    """The runs with the commands after the lag, in parts that bound the memory for the filtered functions."""
+    pieces = with_lagged_command(evaluation_pieces(runs), lag_s)
+    return [piece.rows(first, end) for piece in pieces for first, end in piece.equal_parts(MAX_SAMPLES)]
 
 
-def _lagged(piece: Run, lag_s: Array) -> Array:
-    """(n, fans) the command as the tachos show it, after the lag."""
-    shown = with_measured_command(piece)
-    return effective_command(shown.command, shown.step_s[:, np.newaxis], lag_s, shown.command[0])[0]
+def _regression(part: Run, fan: int, basis: Basis, lambda_per_s: float) -> tuple[Array, Array]:
+    return filtered_regression(part.t_s, part.speed_rad_s[:, fan], part.command[:, fan], basis, lambda_per_s)
 
 
 def _relative_std(missed: Array, motion_rad_s: Array, turns: NDArray[np.bool_], least_rad_s: float) -> Array:

@@ -10,12 +10,15 @@ discretised exactly, for steps of any length. w(0) is measured with noise, so it
 column is projected out of both sides.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
+from fantwin.twin.measurement import with_measured_command
+from fantwin.twin.models.lag import effective_command
 from fantwin.twin.models.recursion import linear_recursion
-from fantwin.twin.runs import Array
+from fantwin.twin.runs import Array, Run
 
 Basis = Callable[[Array, Array], Array]
 """Speed (n,) and command (n,) to the regressors phi (n, P)."""
@@ -57,3 +60,13 @@ def filtered_regression(
     if square := float(initial @ initial):  # 0 where the first reading comes so late that no start is left in it
         rows -= np.outer(initial, initial @ rows / square)
     return rows[:, 0], rows[:, 1:]
+
+
+def with_lagged_command(pieces: Sequence[Run], lag_s: Array) -> list[Run]:
+    """The pieces with the commands that act, after the lag (fans,), as the tachos show them."""
+    return [
+        replace(
+            piece, command=effective_command(piece.command, piece.step_s[:, np.newaxis], lag_s, piece.command[0])[0]
+        )
+        for piece in map(with_measured_command, pieces)
+    ]

@@ -25,6 +25,7 @@ from fantwin.twin.fitting.free_run_problem import OF_STEADY_SPEEDS, Flags, FreeR
 from fantwin.twin.fitting.reading_errors import counts
 from fantwin.twin.fitting.trajectories import Trajectories
 from fantwin.twin.models.fan_ode import FanOde
+from fantwin.twin.progress import Progress
 from fantwin.twin.runs import Array
 
 SCALE_ROUNDS, ERROR_ROUNDS = 2, 4  # with a constant scale, or with what was learned of the errors of readings
@@ -110,12 +111,17 @@ def fit_physics(
     *,
     free: Flags,
     prior: Prior,
-    iteration_done: IterationDone,
+    part: str,
+    progress: Progress,
 ) -> FreeRunFit:
     """Fit the physics of each fan alone; where a tacho counts, then with what that fit says of the errors of readings.
 
-    Arguments as of fit_free_run.
+    part: the name of this work in reports of progress. The other arguments are those of fit_free_run.
     """
+
+    def iteration_done(iteration: int, _unknowns: Unknowns, rmse_rad_s: float) -> bool:
+        progress(part, iteration, MOST_ITERATIONS_OF_PHYSICS, rmse_rad_s)
+        return False
 
     def fitted(start: Array, *, with_errors: bool) -> FreeRunFit:
         return fit_free_run(

@@ -30,8 +30,8 @@ from scipy.stats import t as student_t
 
 from fantwin.twin.errors import TwinError
 from fantwin.twin.fitting.filtering import filtered_regression
-from fantwin.twin.fitting.free_run_fit import MOST_ITERATIONS_OF_PHYSICS, FreeRunFit, fit_physics
-from fantwin.twin.fitting.free_run_problem import ALL_FREE, FreeRunProblem, Prior, Unknowns
+from fantwin.twin.fitting.free_run_fit import FreeRunFit, fit_physics
+from fantwin.twin.fitting.free_run_problem import ALL_FREE, FreeRunProblem, Prior
 from fantwin.twin.fitting.identifiability import (
     TOP_SPEED_QUANTILE,
     identifiability_warnings,
@@ -94,11 +94,8 @@ class Identification:
         return np.stack((self.parameters - reach, self.parameters + reach), axis=-1)
 
 
-def identify(runs: Sequence[Run], *, with_lag: bool = True, progress: Progress = unreported) -> Identification:
-    """Identify every fan of the runs. Raises TwinError when the data do not determine the parameters.
-
-    with_lag: false holds the lag at zero, which is the published model.
-    """
+def identify(runs: Sequence[Run], *, progress: Progress = unreported) -> Identification:
+    """Identify every fan of the runs. Raises TwinError when the data do not determine the parameters."""
     fans = common_fans(runs)
     pieces = [piece for run in runs for piece in run.split_at_gaps()]
     for fan in range(fans):
@@ -110,7 +107,6 @@ def identify(runs: Sequence[Run], *, with_lag: bool = True, progress: Progress =
     step_s = min(piece.median_period_s for piece in pieces)
     trajectories = cut_into_trajectories(pieces, stretch_samples(longest_s, step_s, STRETCH_TIME_CONSTANTS))
     free = np.tile(ALL_FREE, (fans, 1))
-    free[:, LAG] = with_lag
     fit, covariance, freedom = _refine(start, free, top_speed, trajectories, "identification", progress)
     lag_s = physical_parameters(fit.point.unknowns.physics, top_speed)[:, LAG]
     unseen = free[:, LAG] & (lag_s <= LAG_IN_STANDARD_ERRORS * np.sqrt(covariance[:, LAG, LAG]))
@@ -238,11 +234,6 @@ def _refine(
     anchor: Array | None = None,
 ) -> tuple[FreeRunFit, Array, Array]:
     """The fit of the free run from parameters (fans, 4), and what _covariance says of it. part: its name in reports."""
-
-    def iteration_done(iteration: int, _unknowns: Unknowns, rmse_rad_s: float) -> bool:
-        progress(part, iteration, MOST_ITERATIONS_OF_PHYSICS, rmse_rad_s)
-        return False
-
     fans = len(start)
     start_physics = fitted_unknowns(start, top_speed_rad_s)
     pull = inertia_anchor(np.count_nonzero(trajectories.compared) / fans)
@@ -254,7 +245,8 @@ def _refine(
         trajectories,
         free=free,
         prior=prior,
-        iteration_done=iteration_done,
+        part=part,
+        progress=progress,
     )
     return fit, *_covariance(fit, free, top_speed_rad_s, trajectories, prior)
 

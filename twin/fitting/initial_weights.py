@@ -9,15 +9,12 @@ hidden units as additional regressors. That is cheap enough to draw many placeme
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 
 import numpy as np
 
-from fantwin.twin.fitting.filtering import filtered_regression
+from fantwin.twin.fitting.filtering import filtered_regression, with_lagged_command
 from fantwin.twin.fitting.identification import Identification
-from fantwin.twin.measurement import with_measured_command
 from fantwin.twin.models.fan_ode import NetworkOde
-from fantwin.twin.models.lag import effective_command
 from fantwin.twin.models.network import TanhNetwork
 from fantwin.twin.models.physics import LAG
 from fantwin.twin.runs import Array, Run
@@ -31,7 +28,7 @@ def initial_weights(
     model: NetworkOde, pieces: Sequence[Run], identification: Identification, rng: np.random.Generator, keep: int
 ) -> list[Array]:
     """The best `keep` of many random starts: weights (P,) each, as many with kinks as without, best first."""
-    acting = _acting(pieces, identification)
+    acting = with_lagged_command(pieces, identification.parameters[:, LAG])
     best: list[tuple[Array, float]] = []
     for kinks, count in ((True, keep - keep // 2), (False, keep // 2)):
         drawn = [
@@ -78,17 +75,6 @@ def _placed(model: NetworkOde, pieces: Sequence[Run], rng: np.random.Generator, 
 
 def _log_uniform(rng: np.random.Generator, low: float, high: float, size: int) -> Array:
     return np.exp(rng.uniform(np.log(low), np.log(high), size))
-
-
-def _acting(pieces: Sequence[Run], identification: Identification) -> list[Run]:
-    """The pieces with the commands that act, after the lag, as the tachos show them."""
-    lag_s = identification.parameters[:, LAG]
-    return [
-        replace(
-            piece, command=effective_command(piece.command, piece.step_s[:, np.newaxis], lag_s, piece.command[0])[0]
-        )
-        for piece in map(with_measured_command, pieces)
-    ]
 
 
 def _fit_output_layer(placed: NetworkOde, acting: Sequence[Run], identification: Identification) -> tuple[Array, float]:

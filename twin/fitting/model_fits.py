@@ -7,13 +7,14 @@ from typing import Literal
 import numpy as np
 
 from fantwin.twin.each_network import ForEachNetwork, one_after_another
+from fantwin.twin.errors import TwinError
 from fantwin.twin.evaluation.accuracy import evaluation_pieces
 from fantwin.twin.fitting.cross_validation import choose_prior_std
 from fantwin.twin.fitting.drive_fit import FoundDrive
 from fantwin.twin.fitting.identification import Identification
 from fantwin.twin.fitting.initial_weights import initial_weights
 from fantwin.twin.fitting.narx_training import train_narx
-from fantwin.twin.fitting.training import GRID_PRIOR_STD, Physics, data_scaling, train_network
+from fantwin.twin.fitting.training import GRID_PRIOR_STD, data_scaling, train_network
 from fantwin.twin.models.fan_ode import FanOde, NetworkOde
 from fantwin.twin.models.model import Model
 from fantwin.twin.models.network import TanhNetwork
@@ -42,8 +43,6 @@ class FitRequest:
     seed: int = 0
     trainer: Trainer = "levenberg-marquardt"
     max_iterations: int | None = None
-    network_inputs: tuple[str, ...] = ("speed", "command")
-    physics: Physics = "refined"
     progress: Progress = unreported
     drive: FoundDrive | None = None
     networks: int = 1
@@ -54,13 +53,13 @@ class FitRequest:
 class FittedModel:
     """A fitted model. parameters: each fan's own, (fans, 4), behind a drive (fans, 7).
 
-    physics: whether they were refined with the network.
+    is_refined: its physics were fitted along with the network.
     """
 
     model: Model
     parameters: Array
     iterations: int
-    physics: Physics = "fixed"
+    is_refined: bool = False
     warnings: tuple[str, ...] = ()
 
 
@@ -84,21 +83,25 @@ def fit_narx(request: FitRequest) -> FittedModel:
     return FittedModel(narx, request.identification.parameters, iterations)
 
 
-def fit_network_ode(request: FitRequest, units: int, make: Callable[[TanhNetwork], NetworkOde]) -> FittedModel:
-    """A model with a network of so many units, by the trainer of the request."""
+def fit_network_ode(
+    request: FitRequest,
+    make: Callable[[TanhNetwork], NetworkOde],
+    units: int,
+    inputs: tuple[str, ...] = ("speed", "command"),
+) -> FittedModel:
+    """A model with a network of so many units and these inputs, by the trainer of the request."""
     scaling = data_scaling(request.runs, request.identification)
-    untrained = make(TanhNetwork.zero(units, request.network_inputs, scaling))
+    untrained = make(TanhNetwork.zero(units, inputs, scaling))
     limit = request.max_iterations or DEFAULT_ITERATIONS[request.trainer]
     train = _by_adam if request.trainer == "adam" else _by_levenberg_marquardt
     model, parameters, iterations = train(untrained, request, limit)
-    refinable = model.has_physics and request.trainer == "levenberg-marquardt"
     silent = model.has_physics and not np.any(model.theta)
     driven, parameters = _behind(request.drive, model, parameters)
     return FittedModel(
         driven,
         parameters,
         iterations,
-        physics=request.physics if refinable else "fixed",
+        is_refined=model.has_physics and request.trainer == "levenberg-marquardt",
         warnings=(SILENT_NETWORK,) if silent else (),
     )
 
@@ -110,7 +113,11 @@ def _behind(drive: FoundDrive | None, model: FanOde, parameters: Array) -> tuple
 
 
 def _by_adam(untrained: NetworkOde, request: FitRequest, limit: int) -> tuple[NetworkOde, Array, int]:
-    """The published recipe. The physics stay as identified."""
+    """The published recipe. The physics stay as identified. Raises TwinError for tachos that average."""
+    if any(tacho.reach_s > 0.0 for run in request.runs for tacho in run.tacho):
+        raise TwinError(
+            "trainer 'adam' takes readings for speeds, which a counting tacho's are not; use levenberg-marquardt"
+        )
     # torch is needed by this trainer alone, and takes seconds to import.
     from fantwin.twin.fitting.torch_reference import train_adam  # noqa: PLC0415
 
@@ -126,9 +133,7 @@ def _by_adam(untrained: NetworkOde, request: FitRequest, limit: int) -> tuple[Ne
 def _by_levenberg_marquardt(untrained: NetworkOde, request: FitRequest, limit: int) -> tuple[NetworkOde, Array, int]:
     prior_std = GRID_PRIOR_STD
     if not request.validation_runs:
-        prior_std = choose_prior_std(
-            untrained, request.runs, seed=request.seed, physics=request.physics, progress=request.progress
-        )
+        prior_std = choose_prior_std(untrained, request.runs, seed=request.seed, progress=request.progress)
     return train_network(
         untrained,
         request.runs,
@@ -136,7 +141,6 @@ def _by_levenberg_marquardt(untrained: NetworkOde, request: FitRequest, limit: i
         request.identification,
         max_iterations=limit,
         seed=request.seed,
-        physics=request.physics,
         prior_std=prior_std,
         networks=request.networks,
         each=request.each_network,

@@ -62,10 +62,12 @@ def model_uncertainty(
     parameters: Array,
     runs: Sequence[Run],
     acting_runs: Sequence[Run],
+    friction: Array,
     identification: Identification,
 ) -> ModelUncertainty:
     """Of a trained model. parameters: (fans, 4). runs: those that it was trained on, with the commands of the table.
-    acting_runs: the same with the commands that act on the fans.
+    acting_runs: the same with the commands that act on the fans. friction: (fans,) what a drive takes of the command
+    before it acts.
     """
     scale = data_scaling(runs, identification)
     typical_s = float(np.median(identification.time_constant_s))
@@ -85,11 +87,12 @@ def model_uncertainty(
     settled_rad_s, std_rad_s = [], []
 
     @lru_cache(maxsize=1)
-    def settling(friction: float) -> Settling:
-        return Settling(model, commands - friction, reach_rad_s)
+    def settling(lost: float) -> Settling:
+        return Settling(model, commands - lost, reach_rad_s)
 
-    for own, its, root in zip(parameters, evidence, _roots([each.squares for each in evidence]), strict=True):
-        settled_rad_s.append(settling(its.friction).of_fan(own))
+    roots = _roots([each.squares for each in evidence])
+    for own, lost, root in zip(parameters, friction.tolist(), roots, strict=True):
+        settled_rad_s.append(settling(lost).of_fan(own))
         speeds_rad_s = settled_rad_s[-1][:, np.newaxis] + offsets_rad_s
         held_s = _held_s(own, speeds_rad_s, SLOWEST * typical_s)
         std_rad_s.append(_left_rad_s2(root, basis, speeds_rad_s, commands) * held_s)

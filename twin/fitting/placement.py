@@ -14,12 +14,11 @@ import numpy as np
 
 from fantwin.schemas.twin_card import TwinCard
 from fantwin.twin.errors import TwinError
-from fantwin.twin.fitting.free_run_fit import MOST_ITERATIONS_OF_PHYSICS, FreeRunFit, fit_physics
+from fantwin.twin.fitting.free_run_fit import FreeRunFit, fit_physics
 from fantwin.twin.fitting.free_run_problem import (
     ALL_FREE,
     FreeRunProblem,
     Prior,
-    Unknowns,
     sums_by_fan,
     without_initial_speeds,
 )
@@ -104,12 +103,8 @@ def place_fans(
     prior = Prior(0.0, precision, typical)
     model = _FixedNetwork(fixed_network=network)
 
-    def iteration_done(iteration: int, _unknowns: Unknowns, rmse_rad_s: float) -> bool:
-        progress("placing", iteration, MOST_ITERATIONS_OF_PHYSICS, rmse_rad_s)
-        return False
-
     found = fit_physics(
-        model, typical, top_speed_rad_s, stretches, free=free, prior=prior, iteration_done=iteration_done
+        model, typical, top_speed_rad_s, stretches, free=free, prior=prior, part="placing", progress=progress
     )
     problem = FreeRunProblem(model, stretches, top_speed_rad_s, free, prior)
     of_unknowns = _covariance(problem, found, correlated_samples)

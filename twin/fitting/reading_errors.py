@@ -74,7 +74,7 @@ def reading_errors(
     error_rad_s: readings less those expected. speed_rad_s: of the free run. by_inertia_rad_s: what a larger inertia
     changes in the expected readings. All (n, batch). before: what was known, whose weights count.
     """
-    slope = _slope(trajectories.measurement.of_speed(speed_rad_s), trajectories.measurement.t_s)
+    slope = trajectories.measurement.slope(trajectories.measurement.of_speed(speed_rad_s))
     size = np.abs(by_inertia_rad_s)
     usable = trajectories.compared & np.isfinite(slope) & np.isfinite(size) & np.isfinite(error_rad_s)
     found = ReadingErrors.unknown(slope.shape)
@@ -103,12 +103,3 @@ def _rise_of_variance(squared_slope: Array, square: Array, held_s: float) -> flo
         return 0.0
     of_age = held_s**2 / 12.0
     return max(float(moving @ (square[~is_steady] - steady)) / float(moving @ moving), of_age) / steady
-
-
-def _slope(signal: Array, t_s: Array) -> Array:
-    """(n, batch) change a second, the mean of before and after each sample; 0 over padding."""
-    step_s = np.diff(t_s, axis=0)
-    with np.errstate(invalid="ignore", over="ignore"):
-        change = np.diff(signal, axis=0)
-        slope = np.divide(change, step_s, out=np.zeros_like(change), where=step_s > 0.0)
-        return (np.concatenate((slope[:1], slope)) + np.concatenate((slope, slope[-1:]))) / 2.0

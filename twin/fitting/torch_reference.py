@@ -9,7 +9,6 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from fantwin.twin.errors import TwinError
 from fantwin.twin.evaluation.accuracy import evaluation_pieces
 from fantwin.twin.fitting.identification import Identification
 from fantwin.twin.fitting.training import SHORT_STRETCH_TIME_CONSTANTS
@@ -70,14 +69,10 @@ def train_adam(
 ) -> tuple[NetworkOde, int]:
     """Train from the model's weights on stretches of ten time constants; returns the best iterate, and max_iterations.
 
-    Each stretch starts from the mean of its first five measured speeds. Its physics, the lag included, stay as they
-    were identified. Raises TwinError for tachos that average: the published recipe takes readings for speeds.
+    Each stretch starts from the mean of its first five measured speeds: readings are taken for speeds. Its physics, the
+    lag included, stay as they were identified.
     """
     pieces = evaluation_pieces(runs)
-    if any(tacho.reach_s > 0.0 for run in pieces for tacho in run.tacho):
-        raise TwinError(
-            "trainer 'adam' takes readings for speeds, which a counting tacho's are not; use levenberg-marquardt"
-        )
     period_s = min(piece.median_period_s for piece in pieces)
     longest_s = float(identification.time_constant_s.max())
     data = cut_into_trajectories(pieces, stretch_samples(longest_s, period_s, SHORT_STRETCH_TIME_CONSTANTS))

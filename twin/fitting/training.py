@@ -22,7 +22,6 @@ import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Literal
 
 import numpy as np
 
@@ -43,8 +42,6 @@ from fantwin.twin.models.physical import PhysicalModel, fitted_unknowns, physica
 from fantwin.twin.models.physics import LAG, PARAMETER_NAMES
 from fantwin.twin.progress import Progress, unreported
 from fantwin.twin.runs import Array, Run
-
-Physics = Literal["fixed", "refined"]
 
 SHORT_STRETCH_TIME_CONSTANTS = 10.0
 STARTS_OF_NETWORK, START_ITERATIONS, START_SAMPLES = 4, 5, 30_000
@@ -86,7 +83,6 @@ def train_network(
     *,
     max_iterations: int,
     seed: int = 0,
-    physics: Physics = "refined",
     prior_std: float = GRID_PRIOR_STD,
     networks: int = 1,
     each: ForEachNetwork = one_after_another,
@@ -94,18 +90,16 @@ def train_network(
 ) -> tuple[NetworkOde, Array, int]:
     """Train the model's network. Returns the trained model, the parameters (fans, 4) and the iterations taken.
 
+    J, alpha, C_D and the lag of each fan are fitted along with the network (of a tacho that counts alpha and C_D only).
     max_iterations: of each network; those of the starts come before and are not counted, the few on all samples of many
-    fans come on top. physics:
-    "refined" fits J, alpha, C_D and the lag of each fan along with the network (of a tacho that counts alpha and C_D
-    only); "fixed" leaves them as they were identified, as published.
-    prior_std: how far the network's acceleration may be from the physics where there are no data, in units of its scale
-    (twin.fitting.cross_validation chooses it). Zero: the weights stay zero.
+    fans come on top. prior_std: how far the network's acceleration may be from the physics where there are no data, in
+    units of its scale (twin.fitting.cross_validation chooses it). Zero: the weights stay zero.
     networks: how many are trained; the model is the mean of those that end about as well as the best. each: who trains
     them.
     """
     if prior_std == 0.0:
         return model.with_theta(np.zeros_like(model.network.theta)), identification.parameters, 0
-    training = _Training(model, runs, validation_runs, identification, physics, prior_std)
+    training = _Training(model, runs, validation_runs, identification, prior_std)
     starts = training.starts(np.random.default_rng(seed), STARTS_OF_NETWORK * networks, progress)
     trained = each(partial(training.continued, max_iterations), starts[:networks], "training", progress)
     least = min(one.best_loss for one in trained)
@@ -135,7 +129,6 @@ class _Training:
         runs: Sequence[Run],
         validation_runs: Sequence[Run],
         identification: Identification,
-        physics: Physics,
         prior_std: float,
     ) -> None:
         slowest_s = float(identification.time_constant_s.max())
@@ -151,7 +144,7 @@ class _Training:
         self._short = stretch_samples(slowest_s, period_s, SHORT_STRETCH_TIME_CONSTANTS)
         self._stretches = cut_into_trajectories(self._pieces, self._short)
         self._physics = fitted_unknowns(identification.parameters, self._top_speed_rad_s)
-        self._free = np.full(self._physics.shape, physics == "refined")
+        self._free = np.ones(self._physics.shape, np.bool_)
         # A lag that identification has not found stays out of the model.
         self._free[:, LAG] &= identification.parameters[:, LAG] > 0.0
         pull = inertia_anchor(sum(piece.samples for piece in self._pieces) / factor)

@@ -6,12 +6,18 @@ from typing import ClassVar, Self
 import numpy as np
 
 from fantwin.schemas.twin_card import NetworkCard, StateLayout
-from fantwin.twin.models.drive import DRIVE_LAYOUT, Drive
+from fantwin.twin.models.drive import DRIVE_LAYOUT, Drive, drive_settings
+from fantwin.twin.models.integration import free_run
+from fantwin.twin.models.lag import effective_command
 from fantwin.twin.models.network import TanhNetwork
 from fantwin.twin.models.ode_graph import ode_graph
 from fantwin.twin.models.onnx_nodes import Nodes
-from fantwin.twin.models.right_hand_side import ODE_LAYOUT, FanEquation, advance
+from fantwin.twin.models.physics import LAG
+from fantwin.twin.models.right_hand_side import FanEquation
 from fantwin.twin.runs import Array
+
+ODE_LAYOUT = StateLayout(speed=1, command=1)
+"""The one command is the lagged one (twin.models.lag)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,8 +56,15 @@ class FanOde:
         return self if self.network is None else replace(self, network=self.network.with_theta(theta))
 
     def advance(self, state: Array, command: Array, step_s: Array, parameters: Array) -> tuple[Array, Array]:
-        """Free run from state; see model.TwinModel."""
-        return advance(self.equation(parameters), state, command, step_s, parameters, self.drive)
+        """Free run from a state: speed, lagged command and, with a drive, its charge; see model.TwinModel."""
+        charge = state[:, 2:]
+        if self.drive is not None:
+            share, after = self.drive.kick(command, step_s[:, np.newaxis], state[:, 2])
+            command = self.drive.effective(command, share, drive_settings(parameters))
+            charge = after[:, np.newaxis]
+        acting, lagged = effective_command(command, step_s[:, np.newaxis], parameters[:, LAG], state[:, 1])
+        speed_rad_s, final = free_run(self.equation(parameters), state[:, 0], acting, step_s)
+        return speed_rad_s, np.column_stack((final, lagged, charge))
 
     def graph(self) -> Nodes:
         """See model.Model."""

@@ -13,11 +13,11 @@ samples are computed one by one.
 """
 
 from collections.abc import Callable
-from typing import Protocol
 
 import numpy as np
 
 from fantwin.twin.models.recursion import linear_recursion
+from fantwin.twin.models.right_hand_side import FanEquation
 from fantwin.twin.runs import Array
 
 Acceleration = Callable[[Array, Array], Array]
@@ -32,31 +32,6 @@ MAX_WINDOW = 250_000
 """samples times batch that are solved for at once: it bounds the memory"""
 
 
-class RightHandSide(Protocol):
-    """w' as a function of speed and command. Arrays of any equal shape (..., batch)."""
-
-    def acceleration(self, speed_rad_s: Array, command: Array) -> Array:
-        """(..., batch) in rad/s^2."""
-        ...
-
-    def slope(self, speed_rad_s: Array, command: Array) -> tuple[Array, Array]:
-        """The acceleration and its derivative by speed, both (..., batch)."""
-        ...
-
-
-class Linearised(RightHandSide, Protocol):
-    """A right-hand side with the derivatives by its unknowns."""
-
-    def linearise(
-        self, speed_rad_s: Array, command: Array, by_theta: Array | None = None
-    ) -> tuple[Array, Array, Array, Array]:
-        """The acceleration and its derivatives by speed and by command (..., batch), and by theta (..., batch, P).
-
-        by_theta: an array to write the last one into.
-        """
-        ...
-
-
 def rk4_step(acceleration: Acceleration, speed_rad_s: Array, command: Array, step_s: Array | float) -> Array:
     """The speed one step later. All arrays (batch,), or step_s a number common to all."""
     half_s = 0.5 * step_s
@@ -68,7 +43,7 @@ def rk4_step(acceleration: Acceleration, speed_rad_s: Array, command: Array, ste
 
 
 def free_run(
-    rhs: RightHandSide, initial_speed_rad_s: Array, command: Array, step_s: Array, guess_rad_s: Array | None = None
+    rhs: FanEquation, initial_speed_rad_s: Array, command: Array, step_s: Array, guess_rad_s: Array | None = None
 ) -> tuple[Array, Array]:
     """Integrate from one initial speed under the commands alone.
 
@@ -104,7 +79,7 @@ def free_run(
 
 
 def _solve(
-    rhs: RightHandSide, initial_speed_rad_s: Array, command: Array, step_s: Array, guess_rad_s: Array | None
+    rhs: FanEquation, initial_speed_rad_s: Array, command: Array, step_s: Array, guess_rad_s: Array | None
 ) -> tuple[Array, Array] | None:
     """The free run by Newton's method, or None where that does not converge."""
     if len(command) <= SHORTEST_WINDOW:
@@ -138,7 +113,7 @@ def step_through(
     return speed_rad_s, current
 
 
-def _rk4_step_slope(rhs: RightHandSide, speed_rad_s: Array, command: Array, step_s: Array) -> tuple[Array, Array]:
+def _rk4_step_slope(rhs: FanEquation, speed_rad_s: Array, command: Array, step_s: Array) -> tuple[Array, Array]:
     """The result of each step and its derivative by the speed it started from; all arrays (..., batch)."""
     half_s = 0.5 * step_s
     k1, d1 = rhs.slope(speed_rad_s, command)
@@ -156,7 +131,7 @@ def _rk4_step_slope(rhs: RightHandSide, speed_rad_s: Array, command: Array, step
 
 
 def rk4_step_derivatives(
-    rhs: Linearised, speed_rad_s: Array, command: Array, step_s: Array
+    rhs: FanEquation, speed_rad_s: Array, command: Array, step_s: Array
 ) -> tuple[Array, Array, Array]:
     """Derivatives of one step's result by the speed it started from and by the command held (..., batch), and by theta
     (..., batch, P).
@@ -188,7 +163,7 @@ def rk4_step_derivatives(
 
 
 def free_run_sensitivities(
-    rhs: Linearised, speed_rad_s: Array, command: Array, step_s: Array, command_by: Array
+    rhs: FanEquation, speed_rad_s: Array, command: Array, step_s: Array, command_by: Array
 ) -> Array:
     """(n, batch, P + K + 1) derivatives of a free run by theta, by K unknowns of its command and, last, by its own
     initial speed.

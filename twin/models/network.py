@@ -11,10 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fantwin.schemas.twin_card import NetworkCard
-from fantwin.twin.errors import TwinError
 from fantwin.twin.runs import Array
-
-INPUT_CHOICES = (("speed", "command"), ("speed",))
 
 
 @dataclass(frozen=True)
@@ -30,21 +27,13 @@ class Scaling:
 
 @dataclass(frozen=True, eq=False)
 class TanhNetwork:
-    """An acceleration in rad/s^2 from speed and command. theta: (parameter_count,), in scaled units.
-
-    Raises TwinError when theta's length or the inputs are not those of the layer.
-    """
+    """An acceleration in rad/s^2 from speed and command, or from the speed alone. theta: (parameter_count,), in scaled
+    units."""
 
     units: int
     inputs: tuple[str, ...]
     scaling: Scaling
     theta: Array
-
-    def __post_init__(self) -> None:
-        if self.inputs not in INPUT_CHOICES:
-            raise TwinError(f"network inputs {self.inputs} are unknown; use one of {INPUT_CHOICES}")
-        if self.theta.shape != (self.parameter_count,):
-            raise TwinError(f"theta has shape {self.theta.shape}; {self.units} units need ({self.parameter_count},)")
 
     @classmethod
     def zero(cls, units: int, inputs: tuple[str, ...], scaling: Scaling) -> "TanhNetwork":

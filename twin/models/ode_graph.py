@@ -1,4 +1,4 @@
-"""right_hand_side.advance as ONNX nodes: a Scan over samples whose body is the lag and one Runge-Kutta step.
+"""FanOde.advance as ONNX nodes: a Scan over samples whose body is the lag and one Runge-Kutta step.
 
 The nodes are written by hand, and few: each costs a third of a microsecond or more, whatever it computes for a tray of
 fans. A layer of the network with its bias is one node (Gemm), and so is the advance of a Runge-Kutta stage. What does

@@ -7,21 +7,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fantwin.schemas.twin_card import StateLayout
 from fantwin.twin.models import physics
-from fantwin.twin.models.drive import Drive, drive_settings
-from fantwin.twin.models.integration import free_run
-from fantwin.twin.models.lag import effective_command
 from fantwin.twin.models.network import TanhNetwork
 from fantwin.twin.runs import Array
-
-ODE_LAYOUT = StateLayout(speed=1, command=1)
-"""The one command is the lagged one (twin.models.lag)."""
 
 
 @dataclass(frozen=True, eq=False)
 class FanEquation:
-    """The right-hand side of a batch of fans. parameters: (batch, 4) or more, or None without physics.
+    """The right-hand side of a batch of fans, w' as a function of speed and command: arrays of any equal shape
+    (..., batch). parameters: (batch, 4) or more, or None without physics.
 
     linearise gives the derivatives by the network's weights, if these are free, and then by J, alpha and C_D, as far as
     there are any.
@@ -41,7 +35,7 @@ class FanEquation:
         return learned + physics.acceleration(speed_rad_s, command, self.parameters)
 
     def slope(self, speed_rad_s: Array, command: Array) -> tuple[Array, Array]:
-        """See integration.RightHandSide."""
+        """The acceleration and its derivative by speed, both (..., batch)."""
         if self.network is None:
             known = physics.acceleration(speed_rad_s, command, self._physics)
             return known, physics.acceleration_by_speed(speed_rad_s, self._physics)
@@ -56,7 +50,10 @@ class FanEquation:
     def linearise(
         self, speed_rad_s: Array, command: Array, by_theta: Array | None = None
     ) -> tuple[Array, Array, Array, Array]:
-        """See integration.Linearised."""
+        """The acceleration and its derivatives by speed and by command (..., batch), and by theta (..., batch, P).
+
+        by_theta: an array to write the last one into.
+        """
         weights = self.network.parameter_count if self.network is not None and self.has_free_weights else 0
         if by_theta is None:
             of_physics = 0 if self.parameters is None else physics.LAG
@@ -77,20 +74,3 @@ class FanEquation:
     def _physics(self) -> Array:
         assert self.parameters is not None, "an equation needs physics or a network"
         return self.parameters
-
-
-def advance(
-    equation: FanEquation, state: Array, command: Array, step_s: Array, parameters: Array, drive: Drive | None
-) -> tuple[Array, Array]:
-    """Free run from a state; see model.TwinModel. parameters: (fans, 4), with a drive (fans, 7).
-
-    state: (fans, 2) speed and lagged command, with a drive also its charge.
-    """
-    charge = state[:, 2:]
-    if drive is not None:
-        share, after = drive.kick(command, step_s[:, np.newaxis], state[:, 2])
-        command = drive.effective(command, share, drive_settings(parameters))
-        charge = after[:, np.newaxis]
-    acting, lagged = effective_command(command, step_s[:, np.newaxis], parameters[:, physics.LAG], state[:, 1])
-    speed_rad_s, final = free_run(equation, state[:, 0], acting, step_s)
-    return speed_rad_s, np.column_stack((final, lagged, charge))

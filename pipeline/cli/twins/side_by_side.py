@@ -19,7 +19,8 @@ from fantwin.pipeline.files import make_folder, write_whole
 from fantwin.pipeline.learning.training_data import TrainingData, data_cards
 
 if TYPE_CHECKING:
-    from fantwin.twin.comparison import Candidate, Contender
+    from fantwin.twin.comparison import Contender
+    from fantwin.twin.kinds import ModelKind
 
 Data: TypeAlias = tuple[TrainingData, TrainingData | None, TrainingData | None]
 """of training, of validation and of the test"""
@@ -32,7 +33,7 @@ SOURCE_MEANING = {
 
 
 def train_side_by_side(
-    chosen: Sequence[Candidate],
+    chosen: Sequence[ModelKind],
     read: Callable[[], Data],
     folder: Path,
     pool: RecordingsInParallel,
@@ -58,9 +59,9 @@ def train_side_by_side(
     data, validation_data = data_cards(training_data), data_cards(others[0]) if others[0] else ()
     contenders = []
     with training_progress(training_data) as start:
-        for candidate in chosen:
+        for kind in chosen:
             contender = contend(
-                candidate,
+                kind,
                 training_data.runs,
                 validation_runs,
                 test_runs,
@@ -70,17 +71,17 @@ def train_side_by_side(
                 fan_numbers=training_data.fans,
                 data=data,
                 validation_data=validation_data,
-                progress=start(candidate.title),
+                progress=start(kind.title),
             )
             if contender.twin:
-                contender.twin.save(_file(folder, candidate))
+                contender.twin.save(_file(folder, kind))
             contenders.append(contender)
     winner = best(contenders)
     source = source_of(validation_runs, test_runs)
     result = {
         "speed_unit": training_data.speed_unit,
         "evaluated_on": source,
-        "best": winner.candidate.name,
+        "best": winner.kind.name,
         "models": [as_json(contender, training_data, folder) for contender in contenders],
         "warnings": training_data.with_fan_numbers(winner.twin.identification.warnings if winner.twin else []),
     }
@@ -97,10 +98,10 @@ def train_side_by_side(
 
 def as_json(contender: Contender, training_data: TrainingData, folder: Path) -> dict[str, Any]:
     """The result as JSON fields; figures in the recordings' own units, null where there are none."""
-    candidate, twin, each = contender.candidate, contender.twin, training_data.rad_s_per_unit
+    kind, twin, each = contender.kind, contender.twin, training_data.rad_s_per_unit
     result: dict[str, Any] = {
-        "model": candidate.name,
-        "title": candidate.title,
+        "model": kind.name,
+        "title": kind.title,
         "invalid_reason": contender.invalid_reason or None,
     }
     if twin is None:
@@ -114,7 +115,7 @@ def as_json(contender: Contender, training_data: TrainingData, folder: Path) -> 
         "sigma": [sigma / each for sigma in twin.card.sigma_rad_s],
         "training_rmse": contender.training_rmse_rad_s / each,
         "figures": {name: figures_in(part.pooled, each) for name, part in parts.items() if part},
-        "twin": str(_file(folder, candidate)),
+        "twin": str(_file(folder, kind)),
     }
 
 
@@ -145,5 +146,5 @@ def table(result: dict[str, Any]) -> Table:
     return rows
 
 
-def _file(folder: Path, candidate: Candidate) -> Path:
-    return folder / f"{candidate.name}.onnx"
+def _file(folder: Path, kind: ModelKind) -> Path:
+    return folder / f"{kind.name}.onnx"

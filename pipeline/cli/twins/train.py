@@ -45,8 +45,8 @@ from fantwin.pipeline.learning.training_data import (
 
 if TYPE_CHECKING:
     from fantwin.schemas.reference_conditions import ReferenceConditions
-    from fantwin.twin.comparison import Candidate
     from fantwin.twin.finishing import TrainedTwin
+    from fantwin.twin.kinds import ModelKind
     from fantwin.twin.progress import Progress
 
 
@@ -115,7 +115,7 @@ def train(
 
     Example: fantwin train new-tray.mcap --type type.onnx -o new-tray.onnx
     """
-    given = TrainingSettings(model, seed, trainer, iterations, None, networks, command_unit)
+    given = TrainingSettings(model, seed, trainer, iterations, networks, command_unit)
     part = Part(tray, fan_numbers(fans), from_s, to_s, tuple(window_s or ()), ignored_columns(ignore))
     if type_twin and (given != DEFAULT_SETTINGS or window_s or ignore):
         raise UsageError("--type keeps the network of the type: leave out the options of a model and of its training")
@@ -145,7 +145,7 @@ def train(
         training_data, held_out, _ = _read(recordings, validate, None, part, pool)
         if not (json_output or type_twin):
             show_hints(training_data.hints)
-        settings = replace(given, model=chosen[0].kind, network_inputs=chosen[0].network_inputs)
+        settings = replace(given, model=chosen[0].name)
         named = name or output.stem
         with training_progress(training_data) as start, NetworksInParallel(pool.jobs) as each_network:
             if type_twin:
@@ -176,10 +176,10 @@ def _read(
     return training_data, others[0], others[1]
 
 
-def _chosen(names: str) -> list[Candidate]:
-    from fantwin.twin.comparison import all_candidates  # noqa: PLC0415  loads twin only when it is needed
+def _chosen(names: str) -> list[ModelKind]:
+    from fantwin.twin.kinds import KINDS  # noqa: PLC0415  loads twin only when it is needed
 
-    by_name = {candidate.name: candidate for candidate in all_candidates()}
+    by_name = {kind.name: kind for kind in KINDS}
     wanted = list(by_name) if names == "all" else [name.strip() for name in names.split(",")]
     for name in wanted:
         if name not in by_name:

@@ -6,8 +6,9 @@ from pathlib import Path
 import pytest
 
 from fantwin.twin.build import train_twin
-from fantwin.twin.comparison import Contender, all_candidates, best
+from fantwin.twin.comparison import Contender, best
 from fantwin.twin.errors import TwinError
+from fantwin.twin.kinds import KINDS
 from tests.pipeline.cli.conftest import MadeOnce
 from tests.support.fan_data import rough_run
 from tests.support.fantwin_command import fantwin
@@ -105,4 +106,4 @@ def test_the_table_fits_a_terminal_marks_the_best_and_has_a_row_for_a_model_that
 
 def test_if_no_model_could_be_trained_the_error_has_the_reason():
     with pytest.raises(TwinError, match="nothing moved"):
-        best([Contender(candidate, invalid_reason="nothing moved") for candidate in all_candidates()])
+        best([Contender(kind, invalid_reason="nothing moved") for kind in KINDS])

@@ -20,14 +20,10 @@ def untrained(runs: list[Run]) -> Hybrid:
 def test_a_fan_that_the_physics_describe_gets_no_network_and_a_rough_one_does() -> None:
     plain = [fan_data.published_run(seed, 5.0) for seed in (1, 2)]
     rough = [fan_data.rough_run(seed, 8.0) for seed in (1, 2)]
-    assert choose_prior_std(untrained(plain), plain, seed=0, physics="refined") == 0.0
-    assert choose_prior_std(untrained(rough), rough, seed=0, physics="refined") > 0.0
-
-
-def test_a_recording_without_speeds_does_not_count() -> None:
-    run = fan_data.rough_run(1, 10.0)
-    blind = Run("blind", run.t_s, run.command, np.full_like(run.speed_rad_s, np.nan))
-    assert choose_prior_std(untrained([run]), [run, blind], seed=0, physics="refined") == GRID_PRIOR_STD
+    assert choose_prior_std(untrained(plain), plain, seed=0) == 0.0
+    assert choose_prior_std(untrained(rough), rough, seed=0) > 0.0
+    blind = Run("blind", rough[1].t_s, rough[1].command, np.full_like(rough[1].speed_rad_s, np.nan))
+    assert choose_prior_std(untrained(rough), [rough[0], blind], seed=0) == GRID_PRIOR_STD, "it does not count"
 
 
 @pytest.mark.parametrize(

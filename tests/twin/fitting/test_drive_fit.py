@@ -39,7 +39,7 @@ def run_of(drive: Drive | None, seed: int) -> Run:
 
 def found_in(drive: Drive | None, progress: Progress = unreported) -> FoundDrive | None:
     runs, held_out = [run_of(drive, 1)], [run_of(drive, 2)]
-    return find_drive(runs, held_out, identify(runs, with_lag=False), find_standstill([*runs, *held_out]), progress)
+    return find_drive(runs, held_out, identify(runs), find_standstill([*runs, *held_out]), progress)
 
 
 def test_plateau_friction_and_kick_are_found() -> None:
@@ -56,7 +56,7 @@ def test_plateau_friction_and_kick_are_found() -> None:
 
 def test_a_drive_is_looked_for_where_readings_are_of_pulses_and_starts_are_many() -> None:
     run, standstill = run_of(DRIVE, 1), find_standstill([run_of(DRIVE, 1)])
-    plain = identify([run_of(None, 1)], with_lag=False)
+    plain = identify([run_of(None, 1)])
     assert find_drive([replace(run, tacho=INSTANTANEOUS)], [], plain, standstill) is None
     assert find_drive([run.between(0.0, 3 * 5 * HOLD_S)], [], plain, standstill) is None
 
@@ -68,7 +68,7 @@ def test_a_fan_whose_command_acts_as_it_is_gets_no_drive() -> None:
 def test_errors_of_readings_while_the_speed_changes_do_not_hide_a_drive() -> None:
     """Of unknown age, as on a line that is slower than the fan: they exceed all that a drive explains by far."""
     runs = [of_unknown_age(run_of(DRIVE, seed), seed) for seed in (1, 2)]
-    found = find_drive(runs[:1], runs[1:], identify(runs[:1], with_lag=False), find_standstill(runs))
+    found = find_drive(runs[:1], runs[1:], identify(runs[:1]), find_standstill(runs))
     assert found is not None
     np.testing.assert_allclose(found.settings[:, 0], SETTINGS[:, 0], rtol=0.1)
 

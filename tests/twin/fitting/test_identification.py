@@ -13,7 +13,7 @@ from tests.support import fan_data
 
 @pytest.fixture(scope="module")
 def published() -> tuple[Run, Identification]:
-    run = fan_data.published_run(seed=11, duration_s=40.0, fans=8)
+    run = fan_data.published_run(seed=11, duration_s=40.0, fans=4)
     return run, identify([run])
 
 
@@ -52,23 +52,14 @@ def test_a_lag_is_found_where_there_is_one_and_none_where_there_is_none(publishe
     np.testing.assert_allclose(found.parameters[:, 3], 0.03, atol=0.004)
     assert np.all(np.abs(found.parameters[:, 3] - 0.03) < 4.0 * found.standard_errors[:, 3])
     np.testing.assert_allclose(found.parameters[:, 0], 0.15, rtol=0.02)
-    published_model = identify([lagging], with_lag=False)
-    assert np.all(published_model.parameters[:, 3] == 0.0)
-    assert np.all(published_model.rmse_rad_s > found.rmse_rad_s)
-
-
-def test_units_of_command_and_speed_do_not_matter(published) -> None:
-    run, found = published
-    scaled = identify([Run("counts", run.t_s, run.command * 655.35, run.speed_rad_s * 0.1)])
-    factors = np.array([6553.5, 6553.5, 65535.0, 1.0])
-    np.testing.assert_allclose(scaled.parameters, found.parameters * factors, rtol=1e-3)
 
 
 @pytest.mark.parametrize("stretch", [0.1, 60.0], ids=["23 ms", "14 s"])
-def test_a_fan_ten_times_faster_or_sixty_times_slower_is_recovered(published, stretch: float) -> None:
-    run, _ = published
-    found = identify([Run("stretched", run.t_s * stretch, run.command, run.speed_rad_s)])
-    np.testing.assert_allclose(found.parameters[:, 0], 0.15 * stretch, rtol=0.02)
+def test_a_fan_ten_times_faster_or_sixty_times_slower_is_recovered_in_any_units(published, stretch: float) -> None:
+    run, found = published
+    scaled = identify([Run("scaled", run.t_s * stretch, run.command * 655.35, run.speed_rad_s * 0.1)])
+    factors = np.array([6553.5 * stretch, 6553.5, 65535.0, 1.0])
+    np.testing.assert_allclose(scaled.parameters, found.parameters * factors, rtol=0.02)
 
 
 def test_missing_and_jittered_samples_do_not_bias(published) -> None:
@@ -82,34 +73,16 @@ def test_missing_and_jittered_samples_do_not_bias(published) -> None:
     np.testing.assert_allclose(found.parameters[:, 0], 0.15, rtol=0.08)
 
 
-def test_a_first_reading_long_after_the_beginning_shows_nothing_of_the_start(published) -> None:
-    """Of the start nothing is left then: its share underflows to zero."""
-    run = published[0].between(0.0, 20.0).fan(0)
-    before_s = np.arange(40_000) / 100.0
-    later = Run(
-        "later",
-        np.concatenate((before_s, before_s[-1] + 0.01 + run.t_s - run.t_s[0])),
-        np.vstack((np.full((len(before_s), run.fans), 20.0), run.command)),
-        np.vstack((np.full((len(before_s), run.fans), np.nan), run.speed_rad_s)),
-    )
-    found = identify([later], with_lag=False)
-    np.testing.assert_allclose(found.parameters[:, 0], identify([run], with_lag=False).parameters[:, 0], rtol=0.1)
-
-
-def test_a_command_that_never_changes_is_refused() -> None:
-    rng = np.random.default_rng(1)
-    run = Run("constant", np.arange(500) / 100.0, np.full(500, 50.0), 140.0 + rng.normal(size=500))
-    with pytest.raises(TwinError, match="fan 0: the command never changes; record steps"):
-        identify([run])
-
-
-def test_swapped_columns_of_a_dead_sensor_are_refused() -> None:
+def test_a_command_that_never_changes_and_a_dead_sensor_are_refused() -> None:
     command = fan_data.stairs(np.random.default_rng(3), 500, 1)
     t_s = np.arange(500) / 100.0
-    with pytest.raises(TwinError, match="speed never changes"):
-        identify([Run("stuck", t_s, command, np.full_like(command, 3.0))])
-    with pytest.raises(TwinError, match="fewer than ten measured speeds"):
-        identify([Run("dead", t_s, command, np.full_like(command, np.nan))])
+    for held, speed_rad_s, words in (
+        (np.full_like(command, 50.0), command, "fan 0: the command never changes; record steps"),
+        (command, np.full_like(command, 3.0), "speed never changes"),
+        (command, np.full_like(command, np.nan), "fewer than ten measured speeds"),
+    ):
+        with pytest.raises(TwinError, match=words):
+            identify([Run("bad", t_s, held, speed_rad_s)])
 
 
 def test_a_recording_of_few_time_constants_is_said_to_be_too_short_before_anything_else() -> None:
@@ -119,10 +92,6 @@ def test_a_recording_of_few_time_constants_is_said_to_be_too_short_before_anythi
     assert "takes 75; record 5 min or more" in first
     parts = [fan_data.published_run(seed, duration_s=10.0) for seed in (1, 2)]
     assert not any("too short" in line for line in identify(parts).warnings), "recordings count together"
-
-
-def test_a_slow_fan_is_to_be_recorded_for_longer() -> None:
-    run = fan_data.published_run(1, duration_s=5.0)
-    (line,) = short_warnings([run], np.array([0.01, 10.0]))
+    (line,) = short_warnings([fan_data.published_run(1, duration_s=5.0)], np.array([0.01, 10.0]))
     assert "of the slowest fan (10 s)" in line
     assert "record 25 min or more" in line

@@ -18,7 +18,6 @@ from fantwin.schemas.twin_card import NetworkCard, StateLayout
 from fantwin.stages.twin_integrator import TwinIntegratorConfig, TwinIntegratorCore
 from fantwin.twin import kinds
 from fantwin.twin.build import evaluate, train_twin
-from fantwin.twin.comparison import all_candidates
 from fantwin.twin.export.onnx_twin import OnnxTwin
 from fantwin.twin.finishing import TrainedTwin
 from fantwin.twin.fitting.model_fits import FitRequest, FittedModel
@@ -93,15 +92,11 @@ def trained() -> Iterator[TrainedTwin]:
     kinds.KINDS.remove(row)
 
 
-def test_it_is_trained_and_known_to_comparisons(trained: TrainedTwin) -> None:
+def test_it_is_trained_and_its_file_runs_as_it_does_and_is_reported(trained: TrainedTwin, tmp_path: Path) -> None:
     assert isinstance(trained.model, FirstOrder)
     assert trained.model.decay == pytest.approx(0.97, rel=1e-3)
     assert trained.validation.pooled.rmse_rad_s < 0.3
     assert trained.card.kind == "first-order"
-    assert "first-order" in [candidate.name for candidate in all_candidates()]
-
-
-def test_its_file_runs_as_it_does_and_is_evaluated_and_reported(trained: TrainedTwin, tmp_path: Path) -> None:
     path, run = trained.save(tmp_path / "toy.onnx"), linear_run(3)
     from_file, from_memory = evaluate(path, [run]), evaluate(trained, [run])
     assert from_file.pooled.rmse_rad_s == pytest.approx(from_memory.pooled.rmse_rad_s, rel=1e-9)
