@@ -45,17 +45,6 @@ def test_the_expected_reading_is_the_mean_over_window_and_age(held: bool) -> Non
             assert shown[k, column] == pytest.approx(np.mean(at_ends), abs=0.3 if held else 0.01)
 
 
-def test_a_constant_is_left_as_it_is_and_a_ramp_is_late_by_the_mean_delay() -> None:
-    times = uneven_times(500, len(TACHOS))
-    measurement = Measurement(times, TACHOS)
-    np.testing.assert_allclose(measurement.of_speed(np.full_like(times, 300.0)), 300.0, rtol=1e-13)
-    late = times - measurement.of_speed(times)
-    for column, tacho in enumerate(TACHOS):
-        known = measurement.comparable[:, column]
-        np.testing.assert_allclose(late[known, column], tacho.mean_delay_s, atol=1e-9)
-        assert times[known, column][0] >= times[0, column] + tacho.reach_s
-
-
 @pytest.mark.parametrize("tacho", TACHOS[:2], ids=str)
 def test_the_runtime_averages_commands_as_the_maker_does(tacho: Tacho) -> None:
     period_s = 0.1

@@ -25,33 +25,31 @@ def impulse(run: Run, stop_s: float) -> Array:
     return held_s @ run.command
 
 
-@pytest.mark.parametrize("rate_hz", [7.0, 130.0])
-def test_no_impulse_of_the_command_is_lost_on_another_rate(rate_hz: float) -> None:
+@pytest.mark.parametrize("rate_hz", [7.0, 50.0, 130.0, 200.0])
+def test_on_another_rate_no_impulse_is_lost_and_speeds_are_the_measured_ones(rate_hz: float) -> None:
     run = fan_data.published_run(1, 10.0, fans=2)
     other = resampled(run, rate_hz)
     assert np.diff(other.t_s) == pytest.approx(1.0 / rate_hz)
     for stop_s in other.t_s[[1, 5, len(other.t_s) // 2, -1]]:
         assert impulse(other, stop_s) == pytest.approx(impulse(run, stop_s), rel=1e-9)
+    if rate_hz == 50.0:
+        assert other.speed_rad_s == pytest.approx(run.speed_rad_s[::2])
+    if rate_hz == 200.0:
+        assert other.speed_rad_s[::2] == pytest.approx(run.speed_rad_s)
+        assert np.isnan(other.speed_rad_s[1::2]).all()
 
 
-def test_speeds_are_the_measured_ones_wherever_the_grids_meet() -> None:
-    run = fan_data.published_run(3, 10.0)
-    assert resampled(run, 50.0).speed_rad_s == pytest.approx(run.speed_rad_s[::2])
-    double = resampled(run, 200.0)
-    assert double.speed_rad_s[::2] == pytest.approx(run.speed_rad_s)
-    assert np.isnan(double.speed_rad_s[1::2]).all()
-    same = resampled(run, 100.0)
-    np.testing.assert_array_equal(same.speed_rad_s, run.speed_rad_s)
-    np.testing.assert_allclose(same.command, run.command, rtol=1e-9)
-
-
-def test_irregular_steps_are_one_to_three_steps_of_the_run_lose_no_impulse_and_depend_on_the_seed_only() -> None:
+@pytest.mark.parametrize("how", ["irregular", "every seventh"])
+def test_a_thinned_run_keeps_its_readings_and_loses_no_impulse(how: str) -> None:
     run = fan_data.published_run(4, 10.0)
-    thin = irregular(run, seed=1)
+    thin = irregular(run, seed=1) if how == "irregular" else thinned(run, 7)
     steps = np.rint(np.diff(thin.t_s) * fan_data.RATE_HZ)
-    assert [np.mean(steps == k) for k in (1, 2, 3)] == pytest.approx([1 / 3] * 3, abs=0.07)
+    if how == "irregular":
+        assert [np.mean(steps == k) for k in (1, 2, 3)] == pytest.approx([1 / 3] * 3, abs=0.07)
+        np.testing.assert_array_equal(irregular(run, seed=1).t_s, thin.t_s)
+    else:
+        assert np.all(steps == 7)
     np.testing.assert_array_equal(thin.speed_rad_s[:, 0], run.speed_rad_s[np.isin(run.t_s, thin.t_s), 0])
-    np.testing.assert_array_equal(irregular(run, seed=1).t_s, thin.t_s)
     for stop_s in thin.t_s[[1, 50, -1]]:
         assert impulse(thin, stop_s) == pytest.approx(impulse(run, stop_s), rel=1e-9)
 
@@ -66,18 +64,6 @@ def test_on_grids_with_few_common_times_speeds_are_interpolated_and_gaps_stay_ga
     assert other.speed_rad_s[known, 0] == pytest.approx(3.0 + 2.0 * other.t_s[known])
     in_gap = (other.t_s > t_s[199] + 1e-9) & (other.t_s < t_s[203] - 1e-9)
     np.testing.assert_array_equal(~known, in_gap)
-
-
-def test_lost_samples_stay_lost_but_an_uneven_run_is_interpolated() -> None:
-    run = fan_data.published_run(3, 10.0)
-    kept = np.random.default_rng(4).random(run.samples) > 0.2
-    kept[0] = True
-    lossy = resampled(Run("lossy", run.t_s[kept], run.command[kept], run.speed_rad_s[kept]), 50.0)
-    np.testing.assert_array_equal(np.isfinite(lossy.speed_rad_s[:, 0]), kept[: 2 * lossy.samples : 2])
-    # Steps of 10 and 15 ms: a third of the times at 100 Hz would meet samples, and not just any third.
-    t_s = np.cumsum(np.random.default_rng(5).choice([0.010, 0.015], 400))
-    uneven = resampled(Run("uneven", t_s, np.ones(400), 3.0 + 2.0 * t_s), 100.0)
-    assert uneven.speed_rad_s[:, 0] == pytest.approx(3.0 + 2.0 * uneven.t_s)
 
 
 def test_long_gaps_are_left_out_and_short_stretches_too() -> None:
@@ -138,13 +124,3 @@ def test_a_twin_is_as_good_on_every_grid(model: TwinModel, lag_s: float) -> None
     # 800 samples at 20 Hz: their root mean square scatters by 2.5 %.
     for error in errors_in_noise(model, parameters, simulated(model, parameters)).values():
         assert error == pytest.approx(1.0, abs=0.06)
-
-
-def test_a_thinned_run_keeps_its_readings_and_loses_no_impulse() -> None:
-    run = fan_data.published_run(5, 10.0, fans=2)
-    thin = thinned(run, 7)
-    np.testing.assert_array_equal(thin.speed_rad_s, run.speed_rad_s[::7])
-    for stop_s in thin.t_s[[1, 50, -1]]:
-        assert impulse(thin, stop_s) == pytest.approx(impulse(run, stop_s), rel=1e-9)
-    assert thinned(run, 1) is run
-    assert thinned(run.rows(0, 4), 7).samples == 4, "a single sample is no run"

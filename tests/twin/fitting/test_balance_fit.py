@@ -68,32 +68,13 @@ def coefficients(fit: BalanceCard) -> Array:
     return np.column_stack((fit.inertia, fit.viscous, fit.drag, fit.friction))
 
 
-def std_errors(fit: BalanceCard) -> Array:
-    """(fans, 4) of each coefficient by itself."""
-    return np.sqrt(np.diagonal(np.array(fit.covariance), axis1=1, axis2=2))
-
-
-def within_run(run: Run, fit: BalanceCard) -> Array:
-    """(n, fans) balance of a run about its mean, without its first second."""
-    balance = torque_balance(run.command, run.speed_rad_s, run.median_period_s, coefficients(fit), np.array(fit.lag_s))
-    settled = balance[round(1.0 / run.median_period_s) :]
-    return settled - np.nanmean(settled, axis=0)
-
-
-@pytest.mark.parametrize("make", [published_fan.published_training, published_fan.published_test])
-def test_exact_physics_are_kept(make) -> None:
-    run = make(0).run
-    identification = identify([run])
+def test_exact_physics_are_kept_and_sigma_follows_from_the_noise_of_the_tacho(published) -> None:
+    run, identification = published
     fit = fit_balance([run], [], identification)
     assert fit.source == ("physics",)
     np.testing.assert_array_equal(coefficients(fit)[:, :3], identification.parameters[:, :3])
-    np.testing.assert_array_equal(std_errors(fit)[:, :3], identification.standard_errors[:, :3])
-    assert abs(coefficients(fit)[0, 3]) < 4.0 * std_errors(fit)[0, 3]
-
-
-def test_sigma_follows_from_the_noise_of_the_tacho(published) -> None:
-    run, identification = published
-    fit = fit_balance([run], [], identification)
+    np.testing.assert_allclose(np.diagonal(fit.covariance[0])[:3], identification.standard_errors[0, :3] ** 2)
+    assert abs(coefficients(fit)[0, 3]) < 4.0 * np.sqrt(fit.covariance[0][3][3])
     assert fit.sigma_command[0] == pytest.approx(coefficients(fit)[0, 0] * FILTER_RATE_PER_S * NOISE_RAD_S, rel=0.08)
     assert 0.005 <= fit.autocorrelation_time_s[0] < 0.1
     assert fit.lowest_speed_rad_s[0] == pytest.approx(0.05 * np.quantile(run.speed_rad_s, 0.99))
@@ -129,56 +110,31 @@ def test_with_a_tacho_that_counts_least_squares_have_to_explain_more_than_its_er
     assert set(fit_balance([counted(run, coarse)], [], wrong).source) == {"least-squares"}
 
 
-def test_the_command_a_fan_needs_is_known_better_than_any_one_coefficient(plants) -> None:
-    run, identification = plants
-    fit = fit_balance([run], [], identification)
-    chosen = np.array(fit.source) == "least-squares"
-    speed_rad_s = float(np.median(run.speed_rad_s))
-    terms = np.array([0.0, speed_rad_s, speed_rad_s**2, 1.0])
-    needed = coefficients(fit)[chosen] @ terms
-    known = np.sqrt(np.mean(np.einsum("i,fij,j->f", terms, np.array(fit.covariance)[chosen], terms)))
-    one_by_one = np.sqrt(np.mean(np.square(std_errors(fit)[chosen] * terms).sum(axis=1)))
-    assert 0.6 < known / needed.std(ddof=1) < 2.5
-    assert one_by_one > 4.0 * known
-
-
 def test_held_out_runs_judge_and_teach_nothing(published) -> None:
     run, identification = published
     other = published_fan.published_test(5).run
     alone, judged = fit_balance([run], [], identification), fit_balance([run], [other], identification)
     np.testing.assert_array_equal(coefficients(judged), coefficients(alone))
     assert judged.sigma_command[0] != alone.sigma_command[0]
-    assert judged.sigma_command[0] == pytest.approx(within_run(other, judged).std(), rel=0.02)
 
 
-def test_a_fan_that_is_held_or_braked_to_a_stop_teaches_nothing_then(published) -> None:
+@pytest.mark.parametrize("how", ["braked to a stop", "not read at times"])
+def test_a_fan_that_stands_teaches_nothing_then_and_a_few_missing_speeds_are_bridged(published, how: str) -> None:
     run, identification = published
     speed = run.speed_rad_s.copy()
-    speed[2000:2500] = 0.0
-    stopped, free = (fit_balance([r], [], identification) for r in (replace(run, speed_rad_s=speed), run))
-    assert stopped.source == free.source
-    np.testing.assert_allclose(stopped.sigma_command, free.sigma_command, rtol=0.05)
-
-
-def test_a_few_missing_speeds_are_bridged(published) -> None:
-    run, identification = published
-    speed = run.speed_rad_s.copy()
-    speed[np.random.default_rng(1).random(run.samples) < 0.05] = np.nan
-    fit, whole = (fit_balance([r], [], identification) for r in (replace(run, speed_rad_s=speed), run))
-    np.testing.assert_allclose(fit.sigma_command, whole.sigma_command, rtol=0.05)
-
-
-def test_damping_is_never_negative_where_runs_are_at_few_speeds() -> None:
-    levels = [published_fan.rough_run(seed, 12.0, low=60.0).run for seed in range(5)]
-    fit = fit_balance(levels, [], identify(levels))
-    assert np.all(coefficients(fit)[:, :3] >= 0.0)
+    if how == "braked to a stop":
+        speed[2000:2500] = 0.0
+    else:
+        speed[np.random.default_rng(1).random(run.samples) < 0.05] = np.nan
+    disturbed, free = (fit_balance([r], [], identification) for r in (replace(run, speed_rad_s=speed), run))
+    assert disturbed.source == free.source
+    np.testing.assert_allclose(disturbed.sigma_command, free.sigma_command, rtol=0.05)
 
 
 def test_runs_too_short_are_refused_in_one_line(published) -> None:
     run, identification = published
-    with pytest.raises(TwinError, match=r"fan 0: no run in which it turns for more than 1 s on end") as caught:
+    with pytest.raises(TwinError, match=r"^fan 0: no run in which it turns for more than 1 s on end.*$"):
         fit_balance([run.between(10.0, 10.9)], [], identification)
-    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.data

@@ -2,6 +2,7 @@
 
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -64,7 +65,6 @@ def controlled(
     every: int = 1,
     smoothing: float = 0.0,
     noise_rad_s: float = fan_data.NOISE_RAD_S,
-    dither: float = 0.0,
 ) -> Run:
     """Published fans under a PI controller that is fed the measured, noisy speed. set_point_rad_s: (n, fans).
 
@@ -83,7 +83,7 @@ def controlled(
             error = set_point_rad_s[k] - seen[max(k - delay, 0)]
             sum_of_errors = np.clip(sum_of_errors + integral_per_s * STEP_S * every * error, 0.0, 100.0)
             answer = np.clip(proportional * error + sum_of_errors, 0.0, 100.0)
-        command[k] = np.clip(answer + dither * rng.normal(size=shape[1]), 0.0, 100.0)
+        command[k] = answer
         speed = moved(speed, command[k])
     return Run("controlled", STEP_S * np.arange(float(shape[0])), command, measured)
 
@@ -101,17 +101,11 @@ def open_loop_commands(samples: int, fans: int) -> dict[str, Array]:
         noise[k] += 0.98 * noise[k - 1]
     return {
         "stairs": stairs,
-        "binary": np.repeat(rng.choice([20.0, 80.0], (samples // 7 + 1, fans)), 7, axis=0)[:samples],
-        "three levels": np.repeat(rng.choice([20.0, 50.0, 90.0], (samples // 11 + 1, fans)), 11, axis=0)[:samples],
         "two rounded sines": np.round(50.0 + 20.0 * waves.sum(axis=0), 1),
         "ramps": slewed,
         "coloured noise": np.clip(50.0 + 4.0 * noise, 0.0, 100.0),
         "stairs with dither": stairs + rng.normal(size=stairs.shape),
     }
-
-
-def named(settings: dict[str, float]) -> str:
-    return " ".join(f"{name} {value}" for name, value in settings.items()) or "PI"
 
 
 @pytest.mark.slow
@@ -139,28 +133,19 @@ def test_commands_from_outside_are_called_a_loop_less_than_twice_in_a_hundred() 
 
 
 @pytest.mark.parametrize(
-    "controller",
+    ("set_points", "controller"),
     [
-        {"proportional": 1.0, "integral_per_s": 0.0},
-        {"proportional": 0.0, "delay": 1},
-        {"every": 10},
-        {"smoothing": 0.9, "noise_rad_s": 0.05},
+        ("one", {"proportional": 1.0, "integral_per_s": 0.0}),
+        ("one", {"every": 10}),
+        ("one", {"smoothing": 0.9, "noise_rad_s": 0.05}),
+        ("several", {"delay": 3}),
     ],
-    ids=named,
+    ids=str,
 )
-def test_every_loop_at_one_set_point_is_noticed(controller) -> None:
-    run = controlled(np.full((2000, 8), 120.0), seed=3, **controller)
+def test_every_loop_is_noticed_also_behind_steps_of_its_set_point(set_points: str, controller: dict[str, Any]) -> None:
+    stairs = fan_data.stairs(np.random.default_rng(6), 3000, 8, 60.0, 180.0)
+    run = controlled(np.full((2000, 8), 120.0) if set_points == "one" else stairs, seed=3, **controller)
     assert all(feedback_share([run], fan) > 0.0 for fan in range(run.fans))
-
-
-def test_a_loop_is_noticed_through_missing_speeds_and_gaps() -> None:
-    run = controlled(np.full((4000, 2), 120.0), seed=8)
-    speed = run.speed_rad_s.copy()
-    speed[np.random.default_rng(1).random(speed.shape) < 0.05] = np.nan
-    keep = np.flatnonzero((run.t_s < 15.0) | (run.t_s > 18.0))
-    pieces = Run("lossy", run.t_s[keep], run.command[keep], speed[keep]).split_at_gaps()
-    assert len(pieces) == 2
-    assert all(feedback_share(pieces, fan) > 0.2 for fan in range(2))
 
 
 def test_a_loop_at_one_set_point_is_reported_with_biased_and_indistinguishable_parameters() -> None:
@@ -178,20 +163,27 @@ def judged(run: Run, **values_and_errors: tuple[float, float]) -> tuple[str, ...
     return identifiability_warnings([run], parameters[None], np.diag(errors**2)[None])
 
 
-def test_each_parameter_is_judged_by_its_own_interval() -> None:
-    run = published_run(1)
-    assert judged(run) == ()
-    (line,) = judged(run, C_D=(-0.0025, 0.0005))
-    assert line.startswith("fan 0: C_D is negative (-0.0025 ± 0.001)")
-    assert "friction, dead zone or offset" in line
-    (line,) = judged(run, C_D=(-0.0025, 0.002))
-    assert line.startswith("fan 0: C_D is not distinguishable from zero")
-    assert "higher speed" in line
-    (line,) = judged(run, alpha=(0.012, 0.007))
-    assert line.startswith("fan 0: alpha is not distinguishable from zero")
-    assert "low speed" in line
-    (line,) = judged(run, J=(0.15, 0.05))
-    assert line.startswith("fan 0: J is poorly determined (0.15 ± 0.1)")
+@pytest.mark.parametrize(
+    ("name", "estimate", "words"),
+    [
+        ("C_D", (-0.0025, 0.0005), ("fan 0: C_D is negative (-0.0025 ± 0.001)", "friction, dead zone or offset")),
+        ("C_D", (-0.0025, 0.002), ("fan 0: C_D is not distinguishable from zero", "higher speed")),
+        ("alpha", (0.012, 0.007), ("fan 0: alpha is not distinguishable from zero", "low speed")),
+        ("J", (0.15, 0.05), ("fan 0: J is poorly determined (0.15 ± 0.1)",)),
+        ("lag_s", (0.006, 0.001), ("fan 0: lag_s (6 ± 2 ms) is not determined by samples every 10 ms",)),
+        ("lag_s", (0.03, 0.02), ("lag_s (30 ± 40 ms) is not determined",)),
+        ("lag_s", (0.03, 0.002), ()),
+    ],
+)
+def test_each_parameter_is_judged_by_its_own_interval(
+    name: str, estimate: tuple[float, float], words: tuple[str, ...]
+) -> None:
+    """By default the estimates are the published ones with small errors."""
+    estimates = {"J": (0.15, 0.001), "alpha": (0.012, 0.001), "C_D": (0.0025, 1e-5), "lag_s": (0.0, 0.0)}
+    parameters, errors = np.array([(estimates | {name: estimate})[each] for each in PARAMETER_NAMES]).T
+    lines = identifiability_warnings([published_run(1)], parameters[None], np.diag(errors**2)[None])
+    assert len(lines) == bool(words)
+    assert not words or has_line_with(lines, *words)
 
 
 def merged(name: str, t_s: ArrayLike, command: ArrayLike, speed_rad_s: ArrayLike) -> Run:
@@ -199,14 +191,6 @@ def merged(name: str, t_s: ArrayLike, command: ArrayLike, speed_rad_s: ArrayLike
     table = pd.DataFrame({"t_s": t_s, "command": command, "speed_rad_s": speed_rad_s})
     one = table.groupby("t_s", sort=False).agg({"command": "last", "speed_rad_s": "mean"})
     return Run(name, one.index.to_numpy(float), one["command"].to_numpy(float), one["speed_rad_s"].to_numpy(float))
-
-
-def test_a_lag_below_the_sampling_step_or_within_its_error_is_reported_as_undetermined() -> None:
-    run = published_run(1)
-    assert judged(run, lag_s=(0.03, 0.002)) == ()
-    (line,) = judged(run, lag_s=(0.006, 0.001))
-    assert line.startswith("fan 0: lag_s (6 ± 2 ms) is not determined by samples every 10 ms")
-    assert has_line_with(judged(run, lag_s=(0.03, 0.02)), "lag_s (30 ± 40 ms) is not determined")
 
 
 def test_a_command_that_hardly_moves_is_little_excitation() -> None:
@@ -231,7 +215,7 @@ def rosa(folder: Path, number: int) -> Run:
 
 @pytest.mark.data
 def test_the_rotor_under_speed_control_is_noticed_in_every_healthy_run(measured_data) -> None:
-    for number in (44, 103, 120):
+    for number in (44, 120):
         assert feedback_share(rosa(measured_data, number).split_at_gaps(), 0) > 0.2, number
     assert has_line_with(warnings_of(rosa(measured_data, 103)), "closed loop")
 
@@ -294,14 +278,3 @@ def test_a_narrow_range_of_speed_determines_only_the_sum_of_alpha_and_drag() -> 
         value, error, speed = (float(part.split()[0]) for part in re.split(" = | ± ", line)[1:])
         assert abs(value - (VISCOUS + DRAG * speed)) < 2.0 * error
         assert 130.0 < speed < 170.0
-
-
-@pytest.mark.parametrize(
-    "controller",
-    [{"proportional": 0.1, "integral_per_s": 0.2}, {"delay": 3}],
-    ids=named,
-)
-def test_every_proportional_loop_is_noticed_behind_steps_of_its_set_point(controller) -> None:
-    stairs = fan_data.stairs(np.random.default_rng(6), 3000, 8, 60.0, 180.0)
-    run = controlled(stairs, seed=3, **controller)
-    assert all(feedback_share([run], fan) > 0.0 for fan in range(run.fans))

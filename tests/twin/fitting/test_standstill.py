@@ -61,24 +61,6 @@ def test_stops_and_starts_are_found_with_their_times() -> None:
     assert 0.0 <= found.slowing_s < slowed_s + COUNT.held_s, "readings tell it to a count"
 
 
-def test_a_fan_that_keeps_its_speed_for_a_while_is_allowed_to() -> None:
-    """Its drive acts five seconds late, so that the command it is under is known, and its speed stays."""
-    late, run = round(5.0 / PERIOD_S), measured(*STOPS)
-    speed = np.concatenate((np.full((late, 1), run.speed_rad_s[0, 0]), run.speed_rad_s))[:-late]
-    prompt, found = find_standstill([run]), find_standstill([replace(run, speed_rad_s=speed)])
-    assert found is not None
-    assert prompt is not None
-    assert found.slowing_s == pytest.approx(5.0 + (prompt.slowing_s or 0.0), abs=1.0)
-
-
-def test_a_slow_start_is_not_a_command_that_stops_the_fan() -> None:
-    found = find_standstill([measured(*STOPS, start_delay_s=15.0)])
-    assert found is not None
-    assert (found.off_command, found.turning_command) == (10.0, 30.0)
-    assert found.start_s is not None
-    assert 15.0 < found.start_s < 18.5
-
-
 def test_a_fan_that_stood_under_a_rising_command_does_not_stop_under_it() -> None:
     """It starts above 20 only, and once it turns it turns at 15, too."""
     up = [(level, 15.0) for level in (0.0, 5.0, 10.0, 15.0)]
@@ -92,17 +74,15 @@ def test_a_fan_that_stood_under_a_rising_command_does_not_stop_under_it() -> Non
     assert found.start_s < 5.0
 
 
-@pytest.mark.parametrize("disturbed", ["", "missing", "glitch", "gap", "quick"])
+@pytest.mark.parametrize("disturbed", ["", "glitch", "gap"])
 def test_a_command_that_only_a_standing_fan_has_seen_does_not_stop_it(disturbed: str) -> None:
     """It is at rest under 15 for half a minute, and turns under 15 later."""
-    rest = [(0.0, 5.0 if disturbed == "quick" else 30.0), (15.0, 30.0), (40.0, 30.0), (100.0, 30.0)]
+    rest = [(0.0, 30.0), (15.0, 30.0), (40.0, 30.0), (100.0, 30.0)]
     standing = measured(*rest) if not disturbed else measured((100.0, 30.0), *rest)
     turning = measured((100.0, 30.0), (20.1, 60.0))
     turning = replace(turning, command=np.where(turning.command == 20.1, 15.0, turning.command))
     speed, t_s = standing.speed_rad_s.copy(), standing.t_s.copy()
     row = round(75.0 / PERIOD_S)
-    if disturbed == "missing":
-        speed[row] = np.nan
     if disturbed == "glitch":
         speed[row] = 90.0
     if disturbed == "gap":

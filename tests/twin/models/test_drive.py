@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fantwin.schemas.twin_card import DriveCard, TwinCard
 from fantwin.twin.build import train_twin
 from fantwin.twin.export.onnx_export import export_onnx
 from fantwin.twin.export.onnx_twin import OnnxTwin
@@ -32,17 +31,11 @@ def test_a_command_acts_above_the_plateau_keeps_the_plateau_below_it_and_stops_t
     assert acting([120.0, 50.0, 30.0, 20.0, 19.9, 0.0])[0] == [115.0, 45.0, 45.0, 45.0, 0.0, 0.0]
 
 
-def test_a_rested_fan_gets_its_kick_once_and_for_its_time() -> None:
+def test_a_rested_fan_gets_its_kick_once_and_for_its_time_and_one_that_was_off_for_less_gets_less() -> None:
     effective, charge = acting([0.0] * 20 + [100.0] * 10)
     np.testing.assert_allclose(effective, [0.0] * 20 + [175.0] * 6 + [95.0] * 4, rtol=1e-12)
     assert charge == 20.0
-
-
-def test_a_kick_ends_within_a_step_with_the_share_that_is_left() -> None:
     assert acting([100.0, 100.0], charge=0.0, step_s=0.4)[0] == pytest.approx([175.0, 0.5 * 175.0 + 0.5 * 95.0])
-
-
-def test_a_fan_that_was_off_for_less_gets_less_and_one_that_runs_gets_none() -> None:
     effective, _ = acting([0.0] * 10 + [100.0] * 10)
     assert np.sum(np.array(effective[10:]) - 95.0) == pytest.approx(3 * 80.0)
     assert acting([100.0], charge=100.0)[0] == [95.0]
@@ -84,12 +77,3 @@ def test_the_exported_graph_has_the_drive_however_a_run_is_cut(plain: FanOde, tm
     first, between = exported.advance(state, command[:133], step_s[:133], parameters)
     second, _ = exported.advance(between, command[133:], step_s[133:], parameters)
     np.testing.assert_array_equal(np.concatenate((first, second)), from_file)
-
-
-def test_a_card_raises_commands_on_the_plateau_and_may_lack_a_drive() -> None:
-    card = DriveCard(turning_command=20.0, kick_s=0.6, rest_s=2.0, lowest_command=(50.0, 40.0))
-    raised = card.raised(np.array([[0.0, 45.0], [30.0, np.nan]]))
-    np.testing.assert_array_equal(raised, [[0.0, 45.0], [50.0, np.nan]])
-    early = train_twin([fan_data.published_run(1, 20.0)], [], "physical", name="bench").card
-    assert early.drive is None
-    assert TwinCard.from_json(replace(early, drive=DriveCard(20.0, 0.6, 2.0, (50.0,))).to_json()).drive is not None

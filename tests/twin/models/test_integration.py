@@ -27,14 +27,6 @@ def test_halving_the_step_divides_the_error_by_sixteen() -> None:
     np.testing.assert_allclose(orders, 4.0, atol=0.25)
 
 
-def test_each_speed_is_the_one_before_the_command_of_its_sample_acts() -> None:
-    command = np.array([[0.0], [100.0], [100.0]])
-    speed, final = free_run(right_hand_side(PARAMETERS), np.zeros(1), command, np.full(3, 0.01))
-    assert speed[0, 0] == 0.0
-    assert speed[1, 0] == 0.0
-    assert 0.0 < speed[2, 0] < final[0]
-
-
 @pytest.mark.parametrize("guess", ["none", "far"])
 def test_a_free_run_solved_at_once_is_the_one_stepped_through(guess: str) -> None:
     rng = np.random.default_rng(7)
@@ -47,15 +39,6 @@ def test_a_free_run_solved_at_once_is_the_one_stepped_through(guess: str) -> Non
     speed, final = free_run(equation, start, command, step_s, guesses[guess])
     np.testing.assert_allclose(speed, stepped, rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(final, end, rtol=1e-12)
-
-
-def test_a_diverging_fan_does_not_affect_the_others() -> None:
-    parameters = np.array([PARAMETERS[0], [0.15, -3.0, 0.0, 0.0]])
-    command, step_s = np.full((150, 2), 60.0), np.full(150, 0.01)
-    speed, _ = free_run(right_hand_side(parameters), np.array([5.0, 5.0]), command, step_s)
-    alone, _ = free_run(right_hand_side(parameters[:1]), np.array([5.0]), command[:, :1], step_s)
-    assert speed[-1, 1] > 1e10
-    np.testing.assert_allclose(speed[:, 0], alone[:, 0], rtol=1e-10)
 
 
 def test_a_model_that_runs_away_gives_infinities_like_its_steps() -> None:

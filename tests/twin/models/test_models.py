@@ -1,9 +1,8 @@
-"""The four models: their sizes, their derivatives, their state."""
+"""The four models: their derivatives, their equality, their bounds."""
 
 import numpy as np
 import pytest
 
-from fantwin.schemas.twin_card import StateLayout
 from fantwin.twin.models.hybrid import Hybrid
 from fantwin.twin.models.narx import PARAMETER_COUNT, Narx
 from fantwin.twin.models.network import Scaling, TanhNetwork
@@ -27,13 +26,6 @@ def random_narx() -> Narx:
 ALL_MODELS = [PhysicalModel(), NeuralOde(random_network(20)), Hybrid(random_network(10)), random_narx()]
 
 
-def test_parameter_counts_are_those_of_the_layers() -> None:
-    assert random_network(20).parameter_count == 81
-    assert random_network(10).parameter_count + 3 == 44
-    assert random_network(10, ("speed",)).parameter_count + 3 == 34
-    assert PARAMETER_COUNT == 1151
-
-
 @pytest.mark.parametrize("inputs", [("speed", "command"), ("speed",)])
 def test_the_network_is_differentiated_exactly(inputs: tuple[str, ...]) -> None:
     network = random_network(10, inputs)
@@ -52,21 +44,6 @@ def test_the_network_is_differentiated_exactly(inputs: tuple[str, ...]) -> None:
         move[index] = 1e-5
         up, down = (network.with_theta(network.theta + sign * move).acceleration(speed, command) for sign in (1, -1))
         np.testing.assert_allclose(by_theta[:, index], (up - down) / 2e-5, rtol=1e-6, atol=1e-6)
-
-
-def test_a_hybrid_with_a_silent_network_is_the_physical_model() -> None:
-    command, step_s = np.full((50, 2), 60.0), np.full(50, 0.01)
-    silent = Hybrid(TanhNetwork.zero(10, ("speed", "command"), SCALING))
-    state = np.zeros((2, 2))
-    np.testing.assert_array_equal(
-        silent.advance(state, command, step_s, PARAMETERS)[0],
-        PhysicalModel().advance(state, command, step_s, PARAMETERS)[0],
-    )
-
-
-def test_an_initial_state_repeats_the_measured_speed_and_the_command() -> None:
-    state = StateLayout(2, 3).initial_state(np.array([5.0, 6.0]), np.array([1.0, 2.0]))
-    np.testing.assert_array_equal(state, [[5, 5, 1, 1, 1], [6, 6, 2, 2, 2]])
 
 
 def test_the_fitted_unknowns_are_inverted_and_make_any_parameters_stable() -> None:

@@ -9,7 +9,6 @@ from fantwin.twin.errors import TwinError
 from fantwin.twin.evaluation.accuracy import evaluation_pieces, free_run_residuals, pooled_rmse_rad_s
 from fantwin.twin.fitting.narx_fit import free_run_sensitivities
 from fantwin.twin.fitting.narx_stability import forgets_its_start
-from fantwin.twin.fitting.narx_start import starting_weights
 from fantwin.twin.fitting.narx_training import train_narx
 from fantwin.twin.models.narx import ORDER, PARAMETER_COUNT, Narx
 from fantwin.twin.models.network import Scaling
@@ -37,29 +36,6 @@ def trained(run: Run, seed: int = 0, max_iterations: int = 25) -> Narx:
     return train_narx([run], [], SCALING, seed=seed, max_iterations=max_iterations)[0]
 
 
-def filter_start(time_constant: float, rng: np.random.Generator) -> tuple[Array, float]:
-    """Starting weights on the noisy response of a low-pass filter to stairs, and their time constant."""
-    command = fan_data.stairs(rng, 4000, 1, -1.0, 1.0)[:, 0]
-    clean = np.empty(4000)
-    clean[0], kept = command[0], np.exp(-1.0 / time_constant)
-    for k in range(3999):
-        clean[k + 1] = kept * clean[k] + (1.0 - kept) * (0.8 * command[k] + 0.1)
-    noisy = clean + rng.normal(scale=0.1, size=4000)
-    noisy[rng.random(4000) < 0.3] = np.nan
-    return starting_weights([command], [noisy], rng)
-
-
-def test_the_next_speed_is_the_layer_of_past_speeds_and_commands_newest_first() -> None:
-    model, rng = random_narx(), np.random.default_rng(2)
-    state, command = rng.uniform(0.0, 100.0, (2, 2 * ORDER)), rng.uniform(0.0, 100.0, (1, 2))
-    weights, bias, output, constant = model.physical_weights()
-    inputs = np.column_stack((state[:, :ORDER], command[0], state[:, ORDER:]))
-    expected = np.tanh(inputs @ weights + bias) @ output + constant
-    speed, following = advanced(model, state, command)
-    np.testing.assert_array_equal(speed[0], state[:, 0])
-    np.testing.assert_allclose(following[:, 0], expected, rtol=1e-12)
-
-
 def test_the_free_run_is_differentiated_exactly_by_every_weight() -> None:
     model = random_narx(0.3)
     command = fan_data.stairs(np.random.default_rng(4), 120, 1)
@@ -74,17 +50,6 @@ def test_the_free_run_is_differentiated_exactly_by_every_weight() -> None:
         move[index] = 1e-5
         slope = (run(model.theta + move) - run(model.theta - move)) / 2e-5
         np.testing.assert_allclose(by_theta[index], slope, rtol=1e-5, atol=1e-5)
-
-
-def test_the_start_finds_gain_offset_and_time_constant_through_noise_and_gaps() -> None:
-    theta, time_constant = filter_start(30.0, np.random.default_rng(3))
-    # The grid of time constants is spaced by a quarter.
-    assert 30.0 / 1.3 < time_constant < 30.0 * 1.3
-    model = Narx(theta, Scaling(0.0, 1.0, 0.0, 1.0, 1.0))
-    for level in (-0.5, 0.0, 0.7):
-        state = model.state_layout.initial_state(np.zeros(1), np.array([level]))
-        settled = advanced(model, state, np.full((600, 1), level))[0][-1, 0]
-        assert settled == pytest.approx(0.8 * level + 0.1, abs=0.15)
 
 
 def test_a_recursion_with_two_steady_states_is_not_trusted() -> None:

@@ -23,19 +23,13 @@ def known(**unknown: float) -> ModelUncertainty:
     return by_speed(SPEEDS_RAD_S, COMMANDS.tolist(), std.tolist(), 2.0)
 
 
-def test_a_command_that_was_never_held_comes_first() -> None:
+def test_a_command_that_was_never_held_comes_first_then_a_step_and_nothing_that_would_tell_little() -> None:
     found = least_known(known(speed=140.0, command=0.7, std=9.0), CURVE, None)
     assert found is not None
     assert (found.command, found.speed_rad_s, found.std_rad_s, found.held) == (COMMANDS[7], SPEEDS_RAD_S[7], 9.0, True)
-
-
-def test_where_all_commands_were_held_it_is_a_step() -> None:
     found = least_known(known(speed=160.0, command=0.2, std=9.0), CURVE, None)
     assert found is not None
     assert (found.command, found.speed_rad_s, found.held) == (COMMANDS[2], SPEEDS_RAD_S[8], False)
-
-
-def test_nothing_is_asked_for_that_would_tell_little() -> None:
     assert least_known(known(speed=140.0, command=0.7, std=2.9), CURVE, None) is None
     diverging = StaticCurve((), np.column_stack((COMMANDS, np.full(11, np.nan))))
     assert least_known(known(speed=140.0, command=0.7, std=9.0), diverging, None) is None

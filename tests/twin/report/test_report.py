@@ -54,7 +54,6 @@ FIGURES = (
 )
 """the functions that draw them"""
 RAD_S = SpeedUnit("rad/s", 1.0)
-CORNERS = {"speeds_rad_s": (0.0, 100.0), "commands": (0.0, 300.0)}
 SMALLEST_TEXT_UNITS = 8.5 * 0.88
 """Height of the smallest text of a figure in the units of its viewBox (points)."""
 
@@ -168,28 +167,19 @@ def with_speed(run: Run, speed_rad_s: np.ndarray) -> Run:
     return Run(run.name, run.t_s, run.command, speed_rad_s)
 
 
-def test_the_page_holds_every_section_and_every_figure(page):
+def test_the_page_holds_every_section_and_every_figure_and_needs_nothing_but_itself(page):
     parsed = Page(page)
     assert parsed.sections == SECTIONS
     assert [title for title in TITLES if title in parsed.text] == TITLES
     assert page.count("<svg ") == 2 * (len(TITLES) + 1)  # time is drawn twice: for wide screens and for phones
     for expected in ("physical twin of 2 fans", "held-out data", "95%", "sha256"):
         assert expected in parsed.text
-
-
-def test_the_page_needs_nothing_but_itself(page):
-    parsed = Page(page)
     assert not parsed.tags & {"script", "link", "iframe", "img", "object", "embed"}
     assert all(reference.startswith("#") for reference in parsed.references)
     assert not re.search(r"url\((?!#)|@import", page)
-
-
-def test_ids_are_unique_and_every_reference_has_its_target(page):
-    parsed = Page(page)
     assert len(parsed.ids) == len(set(parsed.ids))
     targets = {reference[1:] for reference in parsed.references} | set(re.findall(r"url\(#([^)]*)\)", page))
     assert targets <= set(parsed.ids)
-    assert set(parsed.numbers) > {"pooled", "row-0", "row-1"}
 
 
 def test_json_and_page_hold_the_figures_of_evaluate(reported, page, evaluated):
@@ -217,52 +207,42 @@ def test_a_fan_that_runs_slow_is_not_followed_and_the_page_says_by_how_much(twin
     assert "train it on them" in Page(report_page(content)).text
 
 
-def test_limitations_of_the_figures_are_reported_as_warnings(twin):
+def test_what_limits_the_figures_is_a_warning(twin):
     run = published_run(7, 20.0)
     trained_on = DataCard("healthy.mcap", twin.card.training.data[0].sha256, 1, run.samples)
-    assert "too optimistic" in assess(report_content(twin, [run], [trained_on], RAD_S)).warnings[0]
-    beyond = Run("beyond", run.t_s, run.command + 40.0, run.speed_rad_s)
-    assert any("outside the trained range" in line for line in assess(content_of(twin, beyond)).warnings)
-    speed = run.speed_rad_s.copy()
-    speed[::4] = np.nan
-    assert any("speeds are missing" in line for line in assess(content_of(twin, with_speed(run, speed))).warnings)
-
-
-def test_the_worst_fan_decides_and_is_named_and_speeds_of_another_unit_are_recognised(twin):
-    healthy = published_run(6, 20.0, fans=3)
-    judged = assess(content_of(twin, with_speed(healthy, healthy.speed_rad_s * np.array([1.0, 0.85, 1.0]))))
-    assert "does not follow fan 1: rmse" in judged.headline
-    assert "A twin of one fan is used for 3: fans differ, and so may their errors." in judged.warnings
-    run = published_run(5, 10.0)
-    (first, *_) = assess(content_of(twin, with_speed(run, run.speed_rad_s * 60.0 / (2.0 * np.pi)))).warnings
-    assert re.fullmatch(r"Speeds up to \d,\d{3} rad/s, the twin knows \d{3}: is the recording's unit right\?", first)
-
-
-def test_a_band_that_is_too_wide_and_figures_of_few_errors_are_reported(twin):
-    run = published_run(5, 30.0)
+    seldom, wrong_unit = run.speed_rad_s.copy(), run.speed_rad_s * 60.0 / (2.0 * np.pi)
+    seldom[::4] = np.nan
     content = content_of(twin, run)
-    wide = replace(content, fans=(replace(content.fans[0], sigma_rad_s=2.0 * content.fans[0].sigma_rad_s),))
-    (line,) = assess(wide).warnings
-    assert line.startswith("This fan: the card's sigma is over 1.5 times the standard deviation of the errors")
-    (line,) = assess(content_of(twin, run.between(0.0, 0.9))).warnings
-    assert re.search(r"\d+ independent errors determine the rmse to 1\d% only", line)
+    (fan,) = content.fans
+    lost = replace(fan.figures, rmse_rad_s=np.inf, max_error_rad_s=np.inf, r2=-np.inf)
     healthy = replace(twin.card.healthy, independent_samples=(8.0,))
     of_few: Any = SimpleNamespace(card=replace(twin.card, healthy=healthy), path=twin.path)
-    (line,) = assess(replace(content, twin=of_few)).warnings
-    assert "equivalent of 8 independent errors: its sigma may be off by 25%" in line
+    for judged, words in (
+        (report_content(twin, [run], [trained_on], RAD_S), "too optimistic"),
+        (content_of(twin, Run("beyond", run.t_s, run.command + 40.0, run.speed_rad_s)), "outside the trained range"),
+        (content_of(twin, with_speed(run, seldom)), "speeds are missing"),
+        (
+            content_of(twin, with_speed(run, wrong_unit)),
+            r"^Speeds up to \d,\d{3} rad/s, the twin knows \d{3}: is the re",
+        ),
+        (replace(content, fans=(replace(fan, sigma_rad_s=2.0 * fan.sigma_rad_s),)), "sigma is over 1.5 times the st"),
+        (content_of(twin, run.between(0.0, 0.9)), r"\d+ independent errors determine the rmse to 1\d% only"),
+        (replace(content, twin=of_few), "equivalent of 8 independent errors: its sigma may be off by 25%"),
+        (replace(content, fans=(replace(fan, figures=lost),)), "This fan: the free run diverges."),
+    ):
+        assert any(re.search(words, line) for line in assess(judged).warnings), words
 
 
-def test_a_free_run_that_diverges_is_reported_and_of_many_fans_the_worst_are_drawn(twin):
-    many = published_run(9, 4.0, fans=MOST_FANS_DRAWN + 3)
-    content = content_of(twin, with_speed(many, many.speed_rad_s * np.where(np.arange(many.fans) == 13, 0.7, 1.0)))
+def test_of_many_fans_the_worst_decides_and_is_named_and_the_worst_are_drawn(twin):
+    healthy = published_run(9, 10.0, fans=MOST_FANS_DRAWN + 3)
+    content = content_of(twin, with_speed(healthy, healthy.speed_rad_s * np.where(np.arange(15) == 13, 0.7, 1.0)))
+    judged = assess(content)
+    assert "does not follow fan 13: rmse" in judged.headline
+    assert "A twin of one fan is used for 15: fans differ, and so may their errors." in judged.warnings
     drawn = drawn_fans(content.fans)
     assert len(drawn) == MOST_FANS_DRAWN and 13 in [fan.number for fan in drawn]
     left_out = [fan.rmse_in_sigma for fan in content.fans if fan not in drawn]
     assert max(left_out) <= min(fan.rmse_in_sigma for fan in drawn)
-    lost = replace(content.fans[0].figures, rmse_rad_s=np.inf, max_error_rad_s=np.inf, r2=-np.inf)
-    judged = assess(replace(content, fans=(replace(content.fans[0], figures=lost),)))
-    assert judged.headline == "The twin does not follow this fan: rmse without limit."
-    assert "This fan: the free run diverges." in judged.warnings
 
 
 @given(spike=st.integers(0, 19_999), columns=st.integers(10, 500), missing=st.integers(0, 10_000))
@@ -278,7 +258,7 @@ def test_a_thinned_line_keeps_every_spike_and_breaks_where_nothing_was_measured(
     assert np.all(np.diff(kept) > 0)
 
 
-def test_gaps_stay_open_and_long_ones_are_shortened():
+def test_gaps_stay_open_long_ones_are_shortened_and_recordings_follow_one_another():
     run = published_run(1, 30.0)
     t_s = run.t_s + np.where(run.t_s > 10.0, 3600.0, 0.0) + np.where(run.t_s > 20.0, 0.5, 0.0)
     pieces = Run("night", t_s, run.command, run.speed_rad_s).split_at_gaps()
@@ -290,9 +270,6 @@ def test_gaps_stay_open_and_long_ones_are_shortened():
     assert not line.keeps_the_clock
     (drawn,) = broken_at(line.starts, np.arange(run.samples), run.speed_rad_s[:, 0])
     assert np.flatnonzero(np.isnan(drawn)).tolist() == [line.starts[1], line.starts[2] + 1]
-
-
-def test_recordings_follow_one_another_and_one_alone_keeps_its_clock():
     first, second = published_run(1, 10.0).rows(500, 1000), published_run(2, 10.0)
     both, alone = timeline([first, second]), timeline([first])
     assert [name for _, name in both.recordings] == ["published 1", "published 2"]
@@ -327,11 +304,7 @@ def test_recordings_summed_one_by_one_give_the_figures_of_all_their_samples(twin
     summary = summary_of(twin, first + second, extent, [], RAD_S)
     content = report_content(twin, runs, [], RAD_S)
     (fan,), (of_samples,) = summary.fans, content.fans
-    error = of_samples.error_rad_s[np.isfinite(of_samples.error_rad_s)]
-    speed = of_samples.measured_rad_s[np.isfinite(of_samples.error_rad_s)]
-    assert fan.figures.rmse_rad_s == pytest.approx(np.sqrt(np.mean(error**2)))
-    assert fan.figures.r2 == pytest.approx(1.0 - np.sum(error**2) / np.sum((speed - speed.mean()) ** 2))
-    assert fan.error_std_rad_s == pytest.approx(error.std())
+    assert fan.error_std_rad_s == pytest.approx(np.nanstd(of_samples.error_rad_s))
     assert astuple(fan.figures) == pytest.approx(astuple(of_samples.figures))
     assert fan.residual.ljung_box_p == pytest.approx(of_samples.residual.ljung_box_p)
     np.testing.assert_allclose(fan.residual.cross_correlation, of_samples.residual.cross_correlation, atol=1e-9)
@@ -346,11 +319,7 @@ def test_invalid_input_is_a_one_line_error(folder, tmp_path):
     (tmp_path / "text.onnx").write_text("text")
     assert "not an ONNX file" in error_of("report", tmp_path / "text.onnx", held_out)
     assert "cannot read the recording" in error_of("report", twin, tmp_path / "nowhere.mcap")
-    (tmp_path / "file").touch()
-    assert "cannot be created" in error_of("report", twin, held_out, "-o", tmp_path / "file" / "page.html")
     assert "name a file that ends in .html" in error_of("report", twin, held_out, "-o", tmp_path)
-    (tmp_path / "folder.html").mkdir()
-    assert "cannot be written" in error_of("report", twin, held_out, "-o", tmp_path / "folder.html")
 
 
 def test_in_a_browser_nothing_overflows_is_fetched_or_too_small_to_read(page_of_hybrid, tmp_path):
@@ -382,11 +351,3 @@ def test_what_the_twin_knows_is_drawn_where_its_card_says_it(twin, content_of_hy
     assert [title for title in TITLES_OF_HYBRID if title in page] == TITLES_OF_HYBRID
     assert page.count("<svg ") == len(TITLES_OF_HYBRID) + 1
     assert "What to record next: " in page or "more such data hardly reduce its error" in page
-    everywhere = replace(
-        known,
-        std_rad_s=(((0.1, 0.2), (0.1, 0.2)),),
-        seen_std_rad_s=(0.2,),
-        settled_speed_rad_s=((0.0, 0.0),),
-        **CORNERS,
-    )
-    assert figures.OUTSIDE not in figures.what_is_known(content, content.fans[0], everywhere), "no line where none is"
