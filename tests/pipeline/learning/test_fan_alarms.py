@@ -44,16 +44,13 @@ def test_an_alarm_lasts_through_samples_that_say_nothing(state: FanState) -> Non
     assert alarms.fans == []
 
 
-def test_the_last_row_that_says_something_decides_for_each_fan() -> None:
+def test_the_last_row_that_says_something_decides_and_alarms_that_end_in_the_same_score_are_seen() -> None:
     alarms = FanAlarms(3)
     seen = alarms.update(
         score([A, N, N], [N, A, FanState.UNKNOWN], [FanState.STOPPED, FanState.UNKNOWN, FanState.UNKNOWN])
     )
     assert alarms.fans == [1]
     assert seen.began_t_ns == [NS_PER_S], "that of fan 0 may have begun before the first score"
-
-
-def test_an_alarm_that_ends_in_the_same_score_is_seen() -> None:
     alarms = FanAlarms(1)
     seen = alarms.update(score([N], [A], [N], [A], [R], [N]))
     assert alarms.fans == []

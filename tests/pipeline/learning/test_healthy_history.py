@@ -83,34 +83,29 @@ def test_before_the_first_twin_all_is_kept_at_once(tmp_path: Path) -> None:
     assert read_metadata(healthy_recordings(tmp_path)[0].path).speed_unit("tray1") == "rpm"
 
 
-def test_what_came_shortly_before_an_alarm_and_after_it_is_never_kept(tmp_path: Path) -> None:
-    history = history_in(tmp_path)
-    watch(history, 0, 500)
-    watch(history, 500, 600, has_alarm=True)
-    watch(history, 600, 1200)
-    history.finish()
-    (before, after) = kept_s(tmp_path)
-    assert before == (10, 399), "100 s before the alarm are left out"
-    assert after[0] >= 690, "and 100 s after its end"
-    assert after[1] <= 1100
-
-
 def near_alarms_s(folder: Path) -> list[tuple[int, int]]:
     """First and last second of each recording of running near alarms."""
     spans = [each.span for each in recordings_near_alarms(folder)]
     return [(round(first / NS_PER_S) - START_S, round(last / NS_PER_S) - START_S) for first, last in spans]
 
 
-def test_samples_are_either_healthy_or_near_an_alarm(tmp_path: Path) -> None:
+@pytest.mark.parametrize("began_and_ended_in_one_score", [False, True])
+def test_what_came_shortly_before_an_alarm_and_after_it_is_never_healthy(
+    tmp_path: Path, began_and_ended_in_one_score: bool
+) -> None:
     history = history_in(tmp_path)
     watch(history, 0, 500)
-    watch(history, 500, 600, has_alarm=True)
+    if began_and_ended_in_one_score:
+        judge(history, 490, 500, had_alarm=True)
+    watch(history, 500, 600, has_alarm=not began_and_ended_in_one_score)
     watch(history, 600, 1200)
     ((first_s, last_s),) = near_alarms_s(tmp_path)
     history.finish()
     (before, after) = kept_s(tmp_path)
-    assert first_s == before[1] + 1
-    assert last_s == after[0] - 1
+    assert before == (10, 399), "100 s before the alarm are left out"
+    assert after[0] >= (600 if began_and_ended_in_one_score else 690), "and 100 s after its end"
+    assert after[1] <= 1100
+    assert (first_s, last_s) == (before[1] + 1, after[0] - 1)
     assert history.seconds_near_alarms_since(0) == last_s - first_s
     assert history.seconds == sum(last - first for first, last in (before, after))
 
@@ -134,18 +129,11 @@ def test_running_near_alarms_is_kept_for_some_time_and_begins_again_when_fans_ar
     assert 3 * hour_s < sum(last - first for first, last in kept) <= 4.5 * hour_s
 
 
-def test_a_short_recording_is_deleted_and_a_pause_begins_a_new_one(tmp_path: Path) -> None:
-    history = history_in(tmp_path, hold_back_s=0.0)
-    add(history, 0, 30)
-    add(history, 1000, 1300)
-    history.close()
-    assert kept_s(tmp_path) == [(1000, 1299)]
-
-
 def test_recordings_in_excluded_time_spans_are_left_out(tmp_path: Path) -> None:
     history = history_in(tmp_path, hold_back_s=0.0)
-    for first_s in (0, 1000, 2000):
+    for first_s in (0, 1000, 2000):  # a pause begins a new one
         add(history, first_s, first_s + 300)
+    add(history, 3000, 3030)  # too short to be kept
     history.close()
     faulty = ((START_S + 1299) * NS_PER_S, (START_S + 1500) * NS_PER_S)
     assert [each.span[0] for each in healthy_recordings(tmp_path, [faulty])] == [
@@ -158,19 +146,11 @@ def test_recordings_in_excluded_time_spans_are_left_out(tmp_path: Path) -> None:
     assert history.seconds == 598.0
 
 
-def test_the_oldest_are_deleted_but_for_the_first(tmp_path: Path) -> None:
-    history = history_in(tmp_path, hold_back_s=0.0, kept_s=650.0)
-    for first_s in range(0, 5000, 1000):
-        add(history, first_s, first_s + 300)
-    history.close()
-    assert [first for first, _ in kept_s(tmp_path)] == [0, 3000, 4000]
-
-
 @pytest.mark.parametrize(
     ("excluded_s", "kept"),
-    [((1900, 4900), [0, 1000, 3000, 4000, 5000]), ((0, 3900), [0, 2000, 3000, 4000, 5000])],
+    [((9000, 9900), [0, 4000, 5000]), ((1900, 4900), [0, 1000, 3000, 4000, 5000])],
 )
-def test_excluded_recordings_take_no_place_of_others_and_of_them_as_much_is_kept(
+def test_the_oldest_are_deleted_but_for_the_first_and_excluded_ones_take_no_place_of_others(
     tmp_path: Path, excluded_s: tuple[int, int], kept: list[int]
 ) -> None:
     history = history_in(tmp_path, hold_back_s=0.0, kept_s=650.0)
@@ -180,20 +160,6 @@ def test_excluded_recordings_take_no_place_of_others_and_of_them_as_much_is_kept
         add(history, second, second + 300)
     history.close()
     assert [first for first, _ in kept_s(tmp_path)] == kept
-
-
-def test_what_a_killed_process_left_is_repaired(tmp_path: Path) -> None:
-    killed = history_in(tmp_path, hold_back_s=0.0)
-    add(killed, 0, 300)
-    killed.flush()
-    active = next((tmp_path / "healthy").glob("*.active"))
-    content = active.read_bytes()
-    killed.close()
-    healthy_recordings(tmp_path)[0].path.unlink()
-    active.write_bytes(content)
-    next_one = history_in(tmp_path)
-    assert next_one.problem == ""
-    assert kept_s(tmp_path) == [(0, 299)]
 
 
 def test_samples_that_nobody_judged_are_never_kept(tmp_path: Path) -> None:
@@ -208,17 +174,6 @@ def test_samples_that_nobody_judged_are_never_kept(tmp_path: Path) -> None:
     assert before == (10, 399), "only what was judged for as long as samples are held back"
     assert after[0] >= 1000, "what nobody judged is not kept later either"
     assert after[1] <= 1400
-
-
-def test_an_alarm_that_began_and_ended_in_one_score_discards_what_is_held(tmp_path: Path) -> None:
-    history = history_in(tmp_path)
-    watch(history, 0, 500)
-    judge(history, 490, 500, had_alarm=True)
-    watch(history, 500, 1000)
-    history.finish()
-    (before, after) = kept_s(tmp_path)
-    assert before == (10, 399)
-    assert after[0] >= 590
 
 
 @pytest.mark.parametrize("had_alarm", [False, True])
@@ -281,26 +236,7 @@ def test_what_a_full_disk_has_is_kept_and_said_until_samples_are_on_the_disk_aga
     assert history.problem == ""
 
 
-def test_what_could_not_be_kept_near_an_alarm_is_said_until_healthy_running_is_kept(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "near_alarms").mkdir()
-    (tmp_path / "near_alarms" / OPEN_NAME).write_bytes(b"no recording")
-    history = history_in(tmp_path)
-    assert "cannot be repaired" in history.problem
-    watch(history, 0, 500)
-    with monkeypatch.context() as full:
-        refuse_writes(full)
-        watch(history, 500, 600, has_alarm=True)
-        watch(history, 600, 750)
-        history.flush()
-    assert "samples are not kept for learning" in history.problem
-    watch(history, 750, 3000)
-    history.finish()
-    assert history.problem == ""
-
-
-def test_recordings_that_were_finished_and_not_named_get_their_names_at_start(tmp_path: Path) -> None:
+def test_what_a_killed_process_left_is_repaired_and_named_at_the_next_start(tmp_path: Path) -> None:
     first = history_in(tmp_path, hold_back_s=0.0)
     add(first, 0, 300)
     add(first, 1000, 1300)
@@ -328,16 +264,6 @@ def test_where_an_excluded_time_span_ends_a_new_recording_begins(tmp_path: Path)
     assert history.seconds == 309.0, "the open recording does not count either, and the first one does again"
     history.finish()
     assert kept_s(tmp_path) == [(0, 309), (310, 599)]
-
-
-def test_rows_of_one_score_may_have_a_pause_between_them(tmp_path: Path) -> None:
-    history = history_in(tmp_path)
-    for second in range(0, 1000, 10):
-        history.add(raw(second), has_alarm=False, is_watched=True)
-    rows_s = np.concatenate((np.arange(300), np.arange(400, 1000)))
-    history.judged((START_S + rows_s) * NS_PER_S, had_alarm=False)
-    history.finish()
-    assert kept_s(tmp_path) == [(410, 899)]
 
 
 def test_what_was_not_judged_for_long_is_given_up_so_that_memory_stays_bounded(tmp_path: Path) -> None:
