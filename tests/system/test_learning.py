@@ -33,7 +33,7 @@ def configuration(tmp_path: Path, endpoint: str) -> Path:
         encoding="utf-8",
     )
     folder = learning_folder(tmp_path / "runs", "tray1")
-    add_recording(folder, -100_000_000, 320.0, 1)
+    add_recording(folder, -100_000_000, 220.0, 1)
     return path
 
 
