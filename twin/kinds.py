@@ -25,7 +25,7 @@ class ModelKind:
     name: on the command line. title: for people. fit: from data to a model. predicts: the speed, which the tacho then
     measures, or the readings themselves. knows_drives: it can be put behind a drive (twin.models.drive).
     has_ode_network: it has a network that adam can train, too, and that can be the mean of several trainings
-    (twin.fitting.mean_model).
+    (twin.fitting.mean_of_networks).
     """
 
     name: str

@@ -13,8 +13,8 @@ from fantwin.twin.export.onnx_twin import OnnxTwin
 from fantwin.twin.export.stored_model import stored_hybrid
 from fantwin.twin.finishing import TrainedTwin, finish_twin
 from fantwin.twin.fitting.drive_fit import FoundDrive
+from fantwin.twin.fitting.fans_of_a_type import place_fans
 from fantwin.twin.fitting.placed_uncertainty import placed_uncertainty
-from fantwin.twin.fitting.placement import place_fans
 from fantwin.twin.fitting.standstill import find_standstill
 from fantwin.twin.models.hybrid import Hybrid
 from fantwin.twin.models.physics import PARAMETER_NAMES
@@ -37,7 +37,7 @@ def place_twin(
 ) -> TrainedTwin:
     """A twin of the fans of healthy runs. type_twin: file of a hybrid of other fans of the same type.
 
-    Its network and drive are those of the type; each fan gets physics of its own (twin.fitting.placement). The other
+    Its network and drive are those of the type; each fan gets physics of its own (twin.fitting.fans_of_a_type). The other
     arguments are those of build.train_twin.
     Raises TwinError when the twin is no hybrid, the tachos differ, or a fan has hardly any readings.
     """

@@ -25,7 +25,7 @@ from fantwin.simulation.plant import FanParameters, tray_of_fans
 from fantwin.twin.build import evaluate, train_twin
 from fantwin.twin.evaluation.accuracy import Evaluation, sums_of_model
 from fantwin.twin.finishing import TrainedTwin
-from fantwin.twin.fitting.placement import TypeOfFans
+from fantwin.twin.fitting.fans_of_a_type import TypeOfFans
 from fantwin.twin.models.physical import physical_parameters
 from fantwin.twin.placing import place_twin
 from fantwin.twin.runs import Run

@@ -18,9 +18,9 @@ from fantwin.pipeline.config.registry import LEARNER, RECORDER, STAGES
 from fantwin.pipeline.config.roles import role_names, roles_of
 from fantwin.pipeline.config.shards import StageProcess, own_file, process_list
 from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.launch.hang_detector import HangDetector
 from fantwin.pipeline.launch.processes import EXIT_CANNOT_START, Child
 from fantwin.pipeline.launch.site_report import RunningProcess, SiteReport
-from fantwin.pipeline.launch.watchdog import Watchdog
 from fantwin.pipeline.prediction.tray_twin import load_tray_twin, twin_path
 from fantwin.pipeline.recordings.parts import part_files, part_path
 from fantwin.pipeline.runtime.stage import load_stage
@@ -121,7 +121,7 @@ class Launcher:
         if not rows:
             raise UserError(f"{config.path}: no process has tray {', '.join(trays or ())} first: see launcher.shards")
         self._slots = [_Slot(row) for row in rows]
-        self._watchdog = Watchdog(config.launcher.watchdog_s)
+        self._hang_detector = HangDetector(config.launcher.watchdog_s)
         self._is_started = False
         """all stages have been started and waited for"""
         self.outcome = Outcome(run_folder=str(config.run_folder))
@@ -259,7 +259,7 @@ class Launcher:
         slot.was_seen = False
         slot.sessions.append((slot.row.label, slot.child.process_id))
         self._watcher.add_launched(slot.sessions[-1])
-        self._watchdog.started(slot.row.label, time.monotonic())
+        self._hang_detector.started(slot.row.label, time.monotonic())
         self._say(f"{slot.row.label}: started, process {slot.child.process_id}")
 
     def _start_again(self, slot: _Slot, now: float) -> None:
@@ -288,7 +288,7 @@ class Launcher:
                 slot.was_seen = slot.was_seen or self._watcher.is_ready(slot.child.process_id)
                 slot.was_ready = slot.was_ready or slot.was_seen
                 if slot.child.notices.read():
-                    self._watchdog.heard(slot.row.label, now, is_ready=slot.child.notices.is_ready)
+                    self._hang_detector.heard(slot.row.label, now, is_ready=slot.child.notices.is_ready)
                 continue
             if status == EXIT_CANNOT_START and not slot.was_ready:
                 slot.child.stop(0.1)
@@ -298,7 +298,7 @@ class Launcher:
         self._kill_what_hangs(now)
 
     def _kill_what_hangs(self, now: float) -> None:
-        hung = self._watchdog.hung(now)
+        hung = self._hang_detector.hung(now)
         for slot in self._slots:
             if hung and slot.child and slot.row.label == hung[0]:
                 status = slot.child.notices.status
@@ -309,7 +309,7 @@ class Launcher:
     def _report_changes(self) -> None:
         now = time.monotonic()
         processes = {
-            slot.row.label: RunningProcess(slot.child.process_id, self._watchdog.is_at_work(slot.row.label, now))
+            slot.row.label: RunningProcess(slot.child.process_id, self._hang_detector.is_at_work(slot.row.label, now))
             for slot in self._slots
             if slot.child and slot.was_seen
         }
@@ -326,7 +326,7 @@ class Launcher:
             how = f"cannot start: {slot.child.last_line}"
         self._say(f"{slot.row.label}: {slot.hung or how}, restarting in {slot.delay_s:.1f} s")
         slot.hung = ""
-        self._watchdog.ended(slot.row.label)
+        self._hang_detector.ended(slot.row.label)
         slot.child.notices.close()
         self.outcome.restarts[slot.row.label] = self.outcome.restarts.get(slot.row.label, 0) + 1
         slot.child = None

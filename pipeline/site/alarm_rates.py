@@ -15,7 +15,7 @@ from fantwin.pipeline.site.judged_time import JudgedStretch
 from fantwin.schemas.enums import Feedback, Transition
 from fantwin.schemas.messages import Alarm
 from fantwin.schemas.units import NS_PER_S
-from fantwin.scoring.alarms.fan_condition import GIVES_FEEDBACK
+from fantwin.scoring.alarms.alarm_state import GIVES_FEEDBACK
 from fantwin.scoring.calibration.observed_rate import ObservedRate
 
 MOST_KEPT = 200_000

@@ -10,7 +10,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validat
 from fantwin.pipeline.site.one_line import one_line
 from fantwin.schemas.enums import Action
 from fantwin.schemas.messages import Request
-from fantwin.scoring.alarms.fan_condition import GIVES_FEEDBACK
+from fantwin.scoring.alarms.alarm_state import GIVES_FEEDBACK
 
 LONGEST_SHELVING_S = 30 * 86400.0
 LONGEST_COMMENT = 500

@@ -19,8 +19,8 @@ from fantwin.schemas.enums import Severity, Statistic
 from fantwin.schemas.messages import Alarm, Array, Diagnosis, Prediction, Score
 from fantwin.schemas.units import NS_PER_S
 from fantwin.scoring.alarms.alarm_manager import AlarmManager, Measured
+from fantwin.scoring.alarms.alarm_state import ConditionSettings
 from fantwin.scoring.alarms.alarm_text import AlarmText
-from fantwin.scoring.alarms.fan_condition import ConditionSettings
 from fantwin.scoring.alarms.tray_conditions import Decided
 from fantwin.scoring.diagnosis.causes import CANNOT_TELL, CAUSES, SENSOR_DROPOUT, SLOW_CHANGE, is_of_standstill
 from fantwin.scoring.diagnosis.ranked_causes import CauseWords, PossibleCause

@@ -6,7 +6,7 @@ This is the only definition. The scorer's `AlarmState` and the `Alarm` message c
 from __future__ import annotations
 
 from fantwin.schemas.messages import Alarm
-from fantwin.scoring.alarms.fan_condition import AlarmState
+from fantwin.scoring.alarms.alarm_state import AlarmState
 
 
 def is_retained(alarm: Alarm | AlarmState) -> bool:

@@ -13,8 +13,8 @@ from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Alarm, Array, Diagnosis, Request
 from fantwin.schemas.units import NS_PER_S
 from fantwin.scoring.alarms.alarm_flags import is_listed
+from fantwin.scoring.alarms.alarm_state import AlarmState, ConditionSettings
 from fantwin.scoring.alarms.alarm_text import AlarmText
-from fantwin.scoring.alarms.fan_condition import AlarmState, ConditionSettings
 from fantwin.scoring.alarms.tray_conditions import Decided, TrayConditions
 from fantwin.scoring.diagnosis.causes import is_of_standstill
 from fantwin.scoring.diagnosis.ranked_causes import says_more

@@ -22,7 +22,7 @@ from fantwin.schemas.fields import columns
 from fantwin.schemas.messages import Alarm, Prediction, Score, ScorerSnapshot
 from fantwin.schemas.standstill import Standstill
 from fantwin.schemas.tacho import Tacho
-from fantwin.scoring.alarms.fan_condition import ConditionSettings
+from fantwin.scoring.alarms.alarm_state import ConditionSettings
 from fantwin.scoring.alarms.tray_conditions import Decided, TrayConditions
 from fantwin.scoring.model.saved import as_json, from_json
 from fantwin.scoring.standing.against_command import AgainstCommand

@@ -10,7 +10,7 @@ import pytest
 
 from fantwin.schemas.enums import Action, FanState, Transition
 from fantwin.schemas.messages import Alarm, Request
-from fantwin.scoring.alarms.fan_condition import UNTIL_IT_CLEARS_T_NS
+from fantwin.scoring.alarms.alarm_state import UNTIL_IT_CLEARS_T_NS
 from tests.stages.test_gateway import NOW_NS, alarm, score
 from tests.support.node_opcua import PACKAGE, VERSION, WHAT, NodeOpcua
 from tests.support.node_packages import node_modules

@@ -11,7 +11,7 @@ iterations instead of thousands, because the model is small enough for second-or
 The readings of many fans are thinned for all this (twin.fitting.thinning), and the last iterations use all of them.
 
 Where several networks are asked for, as many of the best starts go on, each by itself, and the model is the mean of
-those that end about as well as the best (twin.fitting.mean_model): then hardly anything depends on the seed.
+those that end about as well as the best (twin.fitting.mean_of_networks): then hardly anything depends on the seed.
 
 Every iterate is evaluated as it would be used: by its free run from the measured start, over the held-out runs, or over
 the training runs where none are given. The best one is kept. The untrained network (all weights zero: for a hybrid, its
@@ -31,7 +31,7 @@ from fantwin.twin.fitting.free_run_fit import FreeRunFit, fit_free_run
 from fantwin.twin.fitting.free_run_problem import NONE_FREE, FreeRunProblem, NetworkPrior, Point, Prior, Unknowns
 from fantwin.twin.fitting.identification import Identification, inertia_anchor
 from fantwin.twin.fitting.initial_weights import PLACEMENTS, initial_weights
-from fantwin.twin.fitting.mean_model import mean_model
+from fantwin.twin.fitting.mean_of_networks import mean_model
 from fantwin.twin.fitting.reading_errors import counts, robust_scale
 from fantwin.twin.fitting.thinning import thinning_factor, windows_of
 from fantwin.twin.fitting.trajectories import MAX_SAMPLES, cut_into_trajectories, practical_samples, stretch_samples

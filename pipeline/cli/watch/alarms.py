@@ -30,8 +30,8 @@ from fantwin.pipeline.site.site_watcher import SiteWatcher
 from fantwin.schemas.enums import Action, Transition
 from fantwin.schemas.messages import Alarm, Request
 from fantwin.schemas.units import NS_PER_S
+from fantwin.scoring.alarms.alarm_state import GIVES_FEEDBACK
 from fantwin.scoring.alarms.current_alarms import current_alarm, until
-from fantwin.scoring.alarms.fan_condition import GIVES_FEEDBACK
 
 _SECONDS = {"s": 1, "m": 60, "h": 3600, "d": 86400}
 

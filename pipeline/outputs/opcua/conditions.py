@@ -25,8 +25,8 @@ from fantwin.pipeline.site.request_form import LONGEST_SHELVING_S
 from fantwin.schemas.enums import Severity, Transition
 from fantwin.schemas.messages import Alarm
 from fantwin.scoring.alarms.alarm_flags import is_retained, is_silenced
+from fantwin.scoring.alarms.alarm_state import UNTIL_IT_CLEARS_T_NS
 from fantwin.scoring.alarms.current_alarms import CurrentAlarm
-from fantwin.scoring.alarms.fan_condition import UNTIL_IT_CLEARS_T_NS
 from fantwin.scoring.diagnosis.causes import CANNOT_TELL, likely_causes, likely_evidence
 
 SEVERITIES = {Severity.NONE: 1, Severity.WARNING: 500, Severity.ALARM: 900}

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 from fantwin.schemas.enums import Action, Severity, Transition
 from fantwin.schemas.messages import Alarm
-from fantwin.scoring.alarms.fan_condition import UNTIL_IT_CLEARS_T_NS
+from fantwin.scoring.alarms.alarm_state import UNTIL_IT_CLEARS_T_NS
 
 GOOD = "Good"
 

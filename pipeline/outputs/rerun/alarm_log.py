@@ -10,8 +10,8 @@ from fantwin.pipeline.recordings.dates import has_date
 from fantwin.schemas.enums import Severity, Statistic, Transition
 from fantwin.schemas.messages import Alarm
 from fantwin.schemas.units import NS_PER_S
+from fantwin.scoring.alarms.alarm_state import UNTIL_IT_CLEARS_T_NS
 from fantwin.scoring.alarms.alarm_text import TRANSITIONS
-from fantwin.scoring.alarms.fan_condition import UNTIL_IT_CLEARS_T_NS
 from fantwin.scoring.diagnosis.causes import CANNOT_TELL, with_share
 
 LINE_LENGTH = 64

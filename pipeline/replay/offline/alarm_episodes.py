@@ -8,7 +8,7 @@ from typing import Any
 
 from fantwin.schemas.enums import Feedback
 from fantwin.schemas.messages import Alarm, Diagnosis
-from fantwin.scoring.alarms.fan_condition import GIVES_FEEDBACK
+from fantwin.scoring.alarms.alarm_state import GIVES_FEEDBACK
 
 _GIVES = dict(GIVES_FEEDBACK.values())
 _Name = tuple[str, int, int]

@@ -23,8 +23,8 @@ from fantwin.schemas.enums import InvalidReason, Severity, StageStatus, Transiti
 from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Alarm, Diagnosis, Message, Request
 from fantwin.schemas.topics import BY_NAME, tray_key
+from fantwin.scoring.alarms.alarm_state import AlarmState, ConditionSettings
 from fantwin.scoring.alarms.current_alarms import clock
-from fantwin.scoring.alarms.fan_condition import AlarmState, ConditionSettings
 from fantwin.scoring.alarms.tray_conditions import Decided, TrayConditions
 from tests.support.fantwin_command import error_of, fantwin
 from tests.support.running_chain import DEMO, FANTWIN, SITE, TRAY, eventually

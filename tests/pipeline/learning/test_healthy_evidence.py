@@ -16,7 +16,7 @@ from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Alarm
 from fantwin.schemas.topics import tray_key
 from fantwin.schemas.units import NS_PER_S
-from fantwin.scoring.alarms.fan_condition import GIVES_FEEDBACK
+from fantwin.scoring.alarms.alarm_state import GIVES_FEEDBACK
 from tests.support.healthy_site import FAULT_S, start_ns
 
 FAULTY_NS = start_ns(5)

@@ -21,7 +21,7 @@ from fantwin.schemas.fields import columns
 from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Alarm, Grid, ModelCard
 from fantwin.schemas.topics import tray_key
-from fantwin.scoring.alarms.fan_condition import UNTIL_IT_CLEARS_T_NS
+from fantwin.scoring.alarms.alarm_state import UNTIL_IT_CLEARS_T_NS
 from tests.support import made_messages
 from tests.support.replay_data import START_NS, STEP_NS, raw_of, write_raw
 

@@ -7,7 +7,7 @@ import pytest
 from fantwin.schemas.enums import Severity
 from fantwin.schemas.messages import Alarm
 from fantwin.scoring.alarms.alarm_flags import is_listed, is_presented, is_retained, is_silenced
-from fantwin.scoring.alarms.fan_condition import UNTIL_IT_CLEARS_T_NS, AlarmState
+from fantwin.scoring.alarms.alarm_state import UNTIL_IT_CLEARS_T_NS, AlarmState
 
 ACTIVE = {"active": True, "acknowledged": False, "confirmed": True}
 OVER = {"active": False, "acknowledged": True, "confirmed": True}

@@ -9,8 +9,8 @@ from typing import Any
 from fantwin.schemas.enums import Severity, Transition
 from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Alarm, Diagnosis
+from fantwin.scoring.alarms.alarm_state import UNTIL_IT_CLEARS_T_NS
 from fantwin.scoring.alarms.current_alarms import CurrentAlarm, current_alarm
-from fantwin.scoring.alarms.fan_condition import UNTIL_IT_CLEARS_T_NS
 
 _numbers = itertools.count()
 

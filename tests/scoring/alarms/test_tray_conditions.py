@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from fantwin.schemas.enums import Action, Severity, Transition
 from fantwin.schemas.units import NS_PER_S
 from fantwin.scoring.alarms.alarm_flags import is_retained, is_silenced
-from fantwin.scoring.alarms.fan_condition import UNTIL_IT_CLEARS_T_NS, ConditionSettings
+from fantwin.scoring.alarms.alarm_state import UNTIL_IT_CLEARS_T_NS, ConditionSettings
 from fantwin.scoring.alarms.tray_conditions import AlarmEvent, Decided, TrayConditions
 
 STEP_NS = 10

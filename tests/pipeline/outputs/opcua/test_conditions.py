@@ -16,8 +16,8 @@ from fantwin.pipeline.outputs.opcua.events import condition_event, system_event
 from fantwin.pipeline.site.fleet import Fan
 from fantwin.schemas.enums import Severity, Transition
 from fantwin.schemas.messages import Alarm
+from fantwin.scoring.alarms.alarm_state import UNTIL_IT_CLEARS_T_NS
 from fantwin.scoring.alarms.current_alarms import current_alarm
-from fantwin.scoring.alarms.fan_condition import UNTIL_IT_CLEARS_T_NS
 from tests.stages.test_gateway import NOW_NS, TRAY, alarm
 
 

@@ -7,7 +7,7 @@ import pytest
 from fantwin.pipeline.outputs.opcua.requests import FAN_METHODS, METHODS, SHELVING_METHODS, status_of
 from fantwin.schemas.enums import Action, Severity, Transition
 from fantwin.schemas.messages import Alarm
-from fantwin.scoring.alarms.fan_condition import GIVES_FEEDBACK, ConditionSettings, FanCondition
+from fantwin.scoring.alarms.alarm_state import GIVES_FEEDBACK, ConditionSettings, FanCondition
 from tests.stages.test_gateway import alarm
 
 NOW_NS = 1_790_000_000_000_000_000

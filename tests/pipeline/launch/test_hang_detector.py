@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from fantwin.pipeline.launch.hang_detector import HangDetector
 from fantwin.pipeline.launch.notices import Notices
-from fantwin.pipeline.launch.watchdog import Watchdog
 from fantwin.pipeline.runtime.service_manager import Notifier, starting
 from fantwin.pipeline.site.site_state import START_LIMIT_S
 from tests.support.running_chain import eventually
@@ -17,7 +17,7 @@ class Site:
     """A watchdog that is asked every tenth of a second about stages that are at work until they hang."""
 
     def __init__(self, *names: str) -> None:
-        self.watchdog = Watchdog(LIMIT_S)
+        self.watchdog = HangDetector(LIMIT_S)
         self.now_s = 0.0
         self.hangs: set[str] = set()
         self.names = names
@@ -51,7 +51,7 @@ def test_row_01_a_stage_that_hangs_is_named_when_its_time_is_over_and_those_that
 
 
 def test_row_01_the_longest_silent_of_several_is_named_and_the_others_have_a_new_period():
-    watchdog = Watchdog(LIMIT_S)
+    watchdog = HangDetector(LIMIT_S)
     for name, at_s in (("resampler", 0.4), ("scorer", 0.0), ("acquisition", 0.2)):
         watchdog.heard(name, at_s, is_ready=True)
     found = [hung[0] if (hung := watchdog.hung(0.75 * step)) else "" for step in range(28)]
@@ -67,7 +67,7 @@ def test_row_01_when_the_launcher_itself_did_not_run_no_stage_is_blamed():
 
 
 def test_a_stage_that_starts_is_given_longer():
-    watchdog = Watchdog(LIMIT_S)
+    watchdog = HangDetector(LIMIT_S)
     watchdog.started("scorer", 0.0)
     watchdog.heard("scorer", 1.0, is_ready=False)
     seconds = [second for second in range(200) if watchdog.hung(float(second))]

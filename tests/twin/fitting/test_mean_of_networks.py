@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fantwin.twin.fitting.mean_model import mean_model
+from fantwin.twin.fitting.mean_of_networks import mean_model
 from fantwin.twin.models.fan_ode import NetworkOde
 from fantwin.twin.models.hybrid import Hybrid
 from fantwin.twin.models.network import Scaling, TanhNetwork

@@ -20,7 +20,7 @@ class _Heard:
     is_ready: bool = False
 
 
-class Watchdog:
+class HangDetector:
     """When each stage was last at work. Times are those of a monotonic clock, in seconds."""
 
     def __init__(self, limit_s: float) -> None:
