@@ -37,8 +37,8 @@ def place_twin(
 ) -> TrainedTwin:
     """A twin of the fans of healthy runs. type_twin: file of a hybrid of other fans of the same type.
 
-    Its network and drive are those of the type; each fan gets physics of its own (twin.fitting.fans_of_a_type). The other
-    arguments are those of build.train_twin.
+    Its network and drive are those of the type; each fan gets physics of its own (twin.fitting.fans_of_a_type). The
+    other arguments are those of build.train_twin.
     Raises TwinError when the twin is no hybrid, the tachos differ, or a fan has hardly any readings.
     """
     card = OnnxTwin(type_twin).card
