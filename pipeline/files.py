@@ -51,7 +51,7 @@ def replace_file(path: Path, content: bytes, mode: int | None = None) -> None:
 
 
 def write_whole(path: Path, content: bytes, advice: str = "; name another file with -o") -> None:
-    """Put a whole file in its place.
+    """Write a file as a whole: no reader finds a part of it.
 
     Raises:
         UserError: it cannot be written.

@@ -170,9 +170,9 @@ def by_rows(rows: int, fans: int) -> bool:
 
 
 def filter_rows(keep: float, rows: Array, state: Array) -> Array:
-    """y[k] = (1 - keep) x[k] + keep y[k-1] along the first axis, sample by sample, so that cuts change nothing.
+    """Filter along the first axis, y[k] = (1 - keep) x[k] + keep y[k-1], by samples, so that cuts change nothing.
 
-    It is a lower bidiagonal system of equations: `scipy.signal` has a filter, and takes two seconds to import.
+    Solved as a lower bidiagonal system of equations, because `scipy.signal` takes two seconds to import.
 
     rows: (n, m). state: (1, m), keep times the y before the first. Returns y (n, m).
     """

@@ -91,8 +91,8 @@ class TwinIntegratorCore(Core):
         grid = self._samples.take(item)
         if grid is None:
             return Admitted(messages)
-        # each session of the resampler derives times from the clock of the device again: by tens of milliseconds they
-        # may differ, as if the speed had jumped
+        # each session of the resampler maps the clock of the device anew: its times may differ by tens of
+        # milliseconds, as if the speed had jumped
         is_of_another_session = self._producer not in (None, grid.header.producer)
         self.tray.begin(grid.period_ns, is_of_another_session=is_of_another_session)
         self._producer = grid.header.producer

@@ -64,7 +64,7 @@ def train_twin(
     validation_runs: held out of the fit; they choose the best weights and give the healthy sigmas and the card's
     figures. If empty, the training runs are used instead, and the card says so. networks: how many are trained and
     averaged, 1 to MOST_NETWORKS. trainer "adam" trains one, keeps the physics as identified, and keeps the weights with
-    the smallest training error. each_network: who trains them.
+    the smallest training error. each_network: runs their trainings.
     fan_numbers (what the recordings call the runs' fans; default: counted from 0), command_unit, data and
     validation_data (the files that the runs are from) and created (default: now) go into the card. The same seed and
     runs give the same model.
@@ -210,7 +210,7 @@ def _as_if_instantaneous(runs: Sequence[Run]) -> list[Run]:
 
 
 def _require_possible(kind: ModelKind, trainer: str, networks: int) -> None:
-    """Raises TwinError where such networks of the kind cannot be trained so."""
+    """Raise TwinError where the trainer cannot train the kind, or so many networks of it."""
     if trainer not in get_args(Trainer):
         raise TwinError(f"trainer {trainer!r} is unknown; use one of {', '.join(get_args(Trainer))}")
     if trainer == "adam" and not kind.has_ode_network:

@@ -24,7 +24,7 @@ sigma. training: fitted, so too optimistic."""
 
 @dataclass(frozen=True, eq=False)
 class Contender:
-    """A kind of model once trained. twin is None where it could not be, and invalid_reason says why, in a line.
+    """A kind of model and its twin. twin is None if it could not be trained: invalid_reason says why, in one line.
 
     training_rmse_rad_s: free run over the training runs. held_out, test: None without such runs.
     """

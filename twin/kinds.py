@@ -1,7 +1,7 @@
 """The kinds of model, one row each. `fantwin train` and `report` know the kinds from here alone.
 
 To add a kind: a file in twin.models with a class that offers what twin.models.model.Model asks for, and a row here
-with the function that fits it. Cards have the kind of the class.
+with the function that fits it. A card holds the `kind` of that class.
 """
 
 from collections.abc import Callable
@@ -24,7 +24,7 @@ class ModelKind:
 
     name: on the command line. title: for people. fit: from data to a model. predicts: the speed, which the tacho then
     measures, or the readings themselves. knows_drives: it can be put behind a drive (twin.models.drive).
-    has_ode_network: it has a network that adam can train, too, and that can be the mean of several trainings
+    has_ode_network: it has a network that adam can train as well, and that can be the mean of several trained ones
     (twin.fitting.mean_of_networks).
     """
 

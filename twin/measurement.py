@@ -64,7 +64,7 @@ class Measurement:
         return np.hypot(of_age, np.array(graded))
 
     def slope(self, signal: Array) -> Array:
-        """(n, batch) change of a signal in a second, the mean of before and after each sample; 0 over padding."""
+        """Slope of a signal (n, batch), per second: the mean of those before and after each sample; 0 over padding."""
         step_s = np.diff(self.t_s, axis=0)
         with np.errstate(invalid="ignore", over="ignore"):
             rise = np.diff(signal, axis=0)

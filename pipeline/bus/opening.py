@@ -69,7 +69,7 @@ def answers(config: BusConfig, credentials: Credentials | None, stop: threading.
             return True
         except zenoh.ZError as error:
             if (stop is not None and stop.is_set()) or not accepts_connections(config.endpoint):
-                return False  # whoever listened has ended meanwhile
+                return False  # the listener has ended meanwhile
             if time.monotonic() > until_s:
                 raise BusError(foreign_program(config.endpoint, is_secure=credentials is not None)) from error
 

@@ -21,7 +21,7 @@ class _Heard:
 
 
 class HangDetector:
-    """When each stage was last at work. Times are those of a monotonic clock, in seconds."""
+    """Notes when each stage was last at work, and names the one that hangs. Times: monotonic clock, s."""
 
     def __init__(self, limit_s: float) -> None:
         """limit_s: how long a stage may be silent."""

@@ -19,8 +19,8 @@ from fantwin.pipeline.replay.offline.kept_bins import KeptBins
 from fantwin.scoring.calibration.calibration import Calibration
 
 MOST_KEPT_BYTES = 1 << 30
-"""room for bins on the disk between passes, the same for each recording; a bin takes about 120 for a fan and 30 for a
-sample of it"""
+"""room on the disk for bins between passes, shared evenly by the recordings; a bin takes about 120 bytes a fan, and 30
+for each sample in it"""
 
 
 def calibrated_on(
@@ -33,11 +33,11 @@ def calibrated_on(
     alarms_left_out: int,
     progress: Callable[[str], None] = lambda _: None,
 ) -> CalibratedTwin:
-    """Calibrate a twin. part: the twin, and what counts of each recording. per_day: false alarms of a fan to declare.
+    """Calibrate a twin. part: the twin, and what counts of each recording. per_day: false alarms of a fan a day.
     each: does the work on each recording. extrapolate, alarms_left_out: as of `calibrated`.
 
     Raises:
-        UserError: the twin or a recording cannot be used, or there is too little of them.
+        UserError: the twin or a recording cannot be used, or the recordings are too short.
     """
     if load_tray_twin(part.twin).card.top_speed_rad_s <= 0.0:
         raise UserError(f"{part.twin}: its training data have no speed above zero (speed_range_rad_s): train it again")
@@ -61,7 +61,7 @@ def with_calibration(twin: Path, calibration: Calibration) -> bytes:
     """The file of a twin with a calibration in its card.
 
     Raises:
-        UserError: it is no twin.
+        UserError: the file is not a twin.
     """
     with twin_errors():
         from fantwin.twin.export.card_entries import with_card_entries  # noqa: PLC0415  the command line loads twin only when needed

@@ -1,4 +1,4 @@
-"""How a twin is trained of what was read of recordings."""
+"""Trains a twin on what was read from recordings."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ if TYPE_CHECKING:
     from fantwin.twin.progress import Progress
 
 Trainer: TypeAlias = Literal["levenberg-marquardt", "adam"]
-"""written again, since twin takes a while to load"""
+"""repeated here, because twin takes a while to load"""
 NETWORKS = 4
-"""with so many, twins hardly depend on the seed: docs/reference/benchmarks.md"""
+"""enough that twins hardly depend on the seed: docs/reference/benchmarks.md"""
 
 
 @dataclass(frozen=True)
 class TrainingSettings:
-    """How a twin is trained; see the options of the command."""
+    """Settings of a training: the options of `fantwin train` explain them."""
 
     model: str = "hybrid"
     seed: int = 0
@@ -41,8 +41,8 @@ def fit_twin(
     progress: Progress | None = None,
     each_network: ForEachNetwork | None = None,
 ) -> TrainedTwin:
-    """A twin of what was read. held_out: on which its weights are chosen and its band is measured. each_network: who
-    trains its networks; None: this process, one after another.
+    """Train a twin on what was read. held_out: chooses its weights and gives its band. each_network: runs the trainings
+    of its networks; None: in this process, one after another.
 
     Raises:
         TwinError: the data do not suffice.

@@ -85,8 +85,8 @@ def _rounded(value: float) -> str:
 
 @dataclass(frozen=True)
 class Part:
-    """Which part of each recording is read. windows_s: of tachos, in place of the recordings' own. ignored: columns
-    that a twin can use, and that are left out."""
+    """The part of each recording that is read. windows_s: of tachos, in place of the recordings' own. ignored: columns
+    that a twin could use, but that are left out."""
 
     tray: str | None = None
     fans: Sequence[int] | None = None
@@ -99,7 +99,7 @@ class Part:
 def read_training_data(recordings: Sequence[Path], part: Part, each: MapRecordings) -> TrainingData:
     """The runs of several recordings, their outliers left out. each: does the work on each recording.
 
-    All samples of the part are in memory, 16 bytes for each of a fan: a fit needs them all.
+    All samples of the part are in memory, 16 bytes a sample and fan: a fit needs them all.
 
     Raises:
         UserError: a recording cannot be used, or they are not in one unit.

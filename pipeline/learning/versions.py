@@ -33,8 +33,9 @@ class _Record(BaseModel):
 
 
 class Drop(_Record):
-    """What the limits find at a speed: the smallest drops that raise an alarm within a time, of the fan whose readings
-    vary most. In the unit of the tray; None where not even standstill raises one.
+    """Smallest drops from a speed that raise an alarm within 1, 10 and 60 s, for the fan whose readings vary most.
+
+    In the unit of the tray; None where not even standstill raises an alarm.
     """
 
     speed: float
@@ -43,7 +44,7 @@ class Drop(_Record):
     within_60_s: float | None
 
     def line(self, unit: str) -> str:
-        """The same for people."""
+        """One line about the drops, for people."""
         found = ((self.within_1_s, "1 s"), (self.within_10_s, "10 s"), (self.within_60_s, "60 s"))
         parts = [f"{_two_digits(value)} {unit} within {time}" for value, time in found if value is not None]
         drops = f"a drop of {', '.join(parts)}" if parts else "no drop, not even standstill"
@@ -51,7 +52,7 @@ class Drop(_Record):
 
 
 def _two_digits(value: float) -> str:
-    """Two digits of a drop are enough."""
+    """The value in whole numbers, or with two digits below 10: a drop needs no more."""
     return f"{value:,.0f}" if value >= 10 else f"{value:.2g}"
 
 

@@ -67,7 +67,7 @@ class LearnedTwinIntegrator(Core):
 
     @property
     def _counting(self) -> Core | NewSamples:
-        """What counts and reports the samples of now: the core of a twin, where there is one."""
+        """The part that counts and reports samples now: the core of the twin in force, if there is one."""
         return self._core or self._samples
 
     def _cut(self, grid: Grid) -> Iterator[Grid]:

@@ -17,7 +17,7 @@ from fantwin.schemas.messages import Array, Grid, Prediction
 from fantwin.schemas.units import NS_PER_S
 
 BEGINNING_NS = np.iinfo(np.int64).min
-REPORTED_AFTER_NS = 10 * NS_PER_S  # of dropped samples one after the other
+REPORTED_AFTER_NS = 10 * NS_PER_S  # of dropped samples in a row
 Block = TypeVar("Block", Grid, Prediction)
 
 
@@ -27,7 +27,7 @@ def are_newer(t_ns: Array, last_t_ns: int) -> Array:
 
 
 class NewSamples:
-    """Drops what is not new in the blocks of a tray, or of another number of fans, and counts it."""
+    """Drops and counts samples of a tray that are not new, and those of another number of fans."""
 
     def __init__(self, fans: int, name: str, stages: str) -> None:
         """fans: of the tray. name: of the input, for people. stages: those to restart if its times have gone back."""
@@ -36,7 +36,7 @@ class NewSamples:
         """time of the newest sample"""
         self._wrong_fans = 0
         self._dropped_ns = self._behind_ns = 0
-        """since the last new sample: how long the dropped ones were, and how far they are behind it"""
+        """since the last new sample: the time that the dropped ones cover, and how far they are behind it"""
         self._counts: Counter[str] = Counter()
 
     def fits(self, block: Grid | Prediction) -> bool:

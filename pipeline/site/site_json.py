@@ -198,7 +198,7 @@ def rates_json(model: SiteModel) -> dict[str, Any]:
 
 
 def answers_json(answers: Sequence[Alarm]) -> dict[str, Any]:
-    """What the scorer says to a request, with an `error` if it has refused it for every fan."""
+    """The scorer's answers to a request, with an `error` if it has refused it for every fan."""
     body: dict[str, Any] = {
         "answers": [
             {"fan": each.fan, "transition": each.transition.name.lower(), "message": each.message} for each in answers

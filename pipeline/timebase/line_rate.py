@@ -30,9 +30,9 @@ ENOUGH_SAMPLES = 26
 SHORTEST_WAIT_US = 1_000_000  # a host that stalls delivers the samples of a tenth of a second at once
 MAX_SAMPLES = 2000
 MOST_KEPT = 6000
-"""samples of a line that has not caught up: a minute at 100 Hz. With more, its clock does not fit"""
+"""samples for a line to catch up: a minute at 100 Hz. If it needs more, its clock runs too fast"""
 PACE_US = 250_000
-"""time of the device over which its line is seen to deliver what it had kept"""
+"""time of the device from one look to the next at whether its line is catching up"""
 MOST_PERIODS = 5  # a longer pause says nothing about the period
 MIN_USED_SHARE = 0.5  # of the steps
 MOST_UNEVEN = 0.15  # mean distance of steps from whole periods, in periods; a quarter where there is no period
@@ -197,7 +197,7 @@ class LineRate:
         self._is_catching_up = False
         """whether the line delivers samples faster than its device measures them"""
         self._paced = (0, 0)
-        """time of the device since the first sample, us, and `first_lateness_ns`, when that was last looked at"""
+        """time of the device since the first sample, us, and `first_lateness_ns`, at the last such look"""
         self.first_lateness_ns = 0
         """delay of the first sample beyond that of the least delayed one of the first second, or of the time until the
         line had caught up; 0 if the device has no clock"""
@@ -227,7 +227,7 @@ class LineRate:
             passed_us = span_us - self._paced[0]
             if passed_us >= PACE_US:
                 gained_ns = self.first_lateness_ns - self._paced[1]
-                self._is_catching_up = 2 * gained_ns > 1000 * passed_us  # less than half of that time has passed here
+                self._is_catching_up = 2 * gained_ns > 1000 * passed_us  # on the host, less than half of that passed
                 self._paced = span_us, self.first_lateness_ns
         else:
             self._last_span_us, self._is_catching_up = math.inf, False  # a later sample says nothing about the first

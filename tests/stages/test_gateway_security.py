@@ -81,7 +81,7 @@ def test_a_login_holds_nobody_up_and_guesses_side_by_side_are_as_few_as_one_afte
     assert sorted(answers) == [401] * login_failures.FAILURES + [429] * (12 - login_failures.FAILURES)
 
 
-def test_an_own_account_buys_no_more_guesses_and_guesses_from_elsewhere_do_not_lock_out_who_has_logged_in():
+def test_logging_in_to_an_own_account_buys_no_guesses_and_guesses_from_elsewhere_lock_out_no_logged_in_user():
     now_s, most = 0.0, login_failures.FAILURES
     failures = login_failures.LoginFailures(lambda: now_s)
     failures.succeed("ann", "192.0.2.7")
@@ -233,7 +233,7 @@ def test_by_https_the_cookie_goes_at_logout_and_a_certificate_that_is_over_is_na
     assert "page.pem: expired on" in gateway.problem()
 
 
-def test_what_all_pages_ask_for_at_once_is_made_for_all_of_them_and_is_never_older_than_the_question():
+def test_pages_that_ask_at_once_share_one_answer_which_is_never_older_than_the_question():
     goes_on, made = threading.Event(), list[int]()
 
     def make() -> int:

@@ -175,7 +175,7 @@ def standing_of(emitted: Sequence[Any]) -> list[CurrentAlarm]:
 
 
 @pytest.mark.parametrize("lost", ["twin", "model", "wear"])
-def test_of_a_snapshot_of_another_twin_or_read_in_part_operator_settings_are_restored_and_that_is_said_for_a_minute(
+def test_operator_settings_outlive_a_snapshot_of_another_twin_or_read_in_part_and_health_says_so_for_a_minute(
     lost: str,
 ) -> None:
     state = json.loads(raised().state_json)

@@ -98,9 +98,9 @@ class ResidualGrid:
 
 
 def residual_grid(period_s: float, longest_s: float) -> ResidualGrid:
-    """The grid for runs of a median step, of which the longest without a gap lasts so long.
+    """The grid for runs with a median step of period_s, whose longest stretch without a gap lasts longest_s.
 
-    Lags go to MAX_LAG_S, but not beyond a quarter of that or 1000 steps.
+    Lags go to MAX_LAG_S, but not beyond a quarter of longest_s or MAX_LAGS steps.
     """
     longest = int(LONGEST_LAG_OF_RUN * (max(round(longest_s / period_s), 1) + 1))
     lags = max(1, min(round(MAX_LAG_S / period_s), longest, MAX_LAGS))
@@ -139,7 +139,7 @@ def residual_sums(
 ) -> ResidualSums:
     """The sums over pieces. residual_rad_s: (samples, fans) as free_run_residuals gives it for them.
 
-    settling_s: left out at the start of each piece, but at most half of it.
+    settling_s: time left out at the start of each piece, at most half of the piece.
     """
     settled = _settled(residual_rad_s, pieces, settling_s)
     ends = np.cumsum([piece.samples for piece in pieces])
@@ -206,7 +206,7 @@ def analysis_of(sums: ResidualSums, grid: ResidualGrid) -> tuple[ResidualAnalysi
 
 
 def healthy_residual(residual_rad_s: Array, pieces: Sequence[Run]) -> tuple[Array, HealthyCard]:
-    """(fans,) healthy standard deviation, rad/s, and the healthy residual for a card. Arguments as of residual_sums."""
+    """Healthy standard deviation (fans,), rad/s, and the healthy residual for a card. Arguments as of residual_sums."""
     settled = _settled(residual_rad_s, pieces, SETTLING_S)
     sigma_rad_s = healthy_sigma_rad_s(settled)
     analyses = analyse_residual(residual_rad_s, pieces)

@@ -72,7 +72,7 @@ class FoundDrive:
 
     @property
     def friction(self) -> Array:
-        """(fans,) what the drive takes of the command of each fan before it acts."""
+        """The part of each fan's command (fans,) that the drive takes off before it acts."""
         return self.settings[:, DRIVE_PARAMETERS.index("friction")]
 
     @property

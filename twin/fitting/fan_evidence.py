@@ -23,9 +23,9 @@ HELD = 2.0
 
 @dataclass(frozen=True, eq=False)
 class FanEvidence:
-    """Of one fan. squares: (C, C) of the filtered functions, relative to the variance of what the model misses.
-    held_command: (m,) after the lag, of the samples in which the fan turned and was held, or turned at least; empty if
-    it never did.
+    """Evidence of one fan. squares: (C, C) of the filtered functions, relative to the variance of what the model
+    misses. held_command: (m,) after the lag, of the samples in which the fan turned and was held, or just turned if it
+    was never held; empty if it never turned.
     """
 
     squares: Array
@@ -42,9 +42,9 @@ def evidence_of_fans(
     least_noise_rad_s: float,
     stands_below_rad_s: float,
 ) -> list[FanEvidence]:
-    """Of each fan. parameters: (fans, 4). acting_runs: the runs with the commands that act on the fans.
+    """The evidence of each fan. parameters: (fans, 4). acting_runs: the runs with the commands that act on the fans.
 
-    least_noise_rad_s: what the model misses is not taken for less. stands_below_rad_s: at such speeds a fan stands.
+    least_noise_rad_s: lower bound of what the model misses. stands_below_rad_s: speed below which a fan stands.
     """
     parts, acting = _parts(runs, parameters[:, LAG]), _parts(acting_runs, parameters[:, LAG])
     found: list[FanEvidence] = []

@@ -63,7 +63,7 @@ def filtered_regression(
 
 
 def with_lagged_command(pieces: Sequence[Run], lag_s: Array) -> list[Run]:
-    """The pieces with the commands that act, after the lag (fans,), as the tachos show them."""
+    """The pieces with the commands after the lag, lag_s (fans,), as the tachos would show them."""
     return [
         replace(
             piece, command=effective_command(piece.command, piece.step_s[:, np.newaxis], lag_s, piece.command[0])[0]

@@ -114,7 +114,7 @@ def fit_physics(
     part: str,
     progress: Progress,
 ) -> FreeRunFit:
-    """Fit the physics of each fan alone; where a tacho counts, then with what that fit says of the errors of readings.
+    """Fit the physics of each fan alone; where a tacho counts, again with the errors of readings that this fit shows.
 
     part: the name of this work in reports of progress. The other arguments are those of fit_free_run.
     """

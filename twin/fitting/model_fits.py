@@ -89,7 +89,7 @@ def fit_network_ode(
     units: int,
     inputs: tuple[str, ...] = ("speed", "command"),
 ) -> FittedModel:
-    """A model with a network of so many units and these inputs, by the trainer of the request."""
+    """Fit a model whose network has these units and inputs, by the trainer of the request."""
     scaling = data_scaling(request.runs, request.identification)
     untrained = make(TanhNetwork.zero(units, inputs, scaling))
     limit = request.max_iterations or DEFAULT_ITERATIONS[request.trainer]

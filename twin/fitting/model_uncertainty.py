@@ -65,9 +65,9 @@ def model_uncertainty(
     friction: Array,
     identification: Identification,
 ) -> ModelUncertainty:
-    """Of a trained model. parameters: (fans, 4). runs: those that it was trained on, with the commands of the table.
-    acting_runs: the same with the commands that act on the fans. friction: (fans,) what a drive takes of the command
-    before it acts.
+    """The uncertainty of a trained model. parameters: (fans, 4). runs: its training runs, with the commands of the
+    table. acting_runs: the same with the commands that act on the fans. friction: (fans,) what a drive takes off the
+    command before it acts.
     """
     scale = data_scaling(runs, identification)
     typical_s = float(np.median(identification.time_constant_s))

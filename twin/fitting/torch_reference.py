@@ -69,8 +69,8 @@ def train_adam(
 ) -> tuple[NetworkOde, int]:
     """Train from the model's weights on stretches of ten time constants; returns the best iterate, and max_iterations.
 
-    Each stretch starts from the mean of its first five measured speeds: readings are taken for speeds. Its physics, the
-    lag included, stay as they were identified.
+    Each stretch starts from the mean of its first five measured speeds: readings are taken for speeds. The
+    model's physics, the lag included, stay as identified.
     """
     pieces = evaluation_pieces(runs)
     period_s = min(piece.median_period_s for piece in pieces)

@@ -90,12 +90,12 @@ def train_network(
 ) -> tuple[NetworkOde, Array, int]:
     """Train the model's network. Returns the trained model, the parameters (fans, 4) and the iterations taken.
 
-    J, alpha, C_D and the lag of each fan are fitted along with the network (of a tacho that counts alpha and C_D only).
+    J, alpha, C_D and the lag of each fan are fitted along with the network (with a counting tacho, alpha and C_D only).
     max_iterations: of each network; those of the starts come before and are not counted, the few on all samples of many
     fans come on top. prior_std: how far the network's acceleration may be from the physics where there are no data, in
     units of its scale (twin.fitting.cross_validation chooses it). Zero: the weights stay zero.
-    networks: how many are trained; the model is the mean of those that end about as well as the best. each: who trains
-    them.
+    networks: how many are trained; the model is the mean of those that end about as well as the best. each: runs
+    their trainings.
     """
     if prior_std == 0.0:
         return model.with_theta(np.zeros_like(model.network.theta)), identification.parameters, 0

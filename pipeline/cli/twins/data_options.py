@@ -1,4 +1,4 @@
-"""Options of the commands that train and evaluate twins, and what they say of their recordings."""
+"""Options of the commands that train and evaluate twins, and what they report of their recordings."""
 
 from __future__ import annotations
 

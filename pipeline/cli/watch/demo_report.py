@@ -61,7 +61,7 @@ class Summary:
 
 @dataclass
 class _Recorded:
-    """Each sample counted once, by tray and number, so that a repeated one hides no lost one."""
+    """What recordings hold. Each sample counts once, by tray and number, so that a repeated one hides no lost one."""
 
     samples: set[tuple[str, int]] = field(default_factory=set)
     latencies_ms: list[float] = field(default_factory=list)

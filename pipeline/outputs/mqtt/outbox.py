@@ -77,5 +77,5 @@ class Outbox:
 
 
 def text_of(value: Any) -> str:
-    """JSON that any program reads: an infinite number, which it does not have, is null."""
+    """JSON that any program reads: NaN and infinity, which JSON does not have, become null."""
     return to_json(value, inf_nan_mode="null").decode()

@@ -35,7 +35,7 @@ class MqttRequestForm(RequestForm):
     name: Annotated[OneLine, Field(max_length=64)] = ""
 
     def message(self, fan: int, operator_name: str) -> Request:
-        """The request, with who says that he asks in its comment."""
+        """The request, with the name that the client gave in its comment."""
         says = f"sent as {self.name}" if self.name else ""
         comment = " ".join(filter(None, (self.comment, f"({says})" if self.comment and says else says)))
         return replace(super().message(fan, operator_name), comment=comment[:LONGEST_COMMENT])

@@ -109,7 +109,7 @@ class AlertSender(TargetThread):
         """None: it is not known yet"""
 
     def want(self, alarms: Sequence[CurrentAlarm]) -> None:
-        """These are to be there now, and no others."""
+        """Set the alarms that Alertmanager is to have now, and no others."""
         if alarms != self._wanted:
             self._wanted = alarms
             self.wake()

@@ -35,7 +35,7 @@ class Happened:
     number: int = 0
 
     def then(self, later: Happened) -> Happened:
-        """Both."""
+        """Join with what happened later."""
         return Happened(self.kinds + later.kinds, later.number or self.number)
 
 
@@ -53,8 +53,8 @@ class Announced:
 
     Attributes:
         severity: the highest that it has heard of.
-        last_ns: when it last heard of it, by the clock of the host; not that data do not confirm it. Of an alarm of
-            which it has heard nothing: when that came.
+        last_ns: host time at which it last heard of it, not counting that data do not confirm it. If it has heard
+            nothing of the alarm: host time at which the alarm came.
         repeats: how many times it was sent again.
         is_stale_said: it has heard that data do not confirm the alarm.
         was_silenced: an operator has silenced the alarm since.
@@ -80,14 +80,14 @@ class Announced:
 
 
 def hears_of(target: TargetConfig, alarm: Alarm) -> bool:
-    """Whether it hears of such an alarm at all."""
+    """Return whether the target hears of such an alarm at all."""
     return alarm.severity >= target.least_severity and _has_tray(target, alarm)
 
 
 def decide(
     target: TargetConfig, alarm: Alarm, announced: Announced | None, now_ns: int
 ) -> tuple[Happened | None, Announced | None]:
-    """What a target hears now of the newest message about a fan, and what it has heard then."""
+    """Decide what a target hears of the newest message about a fan. Returns that, and what it has heard afterwards."""
     has_begun = announced is not None and announced.told == Told.BEGUN
     if is_silenced(alarm):
         return None, replace(announced, was_silenced=True) if announced and has_begun else announced
@@ -133,7 +133,7 @@ def _continue(
     if not alarm.acknowledged and not kinds and (announced.was_silenced or is_due):
         kinds.append(Kind.AGAIN)
         now = replace(now, repeats=announced.repeats + 1)
-    # of fans that were raised together, those that data do not confirm stay together with the others
+    # fans raised together are repeated together, also those that data no longer confirm
     if set(kinds) - {Kind.NOT_CONFIRMED}:
         now = replace(now, last_ns=now_ns)
     return Happened(tuple(kinds), now.repeats * (Kind.AGAIN in kinds)) if kinds else None, now

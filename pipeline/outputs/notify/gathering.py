@@ -37,7 +37,7 @@ class Gathered:
     fans: dict[Fan, Happened] = field(default_factory=dict)
 
     def add(self, fan: Fan, happened: Happened, now_ns: int) -> None:
-        """Something has happened to one more fan, or more to the same one."""
+        """Add what has happened to a fan, after what is gathered of it already."""
         if not self.fans:
             self.opened_ns = now_ns
         self.newest_ns = now_ns

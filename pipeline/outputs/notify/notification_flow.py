@@ -36,7 +36,7 @@ class Basket(StrEnum):
 
 @dataclass
 class Saved:
-    """All that survives a restart, also of fans that are not there any more. `is_first`: there was nothing."""
+    """All that survives a restart, also of fans that are gone. `is_first`: nothing had been saved."""
 
     is_first: bool = True
     announced: dict[tuple[str, Fan], Announced] = field(default_factory=dict)
@@ -56,7 +56,7 @@ class Outgoing:
 
 @dataclass
 class Changes:
-    """What is to be saved: names of what has changed in `Saved`, and the texts that were decided."""
+    """Changes to save: the keys of what has changed in `Saved`, and the texts that were decided on."""
 
     announced: set[tuple[str, Fan]] = field(default_factory=set)
     gathered: set[tuple[str, Basket]] = field(default_factory=set)
@@ -67,10 +67,10 @@ class Changes:
 
 
 class Notifications:
-    """Not thread-safe."""
+    """Decides, transition by transition, what targets hear. Not thread-safe."""
 
     def __init__(self, config: NotifierConfig, place: Place, saved: Saved, past: Iterable[Alarm] = ()) -> None:
-        """past: the transitions that were decided on, as far as the alarms of now follow from them."""
+        """past: transitions already decided on, from which the present alarms follow."""
         self._config = config
         self._place = place
         self._targets = [target for target in config.target if target.kind == "apprise"]
@@ -92,7 +92,7 @@ class Notifications:
         return self._is_looking
 
     def add(self, message: Alarm, now_ns: int) -> None:
-        """A transition. now_ns: time of the host."""
+        """Take a transition. now_ns: time of the host."""
         newest = self._keep(message)
         if not self._is_looking:
             self._decide(newest, now_ns)
@@ -109,7 +109,7 @@ class Notifications:
             self._send_due(target, now_ns)
 
     def firing(self, target: TargetConfig) -> list[CurrentAlarm]:
-        """The alarms that an Alertmanager has to have now: active, and not silenced by an operator."""
+        """The alarms that Alertmanager is to have now: active, and not silenced by an operator."""
         alarms = map(self._current, sorted(self._open))
         return [each for each in alarms if not is_silenced(each.newest) and hears_of(target, each.newest)]
 

@@ -80,7 +80,7 @@ class Outbox:
                 self._store.write("UPDATE message SET under_way = 0, may_be_repeated = 1 WHERE under_way")
                 known = ", ".join("?" * len(names))
                 self._lose(f"target NOT IN ({known})", names)
-                for table in ("gathered", "lost", "firing"):  # a target that comes back has heard what it had heard
+                for table in ("gathered", "lost", "firing"):  # `announced` stays: a target may come back
                     self._store.write(f"DELETE FROM {table} WHERE target NOT IN ({known})", names)
         except sqlite3.Error as error:
             raise UserError(f"{path}: messages cannot be kept there: {error}") from error

@@ -49,7 +49,7 @@ class TargetThread:
     """A thread that delivers to one target, and tries again with growing delays where that fails."""
 
     def __init__(self, target: str, outbox: Outbox, again_s: float) -> None:
-        """again_s: longest time between two looks at what is to be delivered."""
+        """again_s: longest time between two looks for something to deliver."""
         self._target = target
         self._outbox = outbox
         self._again_s = again_s
@@ -61,15 +61,15 @@ class TargetThread:
         self._thread = threading.Thread(target=self._run, name=f"sender of {target}", daemon=True)
 
     def start(self) -> None:
-        """Begin."""
+        """Begin to deliver."""
         self._thread.start()
 
     def wake(self) -> None:
-        """There may be something new."""
+        """Look for something to deliver at once."""
         self._wake.set()
 
     def stop(self, timeout_s: float) -> None:
-        """End after the delivery that is under way. One that takes longer is left behind."""
+        """End after the delivery that is under way. One that takes longer than timeout_s is left behind."""
         self._stop.set()
         self._wake.set()
         self._thread.join(timeout_s)
@@ -102,8 +102,8 @@ class TargetThread:
 
 
 class Sender(TargetThread):
-    """Sends the messages of one target, in their order; tries again until they arrive or are lost by their age. A
-    message that is left behind by a stop is sent again after a restart."""
+    """Sends the messages of one target, in their order; tries again until they arrive or are too old. A message
+    that is left behind by a stop is sent again after a restart."""
 
     def __init__(self, target: str, deliver: Deliver, outbox: Outbox, pause_s: float) -> None:
         """pause_s: least time between two messages."""
@@ -114,10 +114,10 @@ class Sender(TargetThread):
         self._taken: Waiting | None = None
         """the last message that has arrived, until the outbox knows it"""
         self._refused_number = self._refusals = 0
-        """of the message that was refused last, how often"""
+        """number of the message refused last, and how often it was"""
 
     def problem(self) -> str:
-        """Also a delivery that does not end."""
+        """The problem of any target, or a delivery that does not end."""
         began_s = self._delivery_began_s
         if began_s is not None and time.monotonic() - began_s > HUNG_AFTER_S:
             return f"target {self._target}: a delivery has not ended for more than {HUNG_AFTER_S:.0f} s"

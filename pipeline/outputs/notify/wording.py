@@ -136,7 +136,7 @@ def describe(place: Place, current: CurrentAlarm) -> list[str]:
 
 
 def _deviation(place: Place, current: CurrentAlarm) -> str:
-    """How far the fan is from its twin, as the last message that said so has it, with its time; may be empty."""
+    """The deviation of the fan from its twin, by the last message that gives it, with its time; may be empty."""
     raised = current.raised
     deviation = deviation_in(raised.message, raised.fan) if raised else ""
     return f"{deviation} at {place.clock(raised.t_ns)}" if raised and deviation and raised.t_ns else deviation

@@ -1,7 +1,7 @@
 """The alarm of a fan as an AlarmCondition of Part 9: which field has which value."""
 
 # pyright: reportPrivateImportUsage=false, reportArgumentType=false
-# (the library declares its names and integers otherwise than it uses them)
+# (the library declares its names and integers differently from how it uses them)
 from __future__ import annotations
 
 import hashlib
@@ -33,19 +33,19 @@ SEVERITIES = {Severity.NONE: 1, Severity.WARNING: 500, Severity.ALARM: 900}
 """of Part 5: 401 to 600 is medium, 801 to 1000 high"""
 CONDITION_NAME = "FanAlarm"
 OWN_FIELDS = ("Cause", "CauseProbability", "Evidence", "Score")
-"""that no standard names; the event type `FanAlarmType` has them"""
+"""fields that `FanAlarmType` adds to those of the standard"""
 UNCERTAIN = "UncertainNoCommunicationLastUsableValue"
 NS_PER_MS = 1e6
 
 
 def event_id(alarm: Alarm) -> bytes:
-    """Of the event of a transition: the same in every server, before and after a restart, live and in the history."""
+    """The id of a transition's event: the same in every server, before and after a restart, live and in the history."""
     name = f"{alarm.header.producer}/{alarm.header.tray}/{alarm.fan}/{alarm.header.sequence}"
     return hashlib.sha256(name.encode()).digest()[:16]
 
 
 def _last_severity(alarm: Alarm) -> int:
-    """That of before this transition."""
+    """The severity before this transition."""
     if alarm.transition in (Transition.RAISED, Transition.NONE):
         return 0
     is_worse = alarm.transition == Transition.SEVERITY

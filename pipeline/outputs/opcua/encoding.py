@@ -39,7 +39,7 @@ def standard(name: str) -> ua.NodeId:
 
 
 def null_or_time(t_ns: int) -> ua.Variant:
-    """Null for 0: the library cannot send a time that is none."""
+    """A time; null for 0, because the library cannot send a missing time."""
     return ua.Variant(time_of(t_ns), ua.VariantType.DateTime) if t_ns else ua.Variant()
 
 
@@ -64,5 +64,5 @@ def number(value: float, kind: str = "Double") -> ua.Variant:
 
 
 def data_value(value: ua.Variant, status: str, t_ns: int, now: datetime) -> SharedValue:
-    """t_ns: source timestamp."""
+    """A value with its status. t_ns: source timestamp; 0: now."""
     return SharedValue(value, STATUS[status], time_of(t_ns) or now, now)

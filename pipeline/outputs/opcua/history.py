@@ -26,9 +26,9 @@ MOST_EVENTS = 10_000
 
 
 class EventHistory(HistoryDict):
-    """That of the library, which is given nothing to keep, with the events of the stage.
+    """History of events, from the alarms that the stage keeps; the library itself keeps nothing.
 
-    Of the server and the site's folder: all alarms; of a tray or a fan: its own.
+    The server and the site's folder give all alarms; a tray or a fan gives its own.
     """
 
     def __init__(self, model: SiteModel, namespace: int) -> None:

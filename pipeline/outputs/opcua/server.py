@@ -98,7 +98,7 @@ class OpcuaServer:
         return {"clients": self._clients, "events_sent": self._events_sent, "events_left_out": self._events_lost}
 
     def publish(self, current: CurrentAlarm) -> None:
-        """Send an event to whoever subscribes; never waits."""
+        """Send an event to all subscribers; never waits."""
         with self._lock:
             if len(self._pending) >= MOST_PENDING:
                 self._pending.popleft()

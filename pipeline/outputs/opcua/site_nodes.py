@@ -15,7 +15,7 @@ from fantwin.pipeline.outputs.opcua.templates import Template, templates
 from fantwin.pipeline.site.fleet import Fan
 
 ValueOf = Callable[[Fan, str], SharedValue]
-"""the value of a node: of which fan, and its path below the fan"""
+"""the value of a node, from its fan and its path below the fan"""
 
 
 class SiteNode:

@@ -44,7 +44,7 @@ class SiteValues:
         self._values = values
 
     def of(self, fan: Fan, path: str) -> SharedValue:
-        """The value of a node: path below its fan."""
+        """The value of a node. path: below its fan."""
         now = datetime.now(UTC)
         name, _, below = path.partition("/")
         if name == ALARM:

@@ -147,7 +147,7 @@ def _property(path: str, data_type: str, namespace: int = 0) -> Template:
 
 
 def _condition_field(path: str, kind: ua.VariantType, has_id: bool, namespace: int) -> Template:
-    """kind: built-in type; null of a time that there is not."""
+    """The template of a field. kind: its built-in type; null for a time that is not set."""
     data_type = "Duration" if path in _DURATIONS else kind.name
     if kind in (ua.VariantType.Null, ua.VariantType.DateTime):
         data_type = "UtcTime"

@@ -26,7 +26,7 @@ ADDED_EVERY_NS = NS_PER_S // 2
 
 
 def is_fleet(trays: Sequence[TrayConfig]) -> bool:
-    """Whether a site has more fans than are drawn at once."""
+    """Return whether a site has more fans than are drawn at once."""
     return sum(tray.fans for tray in trays) > FLEET_ABOVE
 
 

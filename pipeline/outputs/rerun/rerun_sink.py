@@ -42,7 +42,7 @@ _PAGE_SCRIPT = '"$@" >/dev/null 2>&1 & cat >/dev/null; kill $!'
 
 @dataclass(frozen=True)
 class ViewOptions:
-    """What the view itself depends on, with the defaults of `[viewer]`.
+    """Options of a view, with the defaults of `[viewer]`.
 
     Attributes:
         show: fans of a fleet that always have a plot.

@@ -34,10 +34,10 @@ from fantwin.schemas.messages import Alarm, Message, ModelCard
 
 
 class ReadPlan(NamedTuple):
-    """How a tray was decided, as its recording says it."""
+    """Plan of how to decide a tray again, as its recording tells it."""
 
     plan: TrayPlan
-    """one session of each stage, where the recording does not say it, or another grid or only a part is replayed"""
+    """one session of each stage, if the recording does not tell, or if another grid or only a part is replayed"""
     alarms: list[Alarm]
     """those recorded, each once"""
     why_not_verified: str = ""
@@ -118,7 +118,7 @@ class ReplayInput:
     def pipeline(
         self, tray: str, plan: TrayPlan | None = None, observe: Callable[[Message], None] = lambda _message: None
     ) -> OfflinePipeline:
-        """The stages of a tray, ready to run. Without a plan, one session of each processes all, by the twin given."""
+        """The stages of a tray, ready to run. Without a plan, one session of each processes all, with its twin."""
         raw = RawBlocks(lambda: self.envelopes(tray, ("raw",)), observe, (self.start_s, self.end_s))
         contexts = self.contexts(self.config.tray(tray))
         return OfflinePipeline(self.stages, contexts, raw, plan or undisturbed_plan(self.stages), observe)

@@ -75,8 +75,8 @@ def differences(one: Any, other: Any, note: Callable[[Apart], None], path: tuple
 
 
 def unequal(name: str, one: Array, other: Array) -> tuple[Array, Array]:
-    """Which values of two arrays of one form are not equal, where all NaN are equal; and the share of the tolerance of
-    each of these, infinite for what is no float."""
+    """Flags of the values that differ between two arrays of one shape and type, where all NaN are equal; and the share
+    of the tolerance that each of these takes, infinite if they are not floats."""
     differs = one != other
     if one.dtype.kind != "f":
         return differs, np.full(int(differs.sum()), math.inf)

@@ -43,7 +43,7 @@ def test_row_18_whoever_cannot_ask_does_not_say_that_nobody_is_there(link):
     eventually(lambda: _answer(asks) == {KEY}, "the router answers again")
 
 
-def test_row_18_it_is_asked_again_if_the_answer_did_not_come_in_time(link, monkeypatch):
+def test_row_18_a_question_is_repeated_if_the_answer_did_not_come_in_time(link, monkeypatch):
     relay, asks = link
     monkeypatch.setattr("fantwin.pipeline.bus.session._ALIVE_TIMEOUTS", 1000)
     monkeypatch.setattr(asks._stop, "wait", lambda _timeout_s: relay.heal())  # between two questions

@@ -112,7 +112,7 @@ def test_without_an_output_the_twin_itself_is_calibrated_and_people_read_what_wa
     assert drops and all(line in reported and f"<li>{line}</li>" in page.read_text() for line in drops)
 
 
-def test_a_rate_that_is_not_kept_is_exit_code_3_and_what_a_twin_was_made_from_proves_nothing(
+def test_a_broken_rate_is_exit_code_3_and_recordings_that_made_the_twin_prove_nothing(
     healthy: Path, tmp_path: Path
 ) -> None:
     calibrated, other, copy = healthy / "calibrated.onnx", healthy / "other.mcap", tmp_path / "copy.mcap"

@@ -50,7 +50,7 @@ def summary_of(
     return summarise(truth, [recording], lost or {})
 
 
-def test_a_run_as_it_must_be_has_no_problems_and_json_fields_that_others_rely_on(tmp_path: Path) -> None:
+def test_a_good_run_has_no_problems_and_the_json_fields_that_others_rely_on(tmp_path: Path) -> None:
     summary = summary_of(tmp_path, alarms=[*RIGHT, (2, True, 16.0), (2, False, 17.0)])
     assert summary.problems == []
     assert summary.false_alarms == 0, "an alarm while the fan runs back is that fault's"

@@ -51,7 +51,7 @@ def found_after_s(path: Path, drops: Array) -> Array:
     return found_s
 
 
-def test_most_fans_show_a_drop_in_the_time_in_which_it_is_said_to_be_found_and_a_raised_limit_finds_larger_ones_only(
+def test_most_fans_show_a_drop_within_the_stated_time_and_a_raised_limit_finds_larger_ones_only(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(module, "STEADY_S", STEADY_S)

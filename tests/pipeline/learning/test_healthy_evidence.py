@@ -70,7 +70,7 @@ def test_what_a_gateway_has_kept_counts_for_the_times_of_the_recordings(tmp_path
     assert len(found.alarms) == 1, "that of long ago is of no recording here"
 
 
-def test_a_time_is_left_out_of_its_own_tray_site_and_recording() -> None:
+def test_a_stretch_is_left_out_only_in_its_own_tray_site_and_recording() -> None:
     span = LeftOut("a", None, "t1", 1, 0, 1)
     for more, is_meant in (
         *(({}, True), ({"site": ""}, True)),

@@ -150,7 +150,7 @@ def test_recordings_in_excluded_time_spans_are_left_out(tmp_path: Path) -> None:
     ("excluded_s", "kept"),
     [((9000, 9900), [0, 4000, 5000]), ((1900, 4900), [0, 1000, 3000, 4000, 5000])],
 )
-def test_the_oldest_are_deleted_but_for_the_first_and_excluded_ones_take_no_place_of_others(
+def test_the_oldest_recordings_but_the_first_are_deleted_and_excluded_ones_displace_no_others(
     tmp_path: Path, excluded_s: tuple[int, int], kept: list[int]
 ) -> None:
     history = history_in(tmp_path, hold_back_s=0.0, kept_s=650.0)

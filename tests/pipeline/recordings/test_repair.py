@@ -233,7 +233,7 @@ def test_a_damaged_metadata_record_is_left_out(tmp_path):
     assert len(read_by_others(path)) == 1
 
 
-def test_what_exists_is_written_or_is_repaired_by_another_is_not_touched(tmp_path, whole):
+def test_a_repair_touches_no_file_that_exists_or_that_another_process_writes_or_repairs(tmp_path, whole):
     path = tmp_path / "r.mcap"
     path.write_bytes(whole.read_bytes()[:-300])
     other = AtomicAppendFile(tmp_path / "r.mcap.recovering")

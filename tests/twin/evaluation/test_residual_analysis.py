@@ -145,7 +145,7 @@ def test_runs_are_not_joined_across_their_ends() -> None:
     assert analysis.autocorrelation[lag - 1] == pytest.approx(expected, rel=1e-9)
 
 
-def test_independent_samples_say_how_far_the_mean_scatters_and_the_autocorrelation_time_is_known() -> None:
+def test_the_count_of_independent_samples_gives_the_scatter_of_the_mean_and_the_autocorrelation_time_is_found() -> None:
     """Also where half of the samples are missing."""
     rng = np.random.default_rng(10)
     drawn = [np.where(rng.random(SAMPLES) < 0.5, np.nan, slow(rng)) for _ in range(150)]

@@ -119,7 +119,7 @@ def test_held_out_runs_judge_and_teach_nothing(published) -> None:
 
 
 @pytest.mark.parametrize("how", ["braked to a stop", "not read at times"])
-def test_a_fan_that_stands_teaches_nothing_then_and_a_few_missing_speeds_are_bridged(published, how: str) -> None:
+def test_nothing_is_learned_while_a_fan_stands_and_a_few_missing_speeds_are_bridged(published, how: str) -> None:
     run, identification = published
     speed = run.speed_rad_s.copy()
     if how == "braked to a stop":

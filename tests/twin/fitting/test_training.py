@@ -45,7 +45,7 @@ def disturbed(run: Run) -> Run:
 
 
 @pytest.mark.parametrize(("training", "most"), [("clean", 1.05), ("disturbed", 1.1)])
-def test_the_hybrid_comes_to_the_noise_where_the_physics_stay_far_from_it(rough, training: str, most: float) -> None:
+def test_the_hybrid_comes_close_to_the_noise_where_physics_alone_does_not(rough, training: str, most: float) -> None:
     runs = [rough[0]] if training == "clean" else [disturbed(rough[0])]
     twin, physical = (
         train_twin(runs, [rough[1]], kind, name="x", max_iterations=10) for kind in ("hybrid", "physical")
@@ -116,7 +116,7 @@ def test_progress_is_reported_of_each_part_of_the_work(rough) -> None:
     assert trained.card.training.iterations <= 2 * 5
 
 
-def test_adam_lowers_the_free_run_error_from_the_physics_on(short: Run) -> None:
+def test_adam_lowers_the_free_run_error_below_that_of_the_physics(short: Run) -> None:
     from fantwin.twin.fitting.torch_reference import train_adam  # noqa: PLC0415  torch takes seconds to import
 
     run = thinned(short.between(0.0, 2.0), 2)  # the cost is that of the steps

@@ -92,7 +92,7 @@ def trained() -> Iterator[TrainedTwin]:
     kinds.KINDS.remove(row)
 
 
-def test_it_is_trained_and_its_file_runs_as_it_does_and_is_reported(trained: TrainedTwin, tmp_path: Path) -> None:
+def test_an_added_model_is_trained_and_reported_and_its_file_runs_alike(trained: TrainedTwin, tmp_path: Path) -> None:
     assert isinstance(trained.model, FirstOrder)
     assert trained.model.decay == pytest.approx(0.97, rel=1e-3)
     assert trained.validation.pooled.rmse_rad_s < 0.3

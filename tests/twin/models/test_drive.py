@@ -31,7 +31,7 @@ def test_a_command_acts_above_the_plateau_keeps_the_plateau_below_it_and_stops_t
     assert acting([120.0, 50.0, 30.0, 20.0, 19.9, 0.0])[0] == [115.0, 45.0, 45.0, 45.0, 0.0, 0.0]
 
 
-def test_a_rested_fan_gets_its_kick_once_and_for_its_time_and_one_that_was_off_for_less_gets_less() -> None:
+def test_a_rested_fan_gets_one_full_kick_and_one_that_was_off_for_less_gets_a_shorter_one() -> None:
     effective, charge = acting([0.0] * 20 + [100.0] * 10)
     np.testing.assert_allclose(effective, [0.0] * 20 + [175.0] * 6 + [95.0] * 4, rtol=1e-12)
     assert charge == 20.0

@@ -23,7 +23,7 @@ def known(**unknown: float) -> ModelUncertainty:
     return by_speed(SPEEDS_RAD_S, COMMANDS.tolist(), std.tolist(), 2.0)
 
 
-def test_a_command_that_was_never_held_comes_first_then_a_step_and_nothing_that_would_tell_little() -> None:
+def test_a_command_never_held_is_advised_first_then_a_step_and_nothing_that_would_tell_little() -> None:
     found = least_known(known(speed=140.0, command=0.7, std=9.0), CURVE, None)
     assert found is not None
     assert (found.command, found.speed_rad_s, found.std_rad_s, found.held) == (COMMANDS[7], SPEEDS_RAD_S[7], 9.0, True)

@@ -103,7 +103,7 @@ def test_messages_of_a_target_that_is_gone_are_lost_and_counted_and_one_that_com
     assert again.load()[0].announced == ANNOUNCED
 
 
-def test_nothing_is_saved_by_halves_and_what_cannot_be_decided_for_good_is_not_sent(outbox, tmp_path):
+def test_a_save_that_fails_saves_nothing_and_its_texts_are_not_sent(outbox, tmp_path):
     outbox.load()
     outbox.hear(alarm())
     assert len(outbox.news(9)) == 1

@@ -15,7 +15,7 @@ FAN = Fan("tray1", 0)
 NUMBERS = ("Speed", "PredictedSpeed", "BandHalfWidth", "Score")
 
 
-def test_of_a_silent_tray_every_number_is_uncertain_and_before_the_first_sample_there_is_nothing():
+def test_every_number_of_a_silent_tray_is_uncertain_and_there_is_none_before_the_first_sample():
     curves, reason = np.array([[100.0, 101.0, 2.0, 0.01, 0.5]], np.float32), np.zeros(1, np.uint8)
     heard = TrayNow("tray1", 1_000, curves, np.array([True]), reason, True)
     states = [FanNow(FAN, "normal", 0.5, 900, False)]
