@@ -196,13 +196,14 @@ def test_requests_are_passed_on_under_the_configured_name_and_answered(tmp_path,
     assert (sent.operator_name, sent.comment) == ("mqtt:desk", "seen (sent as ann)"), "nobody chooses his name"
     assert ask('{"action": "commission"}')["error"].startswith("commission is not accepted by MQTT here")
     assert "no such fan" in ask('{"action": "acknowledge"}', f"{ROOT}/{TRAY}/9/request")["error"]
-    for malformed in ("{", "[]", '{"action": "explode"}', '{"action": "shelve", "duration_s": -1}', "x" * 9999):
+    half = '{"action": "acknowledge", "id": "\\ud800"}'
+    for malformed in ("{", "[]", half, '{"action": "explode"}', '{"action": "shelve", "duration_s": -1}', "x" * 9999):
         assert not ask(malformed)["ok"]
     wrong = ask('{"action": "shelve", "duration_s": "1h", "id": "8"}')
     assert (wrong["id"], wrong["ok"], wrong["error"].partition(":")[0]) == ("8", False, "duration_s")
     assert "operator_name" in ask('{"action": "acknowledge", "operator_name": "root"}')["error"]
     counts = stage.counters()
-    assert (counts["malformed_requests"], counts["refused_requests"], counts["accepted_requests"]) == (7, 2, 1)
+    assert (counts["malformed_requests"], counts["refused_requests"], counts["accepted_requests"]) == (8, 2, 1)
     assert len(stage.sent) == 1
 
 

@@ -136,7 +136,9 @@ def _id_of(payload: bytes) -> str:
     except (ValueError, RecursionError):
         return ""
     name = found.get("id") if isinstance(found, dict) else None
-    return name if isinstance(name, str) and len(name) <= LONGEST_ID else ""
+    if not isinstance(name, str) or len(name) > LONGEST_ID or not name.isprintable():  # JSON may have half characters
+        return ""
+    return name
 
 
 def _why(error: ValueError) -> str:

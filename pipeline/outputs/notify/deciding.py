@@ -58,6 +58,7 @@ class Announced:
         repeats: how many times it was sent again.
         is_stale_said: it has heard that data do not confirm the alarm.
         was_silenced: an operator has silenced the alarm since.
+        owes_end: it has heard an alarm begin that this one has followed without a clear between.
     """
 
     onset_t_ns: int
@@ -67,6 +68,7 @@ class Announced:
     repeats: int = 0
     is_stale_said: bool = False
     was_silenced: bool = False
+    owes_end: bool = False
 
     def to_json(self) -> str:
         """For the outbox."""
@@ -92,14 +94,15 @@ def decide(
     if is_silenced(alarm):
         return None, replace(announced, was_silenced=True) if announced and has_begun else announced
     if not alarm.active:
-        if announced is None or not has_begun:
+        if announced is None or not (has_begun or announced.owes_end):
             return None, announced
-        return Happened((Kind.CLEARED,)), replace(announced, told=Told.ENDED, last_ns=now_ns)
+        return Happened((Kind.CLEARED,)), replace(announced, told=Told.ENDED, last_ns=now_ns, owes_end=False)
     is_other = announced is None or announced.onset_t_ns != alarm.onset_t_ns
     if not _has_tray(target, alarm) or (is_other and has_begun and not hears_of(target, alarm)):
         return None, announced
     if announced is None or is_other:
-        announced = Announced(alarm.onset_t_ns, Told.NOTHING, now_ns)
+        owes_end = announced is not None and (has_begun or announced.owes_end)
+        announced = Announced(alarm.onset_t_ns, Told.NOTHING, now_ns, owes_end=owes_end)
     if announced.told == Told.ENDED or not hears_of(target, alarm):
         return None, announced
     decided = _begin if announced.told == Told.NOTHING else _continue

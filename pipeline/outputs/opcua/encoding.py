@@ -58,8 +58,8 @@ def boolean(value: bool) -> ua.Variant:
     return ua.Variant(value, ua.VariantType.Boolean)
 
 
-def number(value: float, kind: str = "Double") -> ua.Variant:
-    """A number of a built-in type."""
+def value_of(value: float | str, kind: str = "Double") -> ua.Variant:
+    """A value of a built-in type."""
     return ua.Variant(value, ua.VariantType[kind])
 
 

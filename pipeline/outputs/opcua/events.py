@@ -16,7 +16,7 @@ from asyncua.server.subscription_service import SubscriptionService
 
 from fantwin.pipeline.config.models import TrayConfig
 from fantwin.pipeline.outputs.opcua.conditions import condition_fields
-from fantwin.pipeline.outputs.opcua.encoding import localized, number, standard, string
+from fantwin.pipeline.outputs.opcua.encoding import localized, standard, string, value_of
 from fantwin.pipeline.outputs.opcua.event_filter import CONDITION_ID, path_of
 from fantwin.pipeline.outputs.opcua.identifiers import SITE_FOLDER, condition_identifier
 from fantwin.pipeline.site.fleet import Fan
@@ -62,7 +62,7 @@ def system_event(kind: str, message: str) -> SiteEvent:
             "Time": now,
             "ReceiveTime": now,
             "Message": localized(message),
-            "Severity": number(1, "UInt16"),
+            "Severity": value_of(1, "UInt16"),
         }
     )
 

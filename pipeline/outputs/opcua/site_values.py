@@ -11,7 +11,7 @@ from datetime import UTC, datetime
 from asyncua import ua
 
 from fantwin.pipeline.outputs.opcua.conditions import condition_fields
-from fantwin.pipeline.outputs.opcua.encoding import SharedValue, data_value, number
+from fantwin.pipeline.outputs.opcua.encoding import SharedValue, data_value, value_of
 from fantwin.pipeline.outputs.opcua.fan_values import GOOD, VARIABLE, FanValues
 from fantwin.pipeline.outputs.opcua.identifiers import ALARM
 from fantwin.pipeline.outputs.opcua.templates import UNIT_RPM
@@ -54,7 +54,7 @@ class SiteValues:
             value = ua.Variant(top if below == "EURange" else UNIT_RPM, ua.VariantType.ExtensionObject)
             return data_value(value, GOOD, 0, now)
         found = self._values.of(fan, name)
-        value = ua.Variant() if found.value is None else number(found.value, VARIABLE[name].type)
+        value = ua.Variant() if found.value is None else value_of(found.value, VARIABLE[name].type)
         return data_value(value, found.status, found.t_ns, now)
 
     def _of_condition(self, fan: Fan, field: str, now: datetime) -> SharedValue:

@@ -24,6 +24,7 @@ from fantwin.schemas.topics import ALL_TRAYS, BY_NAME, alive_key, sessions_key, 
 _POLL_S = 0.02
 _ANY_STAGE_S = 2.0  # to find any stage: one whose first peer has died tries its endpoint every second
 _ALL_STAGES_S = 30.0  # to receive the health of all stages that were found: one that is not linked yet misses messages
+_SAID_AFTER_S = 4.0
 _UNCHANGED_S = 1.0  # after so long without a new stage, all are found
 _STALLED_S = 10.0  # at the end: after so long without progress, waiting for stages that are behind ends
 
@@ -101,15 +102,22 @@ class Listeners:
         self._before: dict[str, int] = {}
         self._present_at_start: set[str] = set()
 
-    def wait_for_discovery(self, stop: threading.Event) -> None:
-        """Wait until the running stages are connected and the health of each has arrived."""
+    def wait_for_discovery(self, stop: threading.Event, report: Callable[[str], None]) -> None:
+        """Wait until the running stages are connected and the health of each has arrived; `report` prints a line if
+        that takes long."""
         began_s = steady_s = time.monotonic()
         known: set[str] = set()
+        waited_for: list[str] = []
         while not stop.wait(_POLL_S):
             now_s = time.monotonic()
             views = {view.health.header.producer for view in self._views()}
             if views != known:
                 known, steady_s = views, now_s
+            if now_s - began_s > _SAID_AFTER_S and not waited_for:
+                heard = {label(view.health) for view in self._views()}
+                waited_for = [each.label for each in self.present() if each.label not in heard]
+                if waited_for:
+                    report(f"waiting for {', '.join(waited_for)} of site {self._site!r}, up to {_ALL_STAGES_S:.0f} s")
             complete = len(views) >= len(self.present()) and now_s - steady_s > _UNCHANGED_S
             if now_s - began_s > (_ALL_STAGES_S if self._alive else _ANY_STAGE_S) or (views and complete):
                 break

@@ -85,7 +85,7 @@ def publish(
             refuse_conflicts()
             show(progress)
 
-        listeners.wait_for_discovery(stop)
+        listeners.wait_for_discovery(stop, report)
         if listeners.is_replaying():
             raise UserError(f"a replay is running on site {config.site!r} at {config.bus.endpoint}: stop that first")
         for topic, label in made_by_stages(listeners.present(), topics).items():

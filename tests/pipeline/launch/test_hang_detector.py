@@ -17,12 +17,12 @@ class Site:
     """A watchdog that is asked every tenth of a second about stages that are at work until they hang."""
 
     def __init__(self, *names: str) -> None:
-        self.watchdog = HangDetector(LIMIT_S)
+        self.detector = HangDetector(LIMIT_S)
         self.now_s = 0.0
         self.hangs: set[str] = set()
         self.names = names
         for name in names:
-            self.watchdog.started(name, 0.0)
+            self.detector.started(name, 0.0)
 
     def hung_within(self, seconds: float) -> tuple[str, float] | None:
         until_s = self.now_s + seconds
@@ -30,8 +30,8 @@ class Site:
             self.now_s += 0.1
             for name in self.names:
                 if name not in self.hangs:
-                    self.watchdog.heard(name, self.now_s, is_ready=True)
-            if hung := self.watchdog.hung(self.now_s):
+                    self.detector.heard(name, self.now_s, is_ready=True)
+            if hung := self.detector.hung(self.now_s):
                 return hung
         return None
 
@@ -62,7 +62,7 @@ def test_row_01_when_the_launcher_itself_did_not_run_no_stage_is_blamed():
     site = Site("scorer")
     site.hung_within(1.0)
     site.now_s += 3600.0
-    assert site.watchdog.hung(site.now_s) is None
+    assert site.detector.hung(site.now_s) is None
     assert site.hung_within(20.0) is None
 
 

@@ -121,7 +121,7 @@ def test_discovery_waits_for_the_health_of_every_present_stage(sites):
 
     speaker = threading.Thread(target=say_on)
     speaker.start()
-    listeners.wait_for_discovery(threading.Event())
+    listeners.wait_for_discovery(threading.Event(), pytest.fail)
     done.set()
     speaker.join()
     assert listeners.readers(("grid",)) == ["twin_integrator"]

@@ -44,7 +44,7 @@ def test_a_tray_that_the_configuration_lacks_is_one_line(recording, tmp_path):
 
 
 def test_beside_another_replay_it_is_refused(recording, tmp_path, endpoint, monkeypatch):
-    monkeypatch.setattr(Listeners, "wait_for_discovery", lambda _listeners, _stop: None)
+    monkeypatch.setattr(Listeners, "wait_for_discovery", lambda _listeners, _stop, _report: None)
     monkeypatch.setattr(Listeners, "is_replaying", lambda _listeners: True)
     config = tmp_path / "c.toml"
     config.write_text(f'site = "hall"\nbus = {{ endpoint = "{endpoint}" }}\n[[tray]]\nname = "tray1"\nfans = 8\n')

@@ -140,6 +140,12 @@ def test_an_escalation_hears_only_what_nobody_has_acknowledged_for_long():
     assert titles(desk.wait(200)) == ["Nobody has acknowledged: WARNING, fan 2 of tray1"]
     desk.hear(cleared(1), cleared(2))
     assert titles(desk.wait(100)) == ["Cleared: alarm, fan 2 of tray1"], "it never heard of the other"
+    desk.hear(alarm(fan=3))
+    assert len(desk.wait(1000)) == 1
+    desk.hear(alarm(fan=3, onset_s=1000))
+    assert desk.wait(100) == []
+    desk.hear(cleared(3))
+    assert titles(desk.wait(100)) == ["Cleared: alarm, fan 3 of tray1"], "of what it has heard begin it hears the end"
 
 
 def test_a_target_hears_of_its_severity_and_trays_only():
