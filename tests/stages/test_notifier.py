@@ -166,6 +166,18 @@ def test_what_another_output_kept_while_the_notifier_was_away_is_sent_and_forged
     assert mail.subjects() == [f"WARNING, fan {fan} of tray1 (hall)" for fan in (0, 1, 3)]
 
 
+def test_a_fan_that_is_taken_out_of_the_configuration_is_not_spoken_of_any_more(tmp_path, mail, started):
+    targets = [mail_target(tmp_path, mail) | {"repeat_s": 60}]
+    before = started(tmp_path, targets)
+    before.hear(alarm(fan=6), alarm(fan=1))
+    eventually(lambda: len(mail.mails) == 2, "both are said")
+    before.core.close()
+    after = started(tmp_path, targets, fans=4)
+    after.wait(120)
+    eventually(lambda: len(mail.mails) >= 3, "the one that is there is sent again")
+    assert mail.subjects()[2:] == ["Still: WARNING, fan 1 of tray1 (hall)"]
+
+
 @pytest.mark.skipif(ALERTMANAGER is None, reason="needs Debian's prometheus-alertmanager")
 def test_an_alertmanager_has_what_is_presented_and_no_more(tmp_path, started, monkeypatch):
     monkeypatch.setattr("fantwin.pipeline.outputs.notify.alertmanager.RESEND_S", 0.5)

@@ -102,3 +102,11 @@ def test_there_is_no_balance_while_the_drive_is_off() -> None:
     begins, ends, again, end = where_known(found)
     assert (begins, ends, end) == (SETTLES, 200, 400)
     assert again >= 220 + SETTLES
+
+
+def test_there_is_no_balance_far_above_the_training_speeds() -> None:
+    twin = physical_twin(speed_range_rad_s=(0.0, 200.0))
+    fast = grid_of(np.full(100, 60.0), np.full(100, 301.0))
+    slower = grid_of(np.full(100, 60.0), np.full(100, 299.0))
+    assert np.isnan(feed(core_of(twin), [fast]).torque_balance_command).all()
+    assert np.isfinite(feed(core_of(twin), [slower]).torque_balance_command[SETTLES:]).all()
