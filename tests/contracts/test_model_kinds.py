@@ -66,9 +66,10 @@ def test_its_card_says_what_it_is_and_its_file_is_as_good_as_itself(
     twin = trained(kind)
     file = OnnxTwin(twin.save(tmp_path / "x.onnx"))
     assert file.card == twin.card == TwinCard.from_json(twin.card.to_json())
-    assert (file.card.kind, file.card.fans) == (kind, 2)
+    of_class = kind.removesuffix("-w")  # the same class, with a network that sees less
+    assert (file.card.kind, file.card.fans) == (of_class, 2)
     assert file.card.rate_hz == pytest.approx(fan_data.RATE_HZ)
-    assert (file.card.model_uncertainty is not None) == (kind == "hybrid")
+    assert (file.card.model_uncertainty is not None) == (of_class == "hybrid")
     assert file.card.training.iterations <= MOST_ITERATIONS or kind == "physical"  # those of its identification
     of_file, of_twin = (evaluate(each, [RUN]).pooled.rmse_rad_s for each in (file.path, twin))
     assert of_file == pytest.approx(of_twin, rel=1e-9)
