@@ -12,9 +12,11 @@ from tests.support.written_recordings import write_run
 
 EPOCH_NS = 1_790_000_000 * NS_PER_S
 FANS = 2
-PER_DAY = 1500
-"""false alarms that are declared: as few as two minutes can support"""
-FAULT_S = (20, 50)
+HEALTHY_S, OTHER_S = 60, 30
+"""length of the recording of the calibration, and of each of the others"""
+PER_DAY = 3000
+"""false alarms that are declared: as few as a minute can support"""
+FAULT_S = (10, 25)
 """begin and end of the fault of the last fan of a recording that has one"""
 
 

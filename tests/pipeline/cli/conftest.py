@@ -12,7 +12,7 @@ import pytest
 
 from fantwin.pipeline.learning import drops_found
 from tests.support.fantwin_command import fantwin
-from tests.support.healthy_site import EPOCH_NS, PER_DAY, recorded
+from tests.support.healthy_site import EPOCH_NS, HEALTHY_S, OTHER_S, PER_DAY, recorded
 
 MadeOnce = Callable[[str, Callable[[Path], None]], Path]
 
@@ -60,9 +60,9 @@ def healthy(made_once: MadeOnce) -> Path:
     the JSON of its calibration."""
 
     def make(folder: Path) -> None:
-        for seed, name, seconds in ((1, "training", 60), (2, "healthy", 120), (3, "other", 60)):
+        for seed, name, seconds in ((1, "training", 40), (2, "healthy", HEALTHY_S), (3, "other", OTHER_S)):
             recorded(folder / f"{name}.mcap", seed, seconds)
-        recorded(folder / "faulty.mcap", 5, 60, has_fault=True)
+        recorded(folder / "faulty.mcap", 5, OTHER_S, has_fault=True)
         twin, calibrated = folder / "twin.onnx", folder / "calibrated.onnx"
         for words in (
             ("train", folder / "training.mcap", "--model", "physical", "-o", twin),

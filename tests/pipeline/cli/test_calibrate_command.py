@@ -24,7 +24,7 @@ from fantwin.schemas.topics import tray_key
 from fantwin.scoring.calibration.calibration import Calibration
 from fantwin.twin.export.card_entries import with_card_entries
 from tests.support.fantwin_command import error_of, fantwin
-from tests.support.healthy_site import FANS, PER_DAY, recorded
+from tests.support.healthy_site import FANS, HEALTHY_S, OTHER_S, PER_DAY, recorded
 from tests.support.twin_files import write_twin
 
 RATE = ("--false-alarms-per-day", PER_DAY)
@@ -65,7 +65,7 @@ def test_the_calibration_is_in_the_card_and_in_one_document_and_the_rest_of_the_
     assert graphs[0] == graphs[1]
     found = calibration_of(after)
     assert (found.false_alarms_per_day, found.is_target, found.limit_factor) == (PER_DAY, False, 1.0)
-    assert found.fan_hours == pytest.approx(FANS * 120 / 3600, rel=0.1)
+    assert found.fan_hours == pytest.approx(FANS * HEALTHY_S / 3600, rel=0.1)
     assert found.interval_95[0] <= PER_DAY
     assert (set(found.data[0]), found.data[0]["name"]) == ({"name", "sha256"}, "healthy.mcap")
     assert len(found.data[0]["sha256"]) == 64
@@ -76,7 +76,7 @@ def test_the_calibration_is_in_the_card_and_in_one_document_and_the_rest_of_the_
     for drop in document["drops_found"]:
         assert 0 < drop["within_60_s"] < drop["within_10_s"] < drop["within_1_s"] < drop["speed"]
     assert document["verify"]["kept"] is True
-    assert document["verify"]["fan_hours"] == pytest.approx(FANS * 60 / 3600, rel=0.1)
+    assert document["verify"]["fan_hours"] == pytest.approx(FANS * OTHER_S / 3600, rel=0.1)
 
 
 def test_the_printed_interval_decides_and_a_rate_is_broken_only_by_more_alarms_than_chance_explains() -> None:
@@ -97,13 +97,13 @@ def test_without_an_output_the_twin_itself_is_calibrated_and_people_read_what_wa
 ) -> None:
     twin, page = tmp_path / "twin.onnx", tmp_path / "report.html"
     twin.write_bytes((healthy / "twin.onnx").read_bytes())
-    part = ("--from", 20, "--to", 90, "--false-alarms-per-day", 1, "--extrapolate")
+    part = ("--from", 10, "--to", 40, "--false-alarms-per-day", 1, "--extrapolate")
     printed = done("calibrate", twin, healthy / "healthy.mcap", *part)
     found = calibration_of(twin)
     assert found.is_target
-    assert (found.data[0]["from_s"], found.data[0]["to_s"]) == (20.0, 90.0)
-    assert found.fan_hours == pytest.approx(FANS * 70 / 3600, rel=0.1)
-    assert "twin.onnx: calibrated on 0.03" in printed and "learned: " in printed and "limit: by theory" in printed
+    assert (found.data[0]["from_s"], found.data[0]["to_s"]) == (10.0, 40.0)
+    assert found.fan_hours == pytest.approx(FANS * 30 / 3600, rel=0.1)
+    assert "twin.onnx: calibrated on 0.01" in printed and "learned: " in printed and "limit: by theory" in printed
     assert re.search(r"false alarms: \d found, 0.\d+ declared \(", printed)
     assert "target: 1 false alarm per fan and day; 72 fan-hours are needed to show it" in printed
     drops = [line for line in printed.splitlines() if line.startswith("found at")]
@@ -120,7 +120,7 @@ def test_a_broken_rate_is_exit_code_3_and_recordings_that_made_the_twin_prove_no
     verified = ("calibrate", rare, "--verify", other, healthy / "faulty.mcap", "--set", "scorer.latching=true")
     broken = json.loads(done(*verified, "--json", exit_code=3))["verify"]
     assert (broken["kept"], broken["alarms"]) == (False, 1)
-    assert broken["fan_hours"] == pytest.approx(FANS * 120 / 3600, rel=0.1), "all that follows --verify"
+    assert broken["fan_hours"] == pytest.approx(FANS * 2 * OTHER_S / 3600, rel=0.1), "all that follows --verify"
     copy.write_bytes((healthy / "healthy.mcap").read_bytes())
     error = error_of("calibrate", calibrated, "--verify", other, "--verify", copy)
     assert f"{copy}: {calibrated} was calibrated on it, so it proves nothing" in error
@@ -151,18 +151,18 @@ def test_of_several_trays_the_chosen_one_alone_makes_and_verifies_a_twin(healthy
     assert json.loads(done(*words))["sigma"] == pytest.approx(expected)
     words = ("calibrate", healthy / "twin.onnx", both, *RATE, "-o", tmp_path / "o.onnx", "--json", "--tray", "a")
     found = json.loads(done(*words, "--verify", others))
-    assert found["verify"]["fan_hours"] == pytest.approx(FANS * 60 / 3600, rel=0.1)
+    assert found["verify"]["fan_hours"] == pytest.approx(FANS * OTHER_S / 3600, rel=0.1)
     alone = json.loads((healthy / "calibrated.json").read_text())["calibration"]
     assert {name for name, value in alone.items() if found["calibration"][name] != value} == {"data", "created"}
     assert found["calibration"]["data"][0]["tray"] == "a"
 
 
 def test_without_a_choice_all_trays_are_calibrated_on_if_the_twin_fits_them(healthy: Path, tmp_path: Path) -> None:
-    alone = recorded(tmp_path / "alone.mcap", 4, 20, fans=1)
+    alone = recorded(tmp_path / "alone.mcap", 4, 10, fans=1)
     both = together(tmp_path / "both.mcap", a=healthy / "other.mcap", b=alone)
     of_one = write_twin(tmp_path / "of-one.onnx")
     found = json.loads(done("calibrate", of_one, both, *RATE, "--extrapolate", "--json"))["calibration"]
-    assert (found["runs"], found["fan_hours"]) == (2, pytest.approx((FANS * 60 + 20) / 3600, rel=0.15))
+    assert (found["runs"], found["fan_hours"]) == (2, pytest.approx((FANS * OTHER_S + 10) / 3600, rel=0.15))
     expected = f"{both}: several trays, a of 2 fans, b of 1 fan, and a twin of 2 fans: choose one with --tray"
     assert error_of("calibrate", healthy / "twin.onnx", both, *RATE) == expected
     assert error_of("calibrate", healthy / "calibrated.onnx", "--verify", both) == expected
