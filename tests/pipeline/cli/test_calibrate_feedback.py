@@ -16,9 +16,10 @@ from fantwin.pipeline.replay.offline.marked_alarms import alarms_in, marked_alar
 from fantwin.schemas.enums import Action
 from fantwin.schemas.messages import Alarm
 from fantwin.scoring.model.priors import Priors
+from tests.pipeline.cli.test_calibrate_command import changed
 from tests.pipeline.learning.test_healthy_evidence import with_alarm
 from tests.support.fantwin_command import fantwin
-from tests.support.healthy_site import FANS, FAULT_S, PER_DAY
+from tests.support.healthy_site import FANS, FAULT_S, OTHER_S, PER_DAY
 
 
 def calibrated(folder: Path, action: Action, place: Path) -> tuple[dict[str, Any], list[str]]:
@@ -57,12 +58,11 @@ def test_what_is_marked_as_false_is_learned_from_and_what_is_marked_as_true_is_n
 def test_a_true_alarm_is_no_false_one_when_the_declared_rate_is_tested(healthy: Path, tmp_path: Path) -> None:
     (span,) = (each.left_out for each in marked_alarms([_marked(tmp_path, Action.TRUE_ALARM)]))
     assert span is not None
+    rare = changed(tmp_path / "rare.onnx", healthy / "calibrated.onnx", false_alarms_per_day=100.0)
     with RecordingsInParallel() as pool:
-        found = check_declared_rate(
-            healthy / "calibrated.onnx", [healthy / "faulty.mcap"], [], pool.map, left_out=[replace(span, path=None)]
-        )
+        found = check_declared_rate(rare, [healthy / "faulty.mcap"], [], pool.map, left_out=[replace(span, path=None)])
     assert found.alarms == 0
-    assert found.fan_hours == pytest.approx((FANS * 60 - FAULT_S[1]) / 3600, rel=0.1)
+    assert found.fan_hours == pytest.approx((FANS * OTHER_S - FAULT_S[1]) / 3600, rel=0.1)
 
 
 def _marked(folder: Path, action: Action | None) -> tuple[Path, list[tuple[str, Alarm]]]:
