@@ -39,7 +39,7 @@ def folder(made_once: MadeOnce) -> Path:
 
     def make(path: Path) -> None:
         for seed, name in enumerate(RECORDINGS, start=1):
-            write_run(path / name, thinned(published_run(seed, 15.0 + 5.0 * seed, fans=2), 5))
+            write_run(path / name, thinned(published_run(seed, 6.0 + 2.0 * seed, fans=2), 5))
         (path / BAD).write_bytes(b"nothing that was recorded")
         trained = fantwin("train", path / "a.mcap", "--model", "physical", "-o", path / "twin.onnx")
         assert trained.exit_code == 0, trained.output
@@ -88,7 +88,7 @@ def test_networks_that_are_trained_two_at_a_time_give_the_same_twin(folder: Path
     for jobs in (1, 2):
         output = tmp_path / f"with-{jobs}"
         output.mkdir()
-        options = ("--networks", 2, "--iterations", 2, "--to", 10, "--json", "--jobs", jobs)
+        options = ("--networks", 2, "--iterations", 2, "--to", 6, "--json", "--jobs", jobs)
         result = fantwin("train", folder / RECORDINGS[0], *options, "-o", output / "trained.onnx")
         assert result.exit_code == 0, result.output
         assert ("training, 2 networks at a time" in result.stderr) == (jobs == 2)
