@@ -33,7 +33,7 @@ pytestmark = pytest.mark.slow
 def _in_minutes() -> Iterator[None]:
     """What a site does in hours, with twins that are trained at once: what is chosen and why is the same."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("fantwin.pipeline.learning.versions.REFERENCE_S", 150.0)
+        patch.setattr("fantwin.pipeline.learning.versions.REFERENCE_S", 110.0)
         patch.setattr(next_version, "CHECKED_S", 100.0)
         patch.setattr(next_version, "LEAST_CHECKED_S", 60.0)
         patch.setattr(next_version, "fit_twin", partial(fit_twin, settings=TrainingSettings("physical")))
@@ -49,7 +49,7 @@ def two_versions(made_once: MadeOnce) -> Path:
     """The learning folder of a tray with two versions."""
 
     def make(folder: Path) -> None:
-        for first_s, seconds, seed in ((0, 70.0, 1), (1000, 100.0, 2)):
+        for first_s, seconds, seed in ((0, 62.0, 1), (1000, 70.0, 2)):
             add_recording(folder, first_s, seconds, seed)
             assert made(folder)
 
