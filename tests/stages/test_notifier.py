@@ -20,7 +20,7 @@ from fantwin.schemas.enums import Severity, Transition
 from fantwin.schemas.messages import Alarm
 from fantwin.schemas.units import NS_PER_S
 from fantwin.stages.notifier import NotifierCore
-from tests.support.message_receivers import ALERTMANAGER, MailServer, RunningAlertmanager
+from tests.support.message_receivers import ALERTMANAGER, HttpReceiver, MailServer, RunningAlertmanager
 from tests.support.notified_alarms import START_NS, alarm, cleared, notifier_core, secret
 from tests.support.running_chain import eventually
 
@@ -176,6 +176,18 @@ def test_a_fan_that_is_taken_out_of_the_configuration_is_not_spoken_of_any_more(
     after.wait(120)
     eventually(lambda: len(mail.mails) >= 3, "the one that is there is sent again")
     assert mail.subjects()[2:] == ["Still: WARNING, fan 1 of tray1 (hall)"]
+
+
+def test_an_alertmanager_is_given_its_alerts_when_they_change_and_not_with_each_look(tmp_path, started):
+    receiver = HttpReceiver()
+    notifier = started(tmp_path, [{"name": "m", "kind": "alertmanager", "url": f"http://127.0.0.1:{receiver.port}"}])
+    notifier.hear(alarm(fan=1))
+    eventually(lambda: receiver.received, "it is given the alert")
+    notifier.wait(30)
+    notifier.hear(alarm(fan=2))
+    eventually(lambda: any(len(alerts) == 2 for alerts in receiver.received), "it is given both")
+    assert [len(alerts) for alerts in receiver.received] == [1, 2]
+    receiver.stop()
 
 
 @pytest.mark.skipif(ALERTMANAGER is None, reason="needs Debian's prometheus-alertmanager")

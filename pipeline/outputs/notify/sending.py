@@ -5,6 +5,7 @@ from __future__ import annotations
 import sqlite3
 import threading
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -45,7 +46,7 @@ def words_sent(waiting: Waiting) -> Text:
     return replace(waiting.text, body="\n".join(lines))
 
 
-class TargetThread:
+class TargetThread(ABC):
     """A thread that delivers to one target, and tries again with growing delays where that fails."""
 
     def __init__(self, target: str, outbox: Outbox, again_s: float) -> None:
@@ -78,9 +79,9 @@ class TargetThread:
         """Why nothing arrives at the target; empty if all is well. The same words as long as the reason is the same."""
         return self._failing
 
+    @abstractmethod
     def _deliver_all(self) -> Failure | None:
         """Deliver what there is, up to the first failure."""
-        raise NotImplementedError
 
     def _arrived(self) -> None:
         self._failing, self._delay_s = "", 0.0

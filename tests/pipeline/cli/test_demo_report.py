@@ -35,7 +35,7 @@ def summary_of(
     lost: dict[str, int] | None = None,
     times_recorded: int = 1,
 ) -> Summary:
-    """Of a made-up run. times_recorded: how often its samples are in the recording."""
+    """The summary of a made-up run. times_recorded: how often its samples are in the recording."""
     truth, recording = folder / "truth.json", folder / "recording.mcap"
     truth.write_text(json.dumps({"faults": [INLET, ROTOR], "samples_sent": sent, "fans": 8, "start_ns": START_NS}))
     score = replace(one_sample(1), t_ns=np.array([START_NS]))

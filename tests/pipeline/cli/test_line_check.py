@@ -35,7 +35,7 @@ def config_of(**keys: object) -> Config:
 
 
 def context_of(config: Config) -> Context:
-    """Of acquisition and its one tray."""
+    """What acquisition and its one tray need."""
     section = config.sections["acquisition"]
     return Context("site", config.trays, section, folder=Path(), run_folder=Path(), started_t_ns=0)
 

@@ -32,7 +32,7 @@ def twin_with(path: Path, limit_factor: float) -> Path:
 
 
 def found_after_s(path: Path, drops: Array) -> Array:
-    """After how many seconds each drop of fans at half their top speed is found, in the noise of their card."""
+    """Seconds after which each drop of fans at half their top speed is found, in the noise of their card."""
     twin = load_tray_twin(path, len(drops))
     fans = modelled_fans(twin)
     exact = dropping(twin, fans, 0.5 * fans.top_rad_s, drops)

@@ -13,7 +13,7 @@ TRAY = TrayConfig.model_validate({"name": "tray1", "fans": 2, "command_max": 100
 
 
 def samples(commands: np.ndarray, first_s: float = 0.0, period_s: float = 0.5) -> Raw:
-    """Of two fans; commands: (n, 2)."""
+    """Samples of two fans; commands: (n, 2)."""
     n = len(commands)
     t_ns = ((first_s + period_s * np.arange(n)) * NS_PER_S).astype(np.int64)
     return Raw(
