@@ -45,6 +45,7 @@ def end_itself(_path: Path) -> None:
 
 def test_a_worker_that_is_killed_is_an_error_of_one_line(folder: Path) -> None:
     dask: Any = import_module("dask")
+    import_module("distributed")  # with its own settings: the end of `set` would take them away if it had made them
     paths = [folder / name for name in RECORDINGS]
     with (
         dask.config.set({"distributed.scheduler.allowed-failures": 0}),
