@@ -333,7 +333,8 @@ class Launcher:
         self._delay_start(slot, now)
 
     def _restart_those_down(self) -> None:
-        """Start a stage that is down at the end once more: it requests what it missed, so nothing is lost."""
+        """Start a stage that is down at the end once more: it requests what it missed, so nothing is lost. One that
+        has just been restarted is waited for as well."""
         started = [slot for slot in self._slots if slot.child or slot.start_at_s]
         down = [slot for slot in started if slot.child is None or slot.child.exit_status() is not None]
         for slot in down:
@@ -345,7 +346,8 @@ class Launcher:
                 why = f"no process could be started: {_reason(error)}"
                 self._say(f"{slot.row.label}: {why}; what it missed while it was down is lost")
         until_s = time.monotonic() + self._config.launcher.stop_timeout_s
-        while time.monotonic() < until_s and not all(map(self._is_back, down)):
+        awaited = [slot for slot in started if slot.was_ready or slot in down]
+        while time.monotonic() < until_s and not all(map(self._is_back, awaited)):
             time.sleep(_POLL_S)
 
     def _is_back(self, slot: _Slot) -> bool:

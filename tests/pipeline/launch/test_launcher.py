@@ -238,6 +238,16 @@ def test_a_stage_for_which_there_is_no_process_is_started_later_unless_the_site_
     assert slot.sessions == [("recorder", 7)]
 
 
+def test_a_stage_that_was_restarted_just_before_the_end_is_waited_for(monkeypatch, no_room):
+    launcher, clock, slot = recorder_only([], monkeypatch)
+    no_room.has_room, slot.was_ready = True, True
+    launcher._start(slot)
+    monkeypatch.setattr(EndedChild, "exit_status", lambda _child: None)
+    monkeypatch.setattr(launcher, "_is_back", lambda _slot: clock.now_s > 104.0)
+    launcher._restart_those_down()
+    assert 104.0 < clock.now_s < 105.0
+
+
 class EndedChild:
     """The process of a stage that ends in order."""
 
