@@ -23,7 +23,7 @@ from typing import TextIO
 import numpy as np
 
 from fantwin.pipeline.errors import UsageError, UserError
-from fantwin.pipeline.sources.tables.columns import DATE_UNIT, NS_PER_UNIT, NumberColumn, TimeColumn
+from fantwin.pipeline.sources.tables.cells import DATE_UNIT, NS_PER_UNIT, NumberColumn, TimeColumn
 from fantwin.schemas.messages import FURTHEST_T_NS, LARGEST_PERIOD_NS, Array
 from fantwin.schemas.units import NS_PER_S, RAD_S_PER_UNIT
 

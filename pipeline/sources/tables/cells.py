@@ -1,4 +1,4 @@
-"""Columns of a measured table, filled in parts: text becomes numbers at once, so that large tables fit."""
+"""Cells of a measured table as numbers and times, column by column and in parts: large tables fit in memory."""
 
 from __future__ import annotations
 
