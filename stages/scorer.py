@@ -29,6 +29,7 @@ from fantwin.pipeline.tray_scoring.healthy_twin import HealthyTwin, ScorerConfig
 from fantwin.pipeline.tray_scoring.judged_share import JudgedShare
 from fantwin.pipeline.tray_scoring.learned_scorer import LearnedTwinScorer
 from fantwin.pipeline.tray_scoring.snapshot_store import Elsewhere, SnapshotStore
+from fantwin.pipeline.tray_scoring.snapshot_times import with_times_moved
 from fantwin.pipeline.tray_scoring.tray_scorer import TrayScorer
 from fantwin.schemas.enums import Transition
 from fantwin.schemas.messages import Alarm, Message, ModelCard, Prediction, Request, Score, ScorerSnapshot
@@ -37,7 +38,6 @@ from fantwin.schemas.units import NS_PER_S, SpeedUnit
 from fantwin.scoring.alarms.alarm_text import AlarmText
 from fantwin.scoring.alarms.unscored_monitor import UnscoredMonitor
 from fantwin.scoring.model.decision import FORGETS_S
-from fantwin.scoring.snapshot_times import with_times_moved
 
 SNAPSHOT_PERIOD_NS = 60 * NS_PER_S  # between snapshots while nothing happens
 SNAPSHOT_PERIOD_SAMPLES = 3000  # at least: at slow rates snapshots would be most of a recording
@@ -222,10 +222,10 @@ class ScorerCore(Core):
 
     def notes(self) -> list[str]:
         """Notes on where it continued from, if not from its file; on the share of the samples that was judged, and why
-        the others were not; on fans that change slowly."""
+        the others were not; on fans that change slowly, and on tachos that are not sound."""
         of_twin = [] if self._twin.is_calibrated else [NOT_CALIBRATED]
         of_store = [self._snapshot_store.note] if self._snapshot_store and self._snapshot_store.note else []
-        return [*of_twin, *of_store, *self._judged_share.notes, *self.tray.wear.notices()]
+        return [*of_twin, *of_store, *self._judged_share.notes, *self.tray.notices()]
 
     def problem(self) -> str:
         """Problem for people to look at: input, snapshot, fans without a score, wear."""

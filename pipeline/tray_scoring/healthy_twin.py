@@ -97,11 +97,11 @@ def known_of(twin: TrayTwin, declared_per_day: float | None = None) -> HealthyTw
     Raises:
         ValidationError: its calibration is not valid.
     """
-    card, balance, fans = twin.card, twin.balance, modelled_fans(twin)
+    card, fans = twin.card, modelled_fans(twin)
     calibration = Calibration.model_validate(card.calibration) if card.calibration is not None else None
     declared = calibration.false_alarms_per_day if calibration else FALSE_ALARMS_PER_DAY
     lowest_command = card.standstill.turning_command if card.standstill else 0.0
-    columns = (balance.viscous, balance.drag, balance.friction, fans.top_rad_s, fans.has_own_drive)
+    columns = (fans.viscous, fans.drag, fans.friction, fans.top_rad_s, fans.has_own_drive)
     return HealthyTwin(
         twin.sha256,
         fans,

@@ -111,8 +111,8 @@ class SnapshotStore:
         except CodecError as error:
             start = "continue from the one that the recorder keeps, or" if self._elsewhere else "start"
             raise StageError(
-                f"{self.path}: not a scorer's snapshot ({error}); remove it to {start} without one: all fans are then "
-                "commissioned again"
+                f"{self.path}: not a scorer's snapshot ({error}); remove it to {start} without one: what was "
+                "learned of the fans, alarms and wear then begin again"
             ) from error
         _check_format(own, str(self.path))
         return own
@@ -124,7 +124,8 @@ class SnapshotStore:
             self.problem = ""
         except OSError as error:
             self.problem = (
-                f"{self.path}: cannot save baselines and alarms: {error.strerror}; a restart would forget them"
+                f"{self.path}: cannot save what was learned of the fans, nor alarms: {error.strerror}; a restart would "
+                "forget them"
             )
 
 

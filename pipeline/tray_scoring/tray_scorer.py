@@ -60,6 +60,8 @@ class TrayScorer:
         """(fans,) what it does against its command, number in KINDS"""
         self._seen = np.zeros((4, fans))
         """(4, fans) lowest and highest speed, lowest and highest command since an alarm was raised"""
+        self._command = np.zeros(fans)
+        """(fans,) newest command"""
         self._now = ScoreColumns.empty(fans)
 
     def _open(self, period_ns: int) -> None:
@@ -89,6 +91,15 @@ class TrayScorer:
             alarms += self._decide(one, item)
         columns.fill(slice(begin, len(item.t_ns)), self._now)
         return score_of(item, columns, self._bins.unseen_rad_s), alarms
+
+    def notices(self) -> list[str]:
+        """Notes on fans that change slowly, and on tachos that are not sound."""
+        many = self._decision.wrong.many
+        unsound = [
+            f"fan {fan}: {many[fan]:.0%} of the readings of its tacho are wrong: check the tacho and its wire"
+            for fan in np.flatnonzero(many).tolist()
+        ]
+        return [*self.wear.notices(), *unsound]
 
     def recommission(self, fans: Array, t_ns: int) -> None:
         """Forget what was learned of some fans, (fans,) of bool, after the sample at t_ns."""
@@ -120,7 +131,7 @@ class TrayScorer:
 
     def causes(self, fan: int, known: tuple[Diagnosis, ...] = ()) -> tuple[Diagnosis, ...]:
         """See FanFacts."""
-        decision, falls, command = self._decision, self._falls, float(self._seen[3, fan])
+        decision, falls, command = self._decision, self._falls, float(self._command[fan])
         kind = KINDS[self._kind[fan]]
         if kind == Standing.NOT_STARTED and known and is_of_standstill(known[0]):
             return known  # how it came to rest says more than that it does not start
@@ -214,6 +225,7 @@ class TrayScorer:
         """Keep what speeds and commands there were since an alarm; before one, those of now."""
         speed = np.where(np.isfinite(one.measured_rad_s), np.abs(one.measured_rad_s), np.abs(one.predicted_rad_s))
         now = np.stack((speed, speed, one.command, one.command))
+        self._command = np.where(np.isfinite(one.command), one.command, self._command)
         lowest, highest = np.fmin(self._seen[::2], now[::2]), np.fmax(self._seen[1::2], now[1::2])
         self._seen[::2] = np.where(was_active, lowest, now[::2])
         self._seen[1::2] = np.where(was_active, highest, now[1::2])
@@ -227,6 +239,7 @@ class TrayScorer:
             **within("falls", self._falls.arrays()),
             **within("now", vars(self._now)),
             "seen": self._seen,
+            "command": self._command,
             "kind": self._kind,
         }
         if self._against:
@@ -259,4 +272,4 @@ class TrayScorer:
         if self._against:
             self._against.restore(part("against", stored))
         self._now = ScoreColumns(**part("now", stored))
-        self._seen, self._kind = stored["seen"], stored["kind"]
+        self._seen, self._command, self._kind = stored["seen"], stored["command"], stored["kind"]

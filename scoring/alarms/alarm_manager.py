@@ -20,10 +20,12 @@ from fantwin.scoring.diagnosis.causes import is_of_standstill
 from fantwin.scoring.diagnosis.ranked_causes import says_more
 
 AGAIN_AFTER_S = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512)
-"""times after an alarm was raised at which its causes are looked at again"""
+"""times after an alarm was raised, or has another kind, at which its causes are looked at again; then each time the
+last one has passed"""
+OF_SPEED = (Statistic.DEVIATION, Statistic.STANDSTILL)
+"""one kind of alarm; each other statistic is a kind"""
 AT_ONCE_NS = 60 * NS_PER_S
 """alarms of several fans that begin within this time may have one reason"""
-_OF_FEEDBACK = ("feedback", "feedback_by", "feedback_reason", "marked_onset_t_ns")
 MAX_REQUESTERS = 64  # the latest whose requests are remembered; docs/reference/alarms.md gives the consequences
 
 
@@ -82,21 +84,19 @@ class AlarmManager:
         """Process what was decided at the end of a bin; returns the messages."""
         alarms: list[Alarm] = []
         for event in self._conditions.update(now):
-            fan, changed = event.fan, _state_fields(event.alarm_state)
-            if event.transition == Transition.RAISED:
-                self.raised += 1
-                self._due_t_ns[fan] = [now.t_ns + after_s * NS_PER_S for after_s in AGAIN_AFTER_S]
-                changed["causes"] = facts.causes(fan)
-            elif event.transition == Transition.CLEARED:
+            fan, before = event.fan, self._next_message(event.fan)
+            changed, measured = _state_fields(event.alarm_state), facts.measured(fan)
+            if event.transition == Transition.CLEARED:
                 self.cleared += 1
                 self._due_t_ns.pop(fan, None)
+                measured = replace(measured, statistic=before.statistic)  # nothing speaks for a fault any more
+            elif event.transition == Transition.RAISED or (now.judged[fan] and _is_other(measured, before)):
+                self._due_t_ns[fan] = _again_after(now.t_ns)
+                changed["causes"] = facts.causes(fan)
+            self.raised += event.transition == Transition.RAISED
             if event.transition != Transition.DATA_LOST:
-                changed |= vars(facts.measured(fan))
-            if event.transition == Transition.CLEARED:
-                changed["statistic"] = self._next_message(fan).statistic  # nothing speaks for a fault any more
-            alarms.append(
-                self._emit(replace(self._next_message(fan), t_ns=now.t_ns, transition=event.transition, **changed))
-            )
+                changed |= vars(measured)
+            alarms.append(self._emit(replace(before, t_ns=now.t_ns, transition=event.transition, **changed)))
         return [*alarms, *self._diagnosed(now, facts)]
 
     def _diagnosed(self, now: Decided, facts: FanFacts) -> list[Alarm]:
@@ -106,17 +106,22 @@ class AlarmManager:
         self._stood = stands.copy()
         due = {fan for fan, times in self._due_t_ns.items() if times[0] <= now.t_ns}
         for fan in due:
-            left = [t_ns for t_ns in self._due_t_ns.pop(fan) if t_ns > now.t_ns]
-            if left:
-                self._due_t_ns[fan] = left
+            left = [t_ns for t_ns in self._due_t_ns[fan] if t_ns > now.t_ns]
+            self._due_t_ns[fan] = left or [now.t_ns + AGAIN_AFTER_S[-1] * NS_PER_S]
         alarms: list[Alarm] = []
-        for fan in sorted(due.union(begins)):
-            before = self._next_message(fan)
-            causes = facts.causes(fan, before.causes)
-            if before.active and not before.stale and now.judged[fan] and _is_news(causes, before.causes):
-                measured = vars(facts.measured(fan))
+        for fan in self._due_t_ns:
+            before, measured = self._next_message(fan), facts.measured(fan)
+            if not before.active or before.stale or not now.judged[fan]:
+                continue
+            is_other = _is_other(measured, before)
+            if not (is_other or fan in due or fan in begins):
+                continue
+            if is_other:
+                self._due_t_ns[fan] = _again_after(now.t_ns)
+            causes = facts.causes(fan, () if is_other else before.causes)
+            if is_other or _is_news(causes, before.causes):
                 changed = {"t_ns": now.t_ns, "transition": Transition.DIAGNOSED, "causes": causes}
-                alarms.append(self._emit(replace(before, **measured, **changed)))
+                alarms.append(self._emit(replace(before, **vars(measured), **changed)))
         return alarms
 
     def answer(self, request: Request, last_t_ns: int) -> list[Alarm]:
@@ -255,6 +260,17 @@ class AlarmManager:
         return alarm
 
 
+def _again_after(t_ns: int) -> list[int]:
+    """Return the times at which the causes of an alarm that begins at t_ns are looked at."""
+    return [t_ns + after_s * NS_PER_S for after_s in AGAIN_AFTER_S]
+
+
+def _is_other(measured: Measured, before: Alarm) -> bool:
+    """Return whether what an alarm is about is of another kind than it was."""
+    of_both = {measured.statistic, before.statistic}
+    return len(of_both) > 1 and of_both != set(OF_SPEED)
+
+
 def _is_news(causes: tuple[Diagnosis, ...], than: tuple[Diagnosis, ...]) -> bool:
     """Return whether causes are worth a message. What a fan does after it stood says less of why it came to rest."""
     stood = bool(than) and is_of_standstill(than[0])
@@ -285,10 +301,8 @@ def _state_fields(state: AlarmState) -> dict[str, Any]:
 
 
 def _to_json(alarm: Alarm) -> dict[str, Any]:
-    """The fields of an alarm. Most alarms have no feedback, so its fields are left out if they are empty."""
-    return {
-        name: value for name, value in asdict(alarm).items() if name != "header" and (value or name not in _OF_FEEDBACK)
-    }
+    """The fields of an alarm."""
+    return {name: value for name, value in asdict(alarm).items() if name != "header"}
 
 
 def _from_json(stored: Mapping[str, Any]) -> Alarm:
@@ -297,7 +311,7 @@ def _from_json(stored: Mapping[str, Any]) -> Alarm:
             **stored,
             "severity": Severity.known(stored["severity"]),
             "transition": Transition.known(stored["transition"]),
-            "feedback": Feedback.known(stored.get("feedback", 0)),
+            "feedback": Feedback.known(stored["feedback"]),
             "statistic": Statistic(stored["statistic"]),  # a detector may be added before its name
             "causes": tuple(Diagnosis(**cause) for cause in stored["causes"]),
         }

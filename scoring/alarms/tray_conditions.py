@@ -15,8 +15,7 @@ import numpy as np
 from fantwin.schemas.enums import Action, Severity, Transition
 from fantwin.schemas.messages import Array
 from fantwin.scoring.alarms.alarm_state import UNTIL_IT_CLEARS_T_NS, AlarmState, ConditionSettings, FanCondition
-
-NEVER_NS = -(1 << 62)
+from fantwin.scoring.column_state import NEVER_NS
 
 
 @dataclass(frozen=True)

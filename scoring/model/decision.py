@@ -32,6 +32,9 @@ TOLD_APART = 16.0
 small fault from none, and its alarm would stay"""
 OVER_S, OVER_ODDS = 10.0, 100.0
 """time for which a healthy fan is likelier, by these odds, than the fault at its largest, until that is over"""
+LEFT_SIGMAS = 3.0
+"""what is left of a fault may be an error of the healthy state up to so many standard deviations: then a healthy fan is
+likelier than a smaller fault by OVER_ODDS at most"""
 PROBABLE = 0.05
 """probability from which a fault may be that of an alarm"""
 SMALLEST = 0.01
@@ -92,8 +95,8 @@ class Decision(Saved):
         """(fans,) whether the speed or the torque balance has an alarm"""
         self._raised, self.onset = np.zeros(count, np.int64), np.zeros(count, np.int64)
         """(fans,) bins in which an alarm was raised, and in which its fault probably began"""
-        self._peak, self._over_s = np.zeros(count), np.zeros(count)
-        """(fans,) share of the speed that the fault took at most, with its sign; and how long it has been over"""
+        self._peak, self._over_s = np.zeros((2, count))
+        """(fans,) share of the speed that the fault surely took, at most, with its sign; and for how long it is over"""
         faults = len(self._hypotheses.faults)
         self._shape, self._is_probable = np.ones((count, faults)), np.zeros((count, faults), np.bool_)
         """(fans, faults) share of the speed that each takes where that of an alarm was at its largest; which it may
@@ -239,7 +242,7 @@ class Decision(Saved):
         model, evidence = self.model, self._evidence
         evidence.begin(now.moved_to_rad_s - now.moves_rad_s2 * self.bin_s)
         largest = self._peak * self._shows
-        room = (np.square(largest) / TOLD_APART - model.covariance[:, FAULT, FAULT]).clip(0.0)
+        room = (np.square(largest) / TOLD_APART - self._own_variance()).clip(0.0)
         walk = np.square(WALKS_PER_SQRT_S * largest) * self.bin_s
         model.noise[:, FAULT] = np.where(self.active, np.minimum(walk, room), 0.0)
         evidence.show(now.changes)
@@ -292,9 +295,8 @@ class Decision(Saved):
         makes[:, FAULT] = pushes[onset, columns] / max(speed_rad_s, SLOWEST_RAD_S)
         model.mean[fan] += sizes @ makes
         model.covariance[fan] += makes.T @ of_sizes @ makes
-        size = float(model.mean[fan, FAULT])
-        self._peak[fan] = math.copysign(max(abs(size), SMALLEST), size)
         self.active[fan], self._over_s[fan] = True, 0.0
+        self._peak[fan] = _surely(model.mean[:, FAULT], self._own_variance())[fan]
         self._raised[fan], self.onset[fan] = evidence.number, evidence.began[onset]
         self._forget(fan)
 
@@ -319,20 +321,33 @@ class Decision(Saved):
         first = [BEFORE_GROWTH.get(fault.columns[0], fault.columns[0]) for fault in self._hypotheses.faults]
         return pushes[:, 0, first] / np.maximum(speed, SLOWEST_RAD_S)
 
+    def _own_variance(self) -> Array:
+        """Return the variance of the faults of active alarms if the slow states are what they were, (fans,); else 0.
+
+        A slow state moves on while nothing is learned of it, and what it does shows as the fault: that is no change of
+        the fault.
+        """
+        found = np.zeros(len(self.active))
+        if self.active.any():
+            of_alarms = self.model.covariance[self.active]
+            slow, both = of_alarms[:, SLOW, SLOW] + 1e-15 * np.eye(SLOW.stop), of_alarms[:, SLOW, FAULT, np.newaxis]
+            explained = (both * np.linalg.solve(slow, both)).sum(axis=(1, 2))
+            found[self.active] = (of_alarms[:, FAULT, FAULT] - explained).clip(0.0)
+        return found
+
     def _log_odds(self) -> Array:
         """(fans,) log of how much likelier the fault of an alarm is, as large as it was at most and as it shows at this
         speed, than a healthy fan."""
-        size, variance = self.model.mean[:, FAULT], self.model.covariance[:, FAULT, FAULT]
         expected = self._peak * self._shows
-        return expected * (size - 0.5 * expected) / np.maximum(variance, 1e-12)
+        return expected * (self.model.mean[:, FAULT] - 0.5 * expected) / np.maximum(self._own_variance(), 1e-12)
 
     def _is_over(self, known: Array, shares: Array) -> Array:
         """(fans,) whether for some time a healthy fan has been likelier than the fault at its largest. shares: see
         `_shares`."""
         model, peak = self.model, self._peak
         size, variance = model.mean[:, FAULT], model.covariance[:, FAULT, FAULT]
-        surely = np.sign(size) * (np.abs(size) - 2.0 * np.sqrt(variance))
-        is_larger = known & self.active & (surely * np.sign(size) > np.abs(peak))
+        surely = _surely(size, self._own_variance())
+        is_larger = known & self.active & (np.abs(surely) > np.abs(peak))
         self._peak = np.where(is_larger, surely, peak)
         is_largest = is_larger | (self._raised == self.number)
         self._shape = np.where(is_largest[:, np.newaxis], shares, self._shape)
@@ -343,9 +358,15 @@ class Decision(Saved):
         self._shows = np.where(known, np.nan_to_num(shows).clip(0.0), self._shows)
         varies = np.zeros(len(known), np.bool_)
         varies[[fan for fan, alarm in self.alarms.items() if alarm.varies]] = True
-        is_healthy = self.active & ~varies & (self._log_odds() < -math.log(OVER_ODDS))
+        is_left = size * np.sign(self._peak) > LEFT_SIGMAS * np.sqrt(variance)
+        is_healthy = self.active & ~varies & ~is_left & (self._log_odds() < -math.log(OVER_ODDS))
         self.is_returning = np.where(known, is_healthy, self.is_returning)
-        over_s = np.where(is_healthy, self._over_s + self.bin_s, 0.0)
+        over_s = np.where(is_healthy, self._over_s + self.bin_s * self.operation.bins_held, 0.0)
         self._over_s = np.where(known, over_s, self._over_s)
         found: Array = self._over_s >= OVER_S
         return found
+
+
+def _surely(size: Array, variance: Array) -> Array:
+    """Return the share of the speed that a fault takes at least, with its sign, and not more than all of it."""
+    return np.copysign((np.abs(size) - 2.0 * np.sqrt(variance)).clip(SMALLEST), size).clip(-1.0)

@@ -53,7 +53,8 @@ class MissingReadings(Saved):
         readings, lost = missing[:, ::2].sum(axis=1), missing[:, 1::2].sum(axis=1)
         self._run = np.where(lost < readings, 0.0, self._run + lost)
         cleared = self._is_over(gain, readings > 0) if self.is_active.any() else np.zeros(len(missing), np.bool_)
-        begins = np.where(self.is_active, -np.inf, 0.0)[:, np.newaxis]  # in an alarm there are no more onsets
+        has_onset = (readings > 0) & ~self.is_active  # the statistic counts bins with readings, until an alarm
+        begins = np.where(has_onset, 0.0, -np.inf)[:, np.newaxis]
         self._log_terms = np.minimum(np.logaddexp(self._log_terms, begins) + gain, LARGEST)
         log_statistic = _log_sum(self._log_terms) - math.log(len(SHARES))
         self.is_active = (self.is_active | (log_statistic > self._log_limit)) & ~cleared

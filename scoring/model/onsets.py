@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from copy import copy
 from itertools import combinations
 
 import numpy as np
@@ -189,8 +190,10 @@ class Hypotheses:
         self._means = [(row, fault.mean) for row, fault in enumerate(self.faults) if fault.mean]
 
     def of(self, fan: int) -> Hypotheses:
-        """Hypotheses of one fan."""
-        return Hypotheses(self.faults, self._has_own_drive[[fan]])
+        """Hypotheses of one fan, with the rows of all of its tray."""
+        found = copy(self)
+        found._has_own_drive = self._has_own_drive[[fan]]
+        return found
 
     def log_weights(self) -> Array:
         """(faults, fans) logarithms of the prior weights."""

@@ -22,6 +22,8 @@ PRIOR_LONGER = 10.0
 """such times of which no more went on than chance would have it"""
 LONGEST = 4
 """wrong readings, one after the other; more are no tacho's"""
+MANY, SAID_FROM = 0.02, 20.0
+"""share of wrong readings with which a tacho is not sound, and how often they were wrong before that is said"""
 FEWEST, ONE_MORE = 2, 2
 """readings that must agree at least; and samples more than they take where they are alike: a reading may be seen in one
 sample more than its time, and the last one has to be seen"""
@@ -53,6 +55,12 @@ class WrongReadings(Saved):
         since then, the first one included"""
         self.agree = np.zeros(count, np.bool_)
         """(fans,) whether the newest reading is far, and enough before it were"""
+
+    @property
+    def many(self) -> Array:
+        """Return the share of wrong readings of a tacho that is not sound, (fans,); of others 0."""
+        times, readings = self._times - PRIOR[0], np.maximum(self._readings - PRIOR[1], 1.0)
+        return np.where((times > MANY * readings) & (times > SAID_FROM), times / readings, 0.0)
 
     @property
     def waits(self) -> Array:

@@ -10,6 +10,7 @@ from fantwin.schemas.messages import Array, Prediction
 from fantwin.schemas.standstill import Standstill
 from fantwin.schemas.tacho import Tacho
 from fantwin.schemas.units import NS_PER_S
+from fantwin.scoring.column_state import NEVER_NS
 from fantwin.scoring.diagnosis.standstill_causes import Standing
 from fantwin.scoring.model.saved import Saved, part, within
 from fantwin.scoring.samples import arrived
@@ -22,7 +23,6 @@ CERTAIN = 2.0
 """score of a fan that does not do as commanded"""
 OBEYS_S = 2.0
 """time for which a fan does as commanded until its alarm is over"""
-NEVER_NS = -(1 << 62)
 KINDS = (None, *Standing)
 
 

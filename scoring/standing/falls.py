@@ -14,12 +14,17 @@ CONSTANT = 0.02
 """share of a reading: two above FALLING that differ by less are of a fan that turns slowly and does not fall"""
 FALLING = 0.6
 """share of the expected speed: a fan below it may come to rest"""
+STEADY = 0.1
+"""share of a reading within which a fan stays that falls no more, for longer than a whole coast"""
 
 
 class Falls(Saved):
     """Follows the fans of one tray from bin to bin."""
 
-    KEPT = ("_share", "_lasted_s", "_rest_s", "_is_first", "_passed_s", "_has_stood", "stands", "is_falling")
+    KEPT = (
+        *("_share", "_lasted_s", "_rest_s", "_is_first", "_passed_s", "_has_stood", "stands", "is_falling"),
+        *("_steady_share", "_steady_s"),
+    )
 
     def __init__(self, fans: Fans, bin_s: float) -> None:
         """Begin with fans that turn."""
@@ -29,6 +34,8 @@ class Falls(Saved):
         """(fans,) newest reading, share of the expected speed"""
         self._passed_s = np.zeros(count)
         """(fans,) time since the newest reading"""
+        self._steady_share, self._steady_s = np.zeros((2, count))
+        """(fans,) share about which a fan stays, and for how long it has"""
         self._lasted_s = np.zeros(count)
         """(fans,) integral of the speed as a share of the expected one, since it fell"""
         self._rest_s = np.zeros(count)
@@ -49,6 +56,11 @@ class Falls(Saved):
         turned_s = np.where(known & ~self._has_stood, share * self._passed_s, 0.0)
         self._is_first = (self._is_first & ~now.changes) | (known & (self._lasted_s == 0.0))
         is_constant = (share > FALLING) & (np.abs(share - self._share) < CONSTANT * share)
+        moves = known & (np.abs(share - self._steady_share) > STEADY * self._steady_share)
+        self._steady_share = np.where(moves, share, self._steady_share)
+        self._steady_s = np.where(moves, 0.0, self._steady_s + np.where(known, self._passed_s, 0.0))
+        coast_s = self._fans.coasts_s + self._fans.held_s
+        is_constant |= (share >= STANDS) & (self._steady_s > coast_s)  # it turns slowly for longer than any fall lasts
         falls = ~known | ((share <= FALLS) & ~is_constant)
         self._share = np.where(known, share, self._share)
         self._rest_s = np.where(falls, self._rest_s + np.where(self._is_first, 0.0, turned_s), 0.0)

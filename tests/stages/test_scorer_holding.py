@@ -101,6 +101,18 @@ def test_a_loose_wire_is_one_alarm_though_the_grid_bridges_its_missing_readings(
     assert re.search(r"; a tacho that drops out, 100 %: \d\d % of the readings are missing", found[0].message)
 
 
+def test_a_fault_of_the_fan_within_an_alarm_of_missing_readings_is_said_with_its_own_causes() -> None:
+    item = on_the_grid(np.full(80 * SECOND, 0.35))
+    falls = np.where(np.arange(len(item.t_ns))[:, np.newaxis] < len(item.t_ns) // 2, 0.0, 60.0)
+    item = replace(item, measured_speed_rad_s=item.measured_speed_rad_s - falls)
+    _, alarms = feed(core_that_knows_its_fan(), [item])
+    assert [alarm.transition for alarm in alarms if alarm.transition in CHANGES] == [Transition.RAISED]
+    said = [alarm for alarm in alarms if alarm.statistic == Statistic.DEVIATION]
+    assert {alarm.causes[0].cause for alarm in alarms if alarm not in said} == {"sensor_dropout"}
+    assert said and said[-1].residual_rad_s == pytest.approx(-60.0, abs=5.0)
+    assert "sensor_dropout" not in {cause.cause for alarm in said for cause in alarm.causes}
+
+
 def test_a_constant_fault_is_one_alarm_in_which_nothing_is_learned_and_no_diagnosis_repeats_another() -> None:
     at = np.arange(50 * SECOND)[:, np.newaxis]
     lost = prediction(noise(len(at)) - np.where(at >= 10 * SECOND, 0.2 * TWIN_SPEED, 0.0))
@@ -149,6 +161,14 @@ def test_readings_of_zero_now_and_then_are_no_fan_that_stands_and_a_fan_that_sta
     raised = [(each.t_ns - EPOCH_NS) / NS_PER_S for each in alarms if each.transition == Transition.RAISED]
     assert len(raised) == 1
     assert 150.0 < raised[0] <= 153.0
+
+
+def test_a_tacho_of_many_wrong_readings_is_said_and_raises_no_alarm() -> None:
+    is_wrong = np.arange(1200) % 20 == 19
+    core = core_of(tachos=(Tacho(kind="average", window_s=0.5),))
+    _, alarms = feed(core, [at_2_hz(is_wrong, 2.0 * TWIN_SPEED)])
+    assert alarms == []
+    assert "fan 0: 5% of the readings of its tacho are wrong: check the tacho and its wire" in core.notes()
 
 
 def test_an_alarm_is_not_lost_between_the_counts_of_a_slow_tacho() -> None:

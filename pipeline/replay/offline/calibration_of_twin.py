@@ -91,8 +91,8 @@ def calibrated(
 def _raised(runs: HealthyRuns, limit: Limit, most: int) -> tuple[Limit, list[DecidedRun]]:
     """The lowest limit at which the runs have no more alarms, but for faults.
 
-    An excursion may raise more than one, and where a limit is higher, more far readings must agree until they count. So
-    the alarms themselves are counted, and the limit is raised again until it is so.
+    An excursion may raise more than one. So the alarms themselves are counted, and the limit is raised again until it
+    is so.
     """
     peaks = [peak for run in runs.decided(FreeLimit(limit.priors, limit.declared_s)) for peak in run.peaks]
     usual = [peak for peak in peaks if peak <= LARGEST_FACTOR]

@@ -45,7 +45,9 @@ def test_a_full_disk_is_reported_until_there_is_room_and_leaves_the_previous_sna
     with monkeypatch.context() as patch:
         patch.setattr(os, "fsync", full)
         file.save(snapshot(2))
-    assert file.problem.startswith(f"{file.path}: cannot save baselines and alarms: No space left on device")
+    assert file.problem.startswith(
+        f"{file.path}: cannot save what was learned of the fans, nor alarms: No space left on device"
+    )
     assert saved(file.path) == 1
     file.save(snapshot(3))
     assert (file.problem, saved(file.path)) == ("", 3)

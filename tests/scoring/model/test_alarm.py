@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from fantwin.schemas.tacho import Tacho
-from fantwin.scoring.model.decision import OVER_S
+from fantwin.scoring.model.decision import OVER_S, Decision
 from fantwin.scoring.model.faults import DRAG, DRAG_GROWS, DRIVE, FRICTION, GROWS_S
 from fantwin.scoring.model.healthy import SLOW
-from tests.support.made_bins import MadeFans, plays
+from tests.support.made_bins import Changes, MadeFans, plays, with_reading
 from tests.support.scored_blocks import TWIN_SPEED, twin_of
 
 FANS = 4
@@ -76,6 +78,51 @@ def test_a_small_fault_of_which_each_reading_of_a_coarse_tacho_says_little_does_
     ends_s, made.sizes[:] = made.time_s, 0.0
     cleared = {fan: time_s - ends_s for time_s, fan, is_raised in plays(made, decision, 300.0) if not is_raised}
     assert raised and raised <= cleared.keys() and max(cleared.values()) < 250.0
+
+
+COUNTING = Tacho(kind="count", pulses=2, window_s=1.0)
+
+
+def with_drop(made: MadeFans, decision: Decision, share: float, seconds: float) -> Changes:
+    """What a decision says while the readings are lower by a share of the speed."""
+    return plays(made, decision, seconds, lambda one: with_reading(one, one.deviation_rad_s - share * TWIN_SPEED))
+
+
+@pytest.mark.parametrize(("share", "later"), [(0.02, 0.02), (0.02, 0.3)], ids=["as large", "much larger"])
+def test_the_alarm_of_a_small_fault_follows_it_for_an_hour_and_clears_after_it(share: float, later: float) -> None:
+    made = MadeFans(
+        replace(twin_of(1, tachos=(COUNTING,)).fans, noise_rad_s=np.full(1, 0.8)), 1.0, steady, seed=2, own=0
+    )
+    decision = made.decision()
+    plays(made, decision, 300.0)
+    assert [each[1:] for each in with_drop(made, decision, share, 3600.0)] == [(0, True)]
+    assert with_drop(made, decision, later, 60.0) == []
+    assert decision.fault[0][0] == pytest.approx(-later, abs=0.3 * later)
+    (over,) = plays(made, decision, 60.0)
+    assert not over[2]
+
+
+@pytest.mark.parametrize("tacho", [Tacho(), COUNTING], ids=["at once", "counting"])
+@pytest.mark.parametrize("shares", [(0.9, 0.9), (0.3, 0.1)], ids=["nearly all of the speed", "a third of it remains"])
+def test_an_alarm_stays_for_as_long_as_anything_is_left_of_its_fault(tacho: Tacho, shares: tuple[float, float]) -> None:
+    made = MadeFans(twin_of(1, tachos=(tacho,)).fans, max(tacho.held_s, 0.1), steady, seed=2, own=0)
+    decision = made.decision()
+    plays(made, decision, 60.0)
+    assert [each[1:] for share in shares for each in with_drop(made, decision, share, 100.0)] == [(0, True)]
+    assert -1.0 <= decision.fault[0][0] < -0.7 * shares[1]
+
+
+def test_fans_of_both_kinds_of_drive_and_tacho_in_one_tray_have_alarms_and_clear_at_the_same_pace() -> None:
+    fans = twin_of(2, tachos=(Tacho(), COUNTING)).fans
+    made = MadeFans(replace(fans, has_own_drive=np.array([False, True])), 0.1, steady, seed=2, own=0)
+    decision = made.decision()
+    plays(made, decision, 30.0)
+    raised = with_drop(made, decision, 0.2, 30.0)
+    assert sorted(each[1:] for each in raised) == [(0, True), (1, True)]
+    for fan in range(2):
+        assert decision.alarms[fan].causes()[0].probability > 0.0
+    ends_s = made.time_s
+    assert all(time_s - ends_s < 2.0 * OVER_S for time_s, _, _ in plays(made, decision, 60.0))
 
 
 def test_a_fan_whose_speed_varies_is_unsteady_and_its_alarm_stays_until_it_is_steady_again() -> None:

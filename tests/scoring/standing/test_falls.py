@@ -21,10 +21,11 @@ COASTS_S = 2.0
     [
         (lambda _since_s: 0.0, 0.0, 0.1),
         (lambda since_s: 0.8 * (since_s < 6.0), 0.0, 0.1),
+        (lambda since_s: 0.5 * (since_s < 6.0), 0.0, 0.1),
         (lambda since_s: 0.2 * (since_s % 3.0 > 2.7), 0.0, 0.1),
         (lambda since_s: math.exp(-since_s / COASTS_S), 1.4, 2.1),
     ],
-    ids=["held", "slow, then held", "held, and jerking", "without power"],
+    ids=["held", "slow, then held", "at half speed, then held", "held, and jerking", "without power"],
 )
 def test_a_fan_that_comes_to_rest_stands_and_has_run_on_for_as_long_as_its_readings_say(
     course: Callable[[float], float], least_s: float, most_s: float

@@ -8,10 +8,15 @@ NEVER_NS = 1 << 62  # times from here on, and those up to 0, are marks and no ti
 
 
 def with_times_moved(state: Any, by_ns: int, *, is_time: bool = False) -> Any:
-    """A snapshot's state, as JSON values, with all absolute times moved by `by_ns`; durations and values stay."""
+    """A snapshot's state, as JSON values, with all absolute times moved by `by_ns`.
+
+    Durations, values and arrays stay.
+    """
     if isinstance(state, dict):
         return {
             name: with_times_moved(entry, by_ns, is_time=is_time or name.endswith("t_ns"))
+            if name != "arrays"
+            else entry
             for name, entry in state.items()
         }
     if isinstance(state, list):
