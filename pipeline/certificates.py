@@ -7,10 +7,8 @@ What cannot be used is refused in one line that names the file, says why, and ne
 from __future__ import annotations
 
 import ipaddress
-import os
 import re
 import ssl
-import stat
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -32,7 +30,7 @@ from cryptography.hazmat.primitives.serialization import (
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from fantwin.pipeline.errors import UserError
-from fantwin.pipeline.files import PRIVATE, PUBLIC, replace_file
+from fantwin.pipeline.files import PRIVATE, PUBLIC, is_read_by_others, replace_file
 
 LONGEST_NAME = 64
 """characters of a common name"""
@@ -44,7 +42,6 @@ RSA_BITS = 2048
 WARN_BEFORE = timedelta(days=30)
 WARN_SHARE = 0.2
 """of its lifetime: a certificate for an hour is not warned of from the first minute"""
-_GROUP_OR_OTHERS, _OTHERS = 0o077, 0o007
 _LABEL = r"[A-Za-z0-9_]([A-Za-z0-9_-]{0,61}[A-Za-z0-9_])?"
 _HOST_NAME = re.compile(rf"(\*\.)?{_LABEL}(\.{_LABEL})*")
 _LONGEST_HOST = 253
@@ -185,9 +182,9 @@ def client_context(ca: Path | None, certificate: Path | None, key: Path | None) 
 def tls_refusal(error: ssl.SSLError, server: str) -> str:
     """Say why a client gets no connection by TLS, and what to check. server: what it is, such as "broker"."""
     if isinstance(error, ssl.SSLCertVerificationError):
-        advice = f"{error.verify_message}: check ca, and that host is a name in the certificate of the {server}"
+        advice = f"{error.verify_message}: check ca, and that the host is a name in the certificate of the {server}"
     else:
-        advice = f"check port, and whether the {server} has TLS there: if not, tls = false"
+        advice = f"check port, and whether the {server} has TLS there: if not, mqtt:// in url"
     return f"no connection by TLS: {error.strerror or error}; {advice}"
 
 
@@ -362,14 +359,11 @@ def _parsed(path: Path, pem: Callable[[bytes], Parsed], der: Callable[[bytes], P
 
 
 def _require_private(key: Path) -> None:
-    """As ssh and PostgreSQL do: only its owner may read it, or the group as well if it belongs to root, as where a
-    cluster hands it to a container."""
     try:
         status = key.stat()
     except OSError as error:
         raise UserError(f"{key}: {error.strerror}") from error
-    forbidden = _OTHERS if status.st_uid == 0 != os.geteuid() else _GROUP_OR_OTHERS
-    if stat.S_IMODE(status.st_mode) & forbidden:
+    if is_read_by_others(status):
         raise UserError(f"{key}: others may read this private key: chmod 600 {key}")
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import secrets
+import stat
 from contextlib import suppress
 from pathlib import Path
 
@@ -12,6 +13,16 @@ from fantwin.pipeline.errors import UserError
 PRIVATE, PUBLIC = 0o600, 0o644
 _AS_THE_USER_WISHES = 0o666
 """less what the umask takes"""
+
+
+_OTHERS, _GROUP_OR_OTHERS = 0o007, 0o077
+
+
+def is_read_by_others(status: os.stat_result) -> bool:
+    """Whether a secret file may be read by others than its owner. As for ssh and PostgreSQL, its group may read it if
+    it belongs to root, as where a service manager or a cluster hands it to a process of another user."""
+    forbidden = _OTHERS if status.st_uid == 0 != os.geteuid() else _GROUP_OR_OTHERS
+    return bool(stat.S_IMODE(status.st_mode) & forbidden)
 
 
 def replace_file(path: Path, content: bytes, mode: int | None = None) -> None:

@@ -66,7 +66,7 @@ class MqttCore(SiteCore):
         self._states = FanStates(model)
         self._outbox = Outbox()
         self._history, self._queue = alarms, TransitionQueue(alarms, MOST_WAITING)
-        self._requests = Requests(topics, model.trays, config.accept, config.operator_name, desk)
+        self._requests = Requests(topics, model.trays, config.accept, desk)
         self._home_assistant = HomeAssistant(config, topics, model.trays)
         self._devices = self._home_assistant.messages() if config.home_assistant != "off" else {}
         self._numbers: dict[int, int] = {}
@@ -212,7 +212,7 @@ def build(context: Context) -> BuiltStage:
     require("stage mqtt", "outputs", "paho")
     if overlapping := overlaps(context):
         raise StageError(overlapping[0])
-    topics = Topics(config.prefix, context.site, context.instance)
+    topics = Topics(context.site, context.instance)
     alarms = AlarmHistory(context.own_file(FILE))
     model = SiteModel(context.site, context.trays, alarms)
     link = BrokerLink(
@@ -230,7 +230,7 @@ def build(context: Context) -> BuiltStage:
 def overlaps(context: Context) -> list[str]:
     """Sources of samples that would take what is published here for samples, or the other way; one line each."""
     config: MqttConfig = context.config
-    own = f"{config.prefix}/{context.site}/#"
+    own = f"{Topics(context.site).root}/#"
     found: list[str] = []
     for tray in context.trays:
         source = tray.source
@@ -239,7 +239,8 @@ def overlaps(context: Context) -> list[str]:
                 unshared = topic.split("/", 2)[-1] if topic.startswith("$share/") else topic
                 if do_overlap(unshared.replace(FAN, "+"), own):
                     found.append(
-                        f"[mqtt] publishes to {own}, which topic {topic} of tray {tray.name} has part of: change prefix"
+                        f"[mqtt] publishes to {own}, which topic {topic} of tray {tray.name} has part of"
+                        ": change that topic, or the name of the site"
                     )
     return found
 
@@ -249,7 +250,7 @@ def check(context: Context) -> list[str]:
     config: MqttConfig = context.config
     try:
         require("stage mqtt", "outputs", "paho")
-        client = new_client(config, context.folder, "mqtt")
+        client = new_client(config, context.folder)
     except UserError as error:
         return [str(error)]
     unknown = sorted(set(config.home_assistant_trays) - {tray.name for tray in context.trays})

@@ -171,7 +171,7 @@ def build(context: Context) -> BuiltStage:
     config: NotifierConfig = context.config
     if problems := check(context):
         raise StageError("; ".join(problems))
-    place = Place(context.site, config.page, config.zone)
+    place = Place(context.site, config.page)
     outbox = Outbox(context.own_file(FILE), [target.name for target in config.target])
     fans = {tray.name: tray.fans for tray in context.trays}
     saved, past = outbox.load()

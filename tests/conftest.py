@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -16,6 +17,10 @@ from tests.support.trained_once import TrainedOnce
 # The same examples on every run, and no judgement of how long one takes: machines differ.
 settings.register_profile("house", derandomize=True, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("house")
+
+# Quiet hours and times in messages are those of the host, and hosts differ.
+os.environ["TZ"] = "UTC"
+time.tzset()
 
 
 @pytest.hookimpl(trylast=True)

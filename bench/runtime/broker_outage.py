@@ -173,7 +173,7 @@ def main(
     broker = Mosquitto(folder, *PERSISTENCE, f"persistence_location {folder}/")
     broker.start()
     stages = json.dumps(["acquisition", "resampler", "twin_integrator", "scorer", "recorder", "mqtt"])
-    settings = (f"launcher.stages={stages}", f"mqtt.port={broker.port}", "mqtt.host='127.0.0.1'")
+    settings = (f"launcher.stages={stages}", f"mqtt.url='mqtt://127.0.0.1:{broker.port}'")
     chain = Chain(folder, endpoint, *settings)
     subscriber = Subscriber(broker.port)
     try:

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from fantwin.pipeline.errors import UserError
-from fantwin.pipeline.files import PRIVATE, replace_file
+from fantwin.pipeline.files import PRIVATE, is_read_by_others, replace_file
 
 if TYPE_CHECKING:
     from argon2 import PasswordHasher
@@ -27,7 +27,6 @@ SHORTEST_PASSWORD, LONGEST_PASSWORD = 12, 128
 GUESSED_WORDS = ("fantwin", "password", "operator", "viewer", "ventilator", "admin")
 """with the name of the user, these do not count in a password"""
 FEWEST_OTHERS = 5
-_OTHERS = 0o077
 _ENTRIES = {"role", "password_hash"}
 
 
@@ -117,7 +116,7 @@ def read_users(path: Path) -> dict[str, User]:
     """
     try:
         with path.open("rb") as file:
-            if os.fstat(file.fileno()).st_mode & _OTHERS:
+            if is_read_by_others(os.fstat(file.fileno())):
                 raise UserError(f"{path}: others may read it: chmod 600 {path}")
             tables = tomllib.load(file)
     except (OSError, tomllib.TOMLDecodeError, UnicodeDecodeError) as error:

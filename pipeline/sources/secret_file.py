@@ -1,4 +1,4 @@
-"""A secret that a stage needs, such as a password: from a file that only its owner reads, or from the environment.
+"""A secret that a stage needs, such as a password: from a file that only its owner reads.
 
 A configuration is in every recording, so that it names where a secret is and never holds one.
 """
@@ -6,44 +6,79 @@ A configuration is in every recording, so that it names where a secret is and ne
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Self
+from typing import ClassVar, Self
+from urllib.parse import SplitResult, unquote, urlsplit
 
-from pydantic import BaseModel, Field, model_validator
+from pydantic import BaseModel, Field, field_validator, model_validator
 
 from fantwin.pipeline.errors import UserError
-
-OTHERS = 0o077
+from fantwin.pipeline.files import is_read_by_others
 
 
 class LogIn(BaseModel, frozen=True):
-    """Who logs in, and where the password is."""
+    """The address of a server, who logs in there, and where the password is.
 
-    username: str = Field(default="", description="user that logs in; without it, nobody does")
+    A subclass says what its URL is.
+    """
+
+    schemes: ClassVar[Mapping[str, int]]
+    """of its URL, with the port of each"""
+
+    url: str
     password_file: Path | None = Field(
-        default=None, description="file with the password in its first line; only its owner may be able to read it"
+        default=None,
+        description="file with the password in its first line; only its owner may be able to read it",
     )
-    password_env: str = Field(
-        default="", description="instead of password_file: environment variable that holds the password"
-    )
+
+    @property
+    def host(self) -> str:
+        """Name or address of the server."""
+        return self.parts.hostname or ""
+
+    @property
+    def port(self) -> int:
+        """Port of the server."""
+        return self.parts.port or self.schemes[self.parts.scheme]
+
+    @property
+    def username(self) -> str:
+        """User that logs in; empty: nobody does."""
+        return unquote(self.parts.username or "")
+
+    @property
+    def parts(self) -> SplitResult:
+        """The parts of the URL."""
+        return urlsplit(self.url)
+
+    @field_validator("url")
+    @classmethod
+    def _is_address(cls, value: str) -> str:
+        try:
+            parts = urlsplit(value)
+            is_address = parts.scheme in cls.schemes and parts.hostname and parts.port != 0
+        except ValueError:
+            is_address = False
+        if not is_address:
+            raise ValueError(f"write the address of the server, such as {list(cls.schemes)[-1]}://USER@HOST")
+        if urlsplit(value).password is not None:
+            raise ValueError("a configuration is recorded: give password_file, and only the user in url")
+        return value
 
     @model_validator(mode="after")
-    def _one_password_of_a_user(self) -> Self:
-        if self.password_file and self.password_env:
-            raise ValueError("give password_file or password_env, not both")
-        if (self.password_file or self.password_env) and not self.username:
-            raise ValueError("a password needs username")
+    def _password_of_a_user(self) -> Self:
+        if self.password_file and not self.username:
+            raise ValueError(f"password_file needs a user in url, such as {self.parts.scheme}://USER@{self.host}")
         return self
 
-    def password(self, folder: Path, process: str = "acquisition") -> str | None:
-        """The password; None: there is none. folder: relative paths start here. process: that needs it.
+    def password(self, folder: Path) -> str | None:
+        """The password; None: there is none. folder: relative paths start here.
 
         Raises:
-            UserError: it cannot be read, or is not set.
+            UserError: it cannot be read.
         """
-        if self.password_file:
-            return read_secret(folder / self.password_file)
-        return secret_of_environment(self.password_env, process) if self.password_env else None
+        return read_secret(folder / self.password_file) if self.password_file else None
 
 
 def read_secret(path: Path) -> str:
@@ -54,23 +89,11 @@ def read_secret(path: Path) -> str:
     """
     try:
         with path.open(encoding="utf-8") as file:
-            if os.fstat(file.fileno()).st_mode & OTHERS:
+            if is_read_by_others(os.fstat(file.fileno())):
                 raise UserError(f"{path}: others may read it: chmod 600 {path}")
             secret = file.readline().strip()
     except (OSError, UnicodeDecodeError) as error:
         raise UserError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
     if not secret:
         raise UserError(f"{path}: its first line is empty")
-    return secret
-
-
-def secret_of_environment(name: str, stage: str = "acquisition") -> str:
-    """A variable of the environment. stage: the one that needs it.
-
-    Raises:
-        UserError: it is not set.
-    """
-    secret = os.environ.get(name, "")
-    if not secret:
-        raise UserError(f"the environment has no {name}: set it for the process of {stage}")
     return secret

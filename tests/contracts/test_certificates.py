@@ -61,7 +61,7 @@ def problems_of_opcua(folder: Path) -> list[str]:
 
 def problems_of_mqtt(folder: Path) -> list[str]:
     try:
-        new_client(BrokerSettings(host="broker", tls=True, **PAIR), folder, "mqtt")
+        new_client(BrokerSettings(url="mqtts://broker", **PAIR), folder)
     except UserError as error:
         return [str(error)]
     return []
@@ -171,4 +171,6 @@ def test_a_client_takes_its_authority_s_certificate_for_the_host_that_it_names_a
         return
     with pytest.raises(ssl.SSLCertVerificationError) as refused:
         shake_hands()
-    assert "check ca, and that host is a name in the certificate of the broker" in tls_refusal(refused.value, "broker")
+    assert "check ca, and that the host is a name in the certificate of the broker" in tls_refusal(
+        refused.value, "broker"
+    )

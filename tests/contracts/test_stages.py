@@ -165,7 +165,7 @@ def test_the_scorer_survives_any_snapshot(memory: ScorerSnapshot) -> None:
 @NO_SLOW_CHECK
 @given(session=sessions(Alarm))
 def test_the_notifier_survives_any_alarm_and_its_outbox_can_be_read_again(session: list[Message]) -> None:
-    target = {"name": "hook", "url_env": "FANTWIN_TEST_URL", "quiet_hours": {"begin": "00:00", "end": "12:00"}}
+    target = {"name": "hook", "url_file": "hook.url", "quiet_hours": "00:00-12:00"}
     config = NotifierConfig.model_validate({"target": [target]})
     with TemporaryDirectory() as folder:
         outbox = Outbox(Path(folder) / "outbox", ["hook"])
@@ -216,14 +216,14 @@ class FakeLink:
 def test_the_mqtt_stage_survives_any_message_and_request_and_publishes_only_json(
     session: list[Message], tray: str, asked: list[tuple[str, bytes]]
 ) -> None:
-    config = MqttConfig(host="broker", accept=("acknowledge",), operator_name="desk", home_assistant="publish")
+    config = MqttConfig(url="mqtt://broker", accept=("acknowledge",), home_assistant="publish")
     received = [Received(f"fantwin/site/tray1/{fan}/request", payload, is_retained=False) for fan, payload in asked]
     link: Any = FakeLink(received)
     with TemporaryDirectory() as folder:
         store = AlarmHistory(Path(folder) / "alarms.sqlite")
         model = SiteModel("site", TRAYS, store)
         context = Context("site", TRAYS, config, Path(folder), Path(folder), 0)
-        core = MqttCore(context, model, store, RequestDesk("p"), Topics("fantwin", "site"), link)
+        core = MqttCore(context, model, store, RequestDesk("p"), Topics("site"), link)
         core.tick(-20_000_000_000)
         survives(core, load_stage("mqtt"), session, tray)
     for message in link.published:

@@ -155,7 +155,7 @@ bus = {{ endpoint = "tcp/127.0.0.1:1" }}
 [[tray]]
 name = "broker"
 fans = 1
-source = {{ kind = "mqtt", host = "127.0.0.1", topic = "a" }}
+source = {{ kind = "mqtt", url = "mqtt://127.0.0.1", topic = "a" }}
 [[tray]]
 name = "drive"
 fans = 1
@@ -166,7 +166,7 @@ fans = 1
 source = {{ kind = "redfish", url = "https://127.0.0.1" }}
 [opcua]
 [mqtt]
-host = "127.0.0.1"
+url = "mqtt://127.0.0.1"
 [notifier]
 target = [{{ name = "mail", url_file = "url" }}]
 """

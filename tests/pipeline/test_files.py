@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from fantwin.pipeline.files import PRIVATE, replace_file
+from fantwin.pipeline.files import PRIVATE, is_read_by_others, replace_file
 
 
 def mode_of(path: Path) -> int:
@@ -46,6 +46,17 @@ def test_a_file_keeps_who_may_read_it_unless_told_and_a_private_one_never_had_ot
     monkeypatch.setattr("fantwin.pipeline.files.os.fsync", lambda file: seen.append(os.fstat(file).st_mode & 0o777))
     replace_file(path, b"3", PRIVATE)
     assert (path.read_bytes(), mode_of(path), seen[0]) == (b"3", PRIVATE, PRIVATE)
+
+
+@pytest.mark.parametrize(
+    ("mode", "owner", "is_read"),
+    [(0o600, 1000, False), (0o640, 1000, True), (0o604, 1000, True), (0o440, 0, False), (0o444, 0, True)],
+)
+def test_a_secret_of_root_may_be_read_by_its_group_as_service_managers_and_clusters_hand_it_over(
+    monkeypatch, mode, owner, is_read
+):
+    monkeypatch.setattr(os, "geteuid", lambda: 1000)
+    assert is_read_by_others(os.stat_result((mode, 0, 0, 1, owner, 1000, 0, 0, 0, 0))) == is_read
 
 
 def test_writers_of_one_file_do_not_disturb_one_another(tmp_path):

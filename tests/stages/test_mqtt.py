@@ -30,7 +30,7 @@ from tests.support.running_mqtt import ROOT, RunningMqtt
 
 pytestmark = needs_mosquitto
 FAN = f"{ROOT}/{TRAY}/2"
-ACCEPTING: dict[str, Any] = {"accept": ("acknowledge", "shelve"), "operator_name": "desk"}
+ACCEPTING: dict[str, Any] = {"accept": ("acknowledge", "shelve")}
 
 
 @pytest.fixture
@@ -193,7 +193,7 @@ def test_requests_are_passed_on_under_the_configured_name_and_answered(tmp_path,
     assert (answer["ok"], answer["id"], answer["answers"][0]["transition"]) == (True, "7", "acknowledged")
     (sent,) = stage.sent
     assert (sent.action, sent.fan, sent.header.tray) == (Action.ACKNOWLEDGE, 2, TRAY)
-    assert (sent.operator_name, sent.comment) == ("mqtt:desk", "seen (sent as ann)"), "nobody chooses his name"
+    assert (sent.operator_name, sent.comment) == ("mqtt", "seen (sent as ann)"), "nobody chooses his name"
     assert ask('{"action": "commission"}')["error"].startswith("commission is not accepted by MQTT here")
     assert "no such fan" in ask('{"action": "acknowledge"}', f"{ROOT}/{TRAY}/9/request")["error"]
     half = '{"action": "acknowledge", "id": "\\ud800"}'
@@ -251,17 +251,18 @@ def test_a_broker_that_refuses_a_password_or_whose_certificate_is_unknown_is_nam
     broker = Mosquitto(tmp_path, *files, "allow_anonymous false", f"password_file {users}")
     broker.start()
     password.touch(0o600)
-    known: dict[str, Any] = {"tls": True, "ca": "ca.pem", "username": "plant", "password_file": "password"}
-    unknown: dict[str, Any] = {"tls": True}
+    url = f"mqtts://127.0.0.1:{broker.port}"
+    known: dict[str, Any] = {"url": url.replace("//", "//plant@"), "ca": "ca.pem", "password_file": "password"}
+    unknown: dict[str, Any] = {"url": url}
     try:
         for text, settings, problem, of_doctor in (
             ("secret", known, "", ""),
-            ("wrong", known, "the broker refuses this client", "check username and password"),
+            ("wrong", known, "the broker refuses this client", "check user and password"),
             (
                 "secret",
                 unknown,
                 "is away, or TLS fails: `fantwin doctor` says which",
-                "check ca, and that host is a name in the certificate of the broker",
+                "check ca, and that the host is a name in the certificate of the broker",
             ),
         ):
             password.write_text(f"{text}\n")
@@ -271,11 +272,11 @@ def test_a_broker_that_refuses_a_password_or_whose_certificate_is_unknown_is_nam
                 problem or "it is let in",
             )
             stage.close()
-            config = MqttConfig(host="127.0.0.1", port=broker.port, **settings)
+            config = MqttConfig(**settings)
             found = check(Context(SITE, (), config, tmp_path, tmp_path, 0))
             assert [of_doctor in each for each in found] == [True] * bool(of_doctor)
         password.chmod(0o644)
-        config = MqttConfig(host="127.0.0.1", port=broker.port, **known)
+        config = MqttConfig(**known)
         assert "chmod 600" in check(Context(SITE, (), config, tmp_path, tmp_path, 0))[0]
     finally:
         broker.stop()
@@ -286,15 +287,16 @@ def test_doctor_names_a_broker_that_is_not_there_and_topics_that_overlap(tmp_pat
     tray = TrayConfig(
         name=TRAY,
         fans=4,
-        source=SourceConfig(host="127.0.0.1", port=port, topic="fantwin/+/tray1/#"),
+        source=SourceConfig(url=f"mqtt://127.0.0.1:{port}", topic="fantwin/+/tray1/#"),
     )
-    config = MqttConfig(host="127.0.0.1", port=port, home_assistant_trays=("tray9",))
+    config = MqttConfig(url=f"mqtt://127.0.0.1:{port}", home_assistant_trays=("tray9",))
     context = Context(SITE, (tray,), config, tmp_path, tmp_path, 0)
     overlapping, unknown, away = check(context)
     assert overlapping == (
-        "[mqtt] publishes to fantwin/hall/#, which topic fantwin/+/tray1/# of tray tray1 has part of: change prefix"
+        "[mqtt] publishes to fantwin/hall/#, which topic fantwin/+/tray1/# of tray tray1 has part of: change that "
+        "topic, or the name of the site"
     )
     assert unknown == "[mqtt] home_assistant_trays: there is no tray tray9"
-    assert away == f"broker 127.0.0.1:{port}: cannot be reached: Connection refused; check host and port"
-    with pytest.raises(StageError, match="change prefix"):
+    assert away == f"broker 127.0.0.1:{port}: cannot be reached: Connection refused; check url"
+    with pytest.raises(StageError, match="change that topic"):
         build(context)

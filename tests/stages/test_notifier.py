@@ -29,7 +29,7 @@ class Notifier:
     """A notifier whose clock the test moves; its senders run in real time."""
 
     def __init__(self, folder: Path, targets: list[dict[str, Any]], fans: int = 8, **settings: Any) -> None:
-        self.config = NotifierConfig.model_validate({"target": targets, "timezone": "UTC", **settings})
+        self.config = NotifierConfig.model_validate({"target": targets, **settings})
         self._folder, self._fans = folder, fans
         self.now_ns = START_NS
         self.core: NotifierCore
@@ -180,7 +180,8 @@ def test_a_fan_that_is_taken_out_of_the_configuration_is_not_spoken_of_any_more(
 
 def test_an_alertmanager_is_given_its_alerts_when_they_change_and_not_with_each_look(tmp_path, started):
     receiver = HttpReceiver()
-    notifier = started(tmp_path, [{"name": "m", "kind": "alertmanager", "url": f"http://127.0.0.1:{receiver.port}"}])
+    url = secret(tmp_path, "m", f"http://127.0.0.1:{receiver.port}")
+    notifier = started(tmp_path, [{"name": "m", "kind": "alertmanager", "url_file": url}])
     notifier.hear(alarm(fan=1))
     eventually(lambda: receiver.received, "it is given the alert")
     notifier.wait(30)
@@ -196,7 +197,7 @@ def test_an_alertmanager_has_what_is_presented_and_no_more(tmp_path, started, mo
     manager = RunningAlertmanager(tmp_path)
     try:
         eventually(lambda: manager.alerts() is not None, "it answers")
-        target = {"name": "prometheus", "kind": "alertmanager", "url": manager.url}
+        target = {"name": "prometheus", "kind": "alertmanager", "url_file": secret(tmp_path, "prometheus", manager.url)}
         notifier = started(tmp_path, [target], page="https://hall.example/")
 
         def has(*expected: tuple[str, str]) -> bool:
@@ -244,7 +245,6 @@ def test_secrets_that_others_read_and_urls_that_cannot_be_are_refused_without_sh
     for words, expected in (
         ({"url_file": readable}, "others may read it"),
         ({"url_file": tmp_path / "none"}, "cannot be read"),
-        ({"url_env": "FANTWIN_TEST_UNSET"}, "set it for the process of the notifier"),
         ({"url_file": several}, "has 2 recipients"),
         ({"url_file": unknown}, "apprise cannot use this URL (nothing://...)"),
         ({"url_file": readable, "trays": ["nowhere"]}, "there is no tray nowhere"),

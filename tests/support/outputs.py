@@ -158,7 +158,7 @@ class NotifierOutput:
         self._receiver.received = self.posted.setdefault(folder, [])
         url = secret(folder, "hook", f"json://127.0.0.1:{self._receiver.port}/")
         target = {"name": "hook", "url_file": url, "repeat_s": 0}
-        config = NotifierConfig.model_validate({"target": [target], "timezone": "UTC"})
+        config = NotifierConfig.model_validate({"target": [target]})
         self.core = notifier_core(folder, config, {TRAY: FANS})
         self._now_ns = START_NS
         self._is_closed = False

@@ -18,5 +18,5 @@ class RunningMqtt(RunningCore[MqttCore]):
     def __init__(
         self, folder: Path, port: int, answer: Answer | None = None, fans: int = FANS, **settings: Any
     ) -> None:
-        config = MqttConfig.model_validate({"host": "127.0.0.1", "port": port} | settings)
+        config = MqttConfig.model_validate({"url": f"mqtt://127.0.0.1:{port}"} | settings)
         super().__init__(STAGE, config, folder, answer, fans)

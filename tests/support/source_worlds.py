@@ -109,7 +109,7 @@ class MqttWorld(World):
     def __init__(self, folder: Path) -> None:
         super().__init__(folder)
         self.broker = MqttBroker()
-        self.settings = {"host": "127.0.0.1", "port": self.broker.port, "topic": "plant/tray1"}
+        self.settings = {"url": f"mqtt://127.0.0.1:{self.broker.port}", "topic": "plant/tray1"}
 
     def plug_in(self) -> None:
         self.broker.start()
@@ -222,7 +222,7 @@ class ModbusWorld(World):
         self.port = free_port()
         scaled = {"scale": 0.001}
         fans = [{"speed": {"address": fan}, "command": {"address": 10 + fan, **scaled}, "unit": 3} for fan in (0, 1)]
-        self.settings = {"host": "127.0.0.1", "tcp_port": self.port, "fan": fans, **POLLED}
+        self.settings = {"host": f"127.0.0.1:{self.port}", "fan": fans, **POLLED}
         self.speeds, self.refuses = (0.0, 0.0), False
 
     async def access(self, _function: int, start: int, address: int, count: int, registers: list[int], values: Any):

@@ -125,7 +125,7 @@ def send_test_messages(config: Path, overrides: Sequence[str], targets: Sequence
     def resolve(path: Path) -> Path:
         return path if path.is_absolute() else settings.folder / path
 
-    place = Place(settings.site, section.page, section.zone)
+    place = Place(settings.site, section.page)
     failed: list[str] = []
     for name in targets or known:
         try:

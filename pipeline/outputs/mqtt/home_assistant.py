@@ -23,6 +23,8 @@ DISCOVERY_PREFIX = "homeassistant"
 """where Home Assistant looks for devices"""
 SITE_DEVICE = "site"
 ONLINE, OFFLINE = "online", "offline"
+MOST_FANS = 64
+"""fans that are devices where nobody has chosen trays: with thousands of entities, Home Assistant becomes slow"""
 _QOS = 1
 
 
@@ -39,9 +41,10 @@ class HomeAssistant:
         node = re.sub(r"[^A-Za-z0-9_-]", "_", topics.root)
         self._node = node if topics.instance == ALL_TRAYS else f"{node}_{topics.instance}"
         self._path = f"{DISCOVERY_PREFIX}/device/{self._node}"
-        chosen = [tray for tray in trays if not config.home_assistant_trays or tray.name in config.home_assistant_trays]
-        fans = [(Fan(tray.name, number), tray.speed_unit) for tray in chosen for number in range(tray.fans)]
-        self._fans = fans[: config.home_assistant_fans]
+        chosen = config.home_assistant_trays or [tray.name for tray in trays]
+        of_chosen = [tray for tray in trays if tray.name in chosen]
+        fans = [(Fan(tray.name, number), tray.speed_unit) for tray in of_chosen for number in range(tray.fans)]
+        self._fans = fans if config.home_assistant_trays else fans[:MOST_FANS]
         self.left_out = len(fans) - len(self._fans)
 
     def messages(self) -> Mapping[str, str]:

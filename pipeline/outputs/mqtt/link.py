@@ -75,7 +75,7 @@ class BrokerLink:
         self._sessions = 0
         self._refused = ""
         self._refused_subscription = ""
-        client = self._client = new_client(config, folder, "mqtt", client_id)
+        client = self._client = new_client(config, folder, client_id)
         client.will_set(will.topic, will.text, QOS, will.is_retained)
         client.max_inflight_messages_set(WINDOW)
         client.connect_timeout = CONNECT_TIMEOUT_S

@@ -20,6 +20,8 @@ from fantwin.pipeline.site.request_form import LONGEST_COMMENT, OneLine, Request
 from fantwin.pipeline.site.site_json import answers_json
 from fantwin.schemas.messages import Alarm, Request
 
+OPERATOR_NAME = "mqtt"
+"""who is recorded with each request: a broker does not say who sent a message"""
 LARGEST_REQUEST_BYTES, LONGEST_ID = 4096, 64
 
 
@@ -55,14 +57,10 @@ class Waiting:
 class Requests:
     """Takes messages, and gives answers: pairs of topic and text."""
 
-    def __init__(
-        self, topics: Topics, trays: Sequence[TrayConfig], accept: Sequence[str], operator_name: str, desk: RequestDesk
-    ) -> None:
-        """operator_name: as configured; it is recorded with each request as `mqtt:NAME`."""
+    def __init__(self, topics: Topics, trays: Sequence[TrayConfig], accept: Sequence[str], desk: RequestDesk) -> None:
         self._topics = topics
         self._fans = {tray.name: tray.fans for tray in trays}
         self._accept = tuple(accept)
-        self._operator_name = f"mqtt:{operator_name}"
         self._desk = desk
         self._waiting: list[Waiting] = []
         self.counts: Counter[str] = Counter()
@@ -92,7 +90,7 @@ class Requests:
         if error or fans is None:
             self.counts["refused_requests"] += 1
             return _answer(topic, form.id, {"error": error})
-        asked = form.message(-1 if parts[1] == ALL_FANS else fans[0], self._operator_name)
+        asked = form.message(-1 if parts[1] == ALL_FANS else fans[0], OPERATOR_NAME)
         try:
             answers = self._desk.begin(parts[0], asked, fans)
         except TimeoutError as busy:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from fantwin.pipeline.site.fleet import Fan
 from fantwin.schemas.topics import ALL_TRAYS
 
+PREFIX = "fantwin"
 ALL_FANS = "all"
 """in place of the number of a fan, in a request"""
 REQUEST, ANSWER = "request", "answer"
@@ -18,24 +19,22 @@ class Topics:
     """Names of topics.
 
     Attributes:
-        prefix: first part of all of them.
         instance: of the process; one that has not all trays has topics about itself of its own.
     """
 
-    prefix: str
     site: str
     instance: str = ALL_TRAYS
 
     @property
     def root(self) -> str:
         """What all topics of the site begin with."""
-        return f"{self.prefix}/{self.site}"
+        return f"{PREFIX}/{self.site}"
 
     @property
     def client_id(self) -> str:
         """Of the process. It has one so that the broker ends a connection of before, and says `offline` for it, when
         there is a new one, and not later."""
-        return f"{self.prefix}-{self.site}-{self.instance}"
+        return f"{PREFIX}-{self.site}-{self.instance}"
 
     @property
     def status(self) -> str:

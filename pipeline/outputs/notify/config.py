@@ -6,44 +6,15 @@ import re
 from datetime import time
 from pathlib import Path
 from typing import Any, Literal, Self
-from urllib.parse import urlsplit
-from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 from pydantic import Field, field_validator, model_validator
 
 from fantwin.pipeline.config.models import Name, Section
 from fantwin.pipeline.runtime.stage import StageConfig
+from fantwin.schemas.enums import Severity
 
-_TIME = re.compile(r"([01][0-9]|2[0-3]):[0-5][0-9]")
-
-
-class QuietHours(Section):
-    """A time of day during which messages are held; when it ends, one message lists what was held."""
-
-    begin: str = Field(description='time of day, such as "22:00"')
-    end: str = Field(description='time of day, such as "06:30"; if earlier than begin, on the next day')
-    sent_from: Literal["alarm", "none"] = Field(
-        default="alarm",
-        description="messages about alarms of at least this severity are sent anyway; none: all are held",
-    )
-
-    @field_validator("begin", "end")
-    @classmethod
-    def _is_time(cls, value: str) -> str:
-        if not _TIME.fullmatch(value):
-            raise ValueError('hours and minutes, such as "22:00"')
-        return value
-
-    @property
-    def times(self) -> tuple[time, time]:
-        """Its begin and its end."""
-        return time.fromisoformat(self.begin), time.fromisoformat(self.end)
-
-    @model_validator(mode="after")
-    def _has_a_length(self) -> Self:
-        if self.begin == self.end:
-            raise ValueError(f"begin and end are both {self.begin}")
-        return self
+_TIME = r"([01][0-9]|2[0-3]):[0-5][0-9]"
+_SPAN = re.compile(f"{_TIME}-{_TIME}")
 
 
 class TargetConfig(Section):
@@ -54,11 +25,7 @@ class TargetConfig(Section):
         default="apprise",
         description="apprise: mail, chat, webhook or any other of its services; alertmanager: that of Prometheus",
     )
-    url_file: Path | None = Field(
-        default=None, description="file with the URL in its first line; only its owner may be able to read it"
-    )
-    url_env: str = Field(default="", description="environment variable that holds the URL, instead of a file")
-    url: str = Field(default="", description="address of an Alertmanager without a password")
+    url_file: Path = Field(description="file with the URL in its first line; only its owner may be able to read it")
     severity: Literal["warning", "alarm"] = Field(
         default="warning", description="least severity of the alarms that this target gets"
     )
@@ -74,25 +41,42 @@ class TargetConfig(Section):
         description="this target gets only alarms that have been unacknowledged for this long; without it, all alarms, "
         "at once",
     )
-    quiet_hours: QuietHours | None = Field(default=None, description="hours in which messages are held")
+    quiet_hours: str = Field(
+        default="",
+        description='time of day in which messages are held, such as "22:00-06:00"; when it ends, one message lists '
+        "what was held",
+    )
+    held_severity: Literal["warning", "alarm"] = Field(
+        default="warning", description="greatest severity of alarms whose messages are held in quiet hours"
+    )
 
     @property
-    def least_severity(self) -> int:
-        """Number of that severity in schemas.enums.Severity."""
-        return 2 if self.severity == "alarm" else 1
+    def least_severity(self) -> Severity:
+        """`severity` as alarms have it."""
+        return Severity[self.severity.upper()]
+
+    @property
+    def most_held_severity(self) -> Severity:
+        """`held_severity` as alarms have it."""
+        return Severity[self.held_severity.upper()]
+
+    @property
+    def quiet_times(self) -> tuple[time, time] | None:
+        """Begin and end of the quiet hours, the end on the next day if it is earlier; None: there are none."""
+        begin, _, end = self.quiet_hours.partition("-")
+        return (time.fromisoformat(begin), time.fromisoformat(end)) if self.quiet_hours else None
+
+    @field_validator("quiet_hours")
+    @classmethod
+    def _is_span(cls, value: str) -> str:
+        if value and (not _SPAN.fullmatch(value) or value[:5] == value[6:]):
+            raise ValueError('begin and end, such as "22:00-06:00"')
+        return value
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        given = [name for name in ("url_file", "url_env", "url") if getattr(self, name)]
-        if len(given) != 1:
-            raise ValueError(f"target {self.name}: give one of url_file and url_env: a URL holds secrets")
-        if self.kind == "apprise":
-            if self.url:
-                raise ValueError(f"target {self.name}: a URL holds secrets: write it into a file, and give url_file")
-            return self
-        if self.url and (urlsplit(self.url).password or urlsplit(self.url).scheme not in ("http", "https")):
-            raise ValueError(f"target {self.name}: url: http:// or https://, without a password (that: url_file)")
-        if self.escalation_after_s or self.quiet_hours or "repeat_s" in self.model_fields_set:
+        of_apprise = {"repeat_s", "escalation_after_s", "quiet_hours", "held_severity"}
+        if self.kind == "alertmanager" and of_apprise & self.model_fields_set:
             raise ValueError(
                 f"target {self.name}: an Alertmanager repeats, escalates and holds by itself: take out repeat_s, "
                 "escalation_after_s and quiet_hours"
@@ -107,26 +91,12 @@ class NotifierConfig(StageConfig):
     page: str = Field(
         default="", pattern=r"^(https?://\S+)?$", description="address of the operators' page, for a link in messages"
     )
-    timezone: str = Field(
-        default="",
-        description='time zone of quiet hours and of times in messages, such as "Europe/Berlin"; "": that of the host',
-    )
 
     @field_validator("target", mode="before")
     @classmethod
     def _are_tables(cls, value: Any) -> Any:
         if isinstance(value, dict):
             raise ValueError("write [[notifier.target]], with two brackets on each side: there may be several")
-        return value
-
-    @field_validator("timezone")
-    @classmethod
-    def _is_known(cls, value: str) -> str:
-        try:
-            if value:
-                ZoneInfo(value)
-        except (ZoneInfoNotFoundError, ValueError, OSError) as error:
-            raise ValueError(f"unknown time zone {value!r}; such as Europe/Berlin") from error
         return value
 
     @field_validator("target")
@@ -137,8 +107,3 @@ class NotifierConfig(StageConfig):
             if names.count(name) > 1:
                 raise ValueError(f"two targets are called {name!r}")
         return value
-
-    @property
-    def zone(self) -> ZoneInfo | None:
-        """None: that of the host."""
-        return ZoneInfo(self.timezone) if self.timezone else None

@@ -5,13 +5,12 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from datetime import datetime, tzinfo
+from datetime import datetime
 from typing import Self
 
-from fantwin.pipeline.outputs.notify.config import QuietHours
+from fantwin.pipeline.outputs.notify.config import TargetConfig
 from fantwin.pipeline.outputs.notify.deciding import Happened, Kind
 from fantwin.pipeline.site.fleet import Fan
-from fantwin.schemas.enums import Severity
 from fantwin.schemas.units import NS_PER_S
 
 GATHER_S = 5.0
@@ -78,17 +77,12 @@ def _longest_ns(gathered: Gathered) -> float:
     return min(LONGEST_S, DIGEST_WITHIN_S * 2 ** min(gathered.in_a_row, 10)) * NS_PER_S
 
 
-def is_held(hours: QuietHours | None, severity: int, now_ns: int, zone: tzinfo | None) -> bool:
-    """Whether a message about an alarm of a severity is held now."""
-    if hours is None or not is_within(hours, now_ns, zone):
+def is_quiet(target: TargetConfig, now_ns: int) -> bool:
+    """Whether it is a quiet hour of a target, in the time zone of the host."""
+    if target.quiet_times is None:
         return False
-    return hours.sent_from == "none" or severity < Severity.ALARM
-
-
-def is_within(hours: QuietHours, now_ns: int, zone: tzinfo | None) -> bool:
-    """Whether it is such an hour. zone: None is that of the host."""
-    now = datetime.fromtimestamp(now_ns / NS_PER_S, zone).time()
-    begin, end = hours.times
+    now = datetime.fromtimestamp(now_ns / NS_PER_S).time()
+    begin, end = target.quiet_times
     return begin <= now < end if begin < end else now >= begin or now < end
 
 

@@ -11,7 +11,7 @@ from enum import StrEnum
 
 from fantwin.pipeline.outputs.notify.config import NotifierConfig, TargetConfig
 from fantwin.pipeline.outputs.notify.deciding import Announced, Happened, decide, hears_of
-from fantwin.pipeline.outputs.notify.gathering import DIGEST_ABOVE, Gathered, is_due, is_held, is_within, next_after
+from fantwin.pipeline.outputs.notify.gathering import DIGEST_ABOVE, Gathered, is_due, is_quiet, next_after
 from fantwin.pipeline.outputs.notify.wording import Place, Text, about_fan, about_many
 from fantwin.pipeline.site.alarm_book import AlarmBook
 from fantwin.pipeline.site.fleet import Fan
@@ -160,7 +160,7 @@ class Notifications:
 
     def _gather(self, target: TargetConfig, fan: Fan, happened: Happened, severity: int, now_ns: int) -> None:
         basket = Basket.OPEN
-        if is_held(target.quiet_hours, severity, now_ns, self._place.zone):
+        if severity <= target.most_held_severity and is_quiet(target, now_ns):
             basket = Basket.HELD
         elif (before := self._gathered(target, Basket.HELD).fans.pop(fan, None)) is not None:
             # worse than what is held: all of it goes at once
@@ -176,7 +176,7 @@ class Notifications:
             for text in self._texts(gathered, now_ns):
                 self.changes.outgoing.append(Outgoing(target.name, text, now_ns))
         held = self._gathered(target, Basket.HELD)
-        if held.fans and not (target.quiet_hours and is_within(target.quiet_hours, now_ns, self._place.zone)):
+        if held.fans and not is_quiet(target, now_ns):
             self._set(target, Basket.HELD, Gathered())
             self._count_from(target, held, now_ns)
             if fans := self._presented(held):

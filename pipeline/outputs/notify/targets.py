@@ -14,21 +14,10 @@ from fantwin.pipeline.outputs.notify.config import NotifierConfig, TargetConfig
 from fantwin.pipeline.outputs.notify.outbox import Outbox
 from fantwin.pipeline.outputs.notify.sending import Failure, Sender, TargetThread
 from fantwin.pipeline.outputs.notify.wording import Place, test_text
-from fantwin.pipeline.sources.secret_file import read_secret, secret_of_environment
+from fantwin.pipeline.sources.secret_file import read_secret
 
 Resolve = Callable[[Path], Path]
 """A path of the configuration file as one of the file system."""
-
-
-def url_of(target: TargetConfig, resolve: Resolve) -> str:
-    """Its URL, with its secrets.
-
-    Raises:
-        UserError: the file cannot be read or others may read it, or the environment lacks the variable.
-    """
-    if target.url_file is not None:
-        return read_secret(resolve(target.url_file))
-    return secret_of_environment(target.url_env, "the notifier") if target.url_env else target.url
 
 
 def connection_of(target: TargetConfig, resolve: Resolve) -> Service | Alertmanager:
@@ -39,9 +28,9 @@ def connection_of(target: TargetConfig, resolve: Resolve) -> Service | Alertmana
     """
     try:
         if target.kind == "alertmanager":
-            return Alertmanager(url_of(target, resolve))
+            return Alertmanager(read_secret(resolve(target.url_file)))
         require(target.kind, "outputs", "apprise")
-        return Service(url_of(target, resolve))
+        return Service(read_secret(resolve(target.url_file)))
     except UserError as error:
         raise UserError(f"target {target.name}: {error}") from error
 

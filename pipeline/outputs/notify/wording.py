@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from datetime import datetime, tzinfo
+from datetime import datetime
 from enum import StrEnum
 from urllib.parse import quote
 
@@ -61,17 +61,15 @@ class Text:
 
 @dataclass(frozen=True)
 class Place:
-    """What all messages of a site say. page: address of the operators' page; may be empty. zone: None is that of the
-    host."""
+    """What all messages of a site say. page: address of the operators' page; may be empty."""
 
     site: str
     page: str = ""
-    zone: tzinfo | None = None
 
     def clock(self, t_ns: int) -> str:
-        """A date and a time of day with its zone."""
+        """A date and a time of day in the time zone of the host."""
         try:
-            at = datetime.fromtimestamp(t_ns / NS_PER_S, self.zone).astimezone(self.zone)
+            at = datetime.fromtimestamp(t_ns / NS_PER_S).astimezone()
         except (ValueError, OverflowError, OSError):  # a device may send any time
             return "at an unknown time"
         return at.strftime("%Y-%m-%d %H:%M:%S %Z")

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from typing import Any, ClassVar, Literal, Self
+from urllib.parse import urlsplit
 
-from pydantic import BaseModel, ConfigDict, Field, create_model, model_validator
+from pydantic import BaseModel, ConfigDict, Field, create_model, field_validator, model_validator
 
 from fantwin.pipeline.sources.polling import PolledConfig
 from fantwin.schemas.channels import CHANNELS, Channel
-from fantwin.schemas.tacho import LONGEST_WINDOW_S, Tacho
-from fantwin.schemas.units import RAD_S_PER_UNIT
 
+TCP_PORT = 502
 RegisterType = Literal["u16", "s16", "u32", "s32", "f32"]
 
 
@@ -58,33 +58,37 @@ class ModbusConfig(PolledConfig, frozen=True):
     """Drives and fan trays by Modbus, TCP or RTU. It needs the extra `devices`."""
 
     kind: Literal["modbus"] = "modbus"
-    host: str = Field(default="", description="name or address, for Modbus TCP")
-    tcp_port: int = Field(default=502, ge=1, le=65535, description="TCP port of the host")
+    host: str = Field(default="", description="name or address, for Modbus TCP; plc1:1502 if its port is not 502")
     port: str = Field(default="", description="serial port, for Modbus RTU")
     baud: int = Field(default=19200, gt=0, description="speed of the serial port, bits a second")
-    parity: Literal["N", "E", "O"] = Field(
-        default="E", description="none, even or odd; the serial port has 8 data bits"
-    )
-    stop_bits: Literal[1, 2] = Field(default=1, description="stop bits of the serial port")
-    average_s: float | None = Field(
-        default=None,
-        gt=0,
-        le=LONGEST_WINDOW_S,
-        description="how long the device averages a speed (its filter); without it, readings count as instantaneous",
-    )
-    update_s: float = Field(
-        default=0.0,
-        ge=0,
-        le=LONGEST_WINDOW_S,
-        description="time between new speeds in the register; 0: average_s",
+    framing: Literal["8N1", "8E1", "8O1", "8N2", "8E2", "8O2"] = Field(
+        default="8E1", description="data bits, parity and stop bits of the serial port"
     )
     fan: tuple[ModbusFan, ...] = Field(min_length=1, description="one [[tray.source.fan]] for each fan, in their order")
+
+    @field_validator("host")
+    @classmethod
+    def _has_a_port_if_any(cls, value: str) -> str:
+        try:
+            parts = urlsplit(f"//{value}")
+            is_address = parts.port != 0 and parts.netloc == value and "@" not in value
+        except ValueError:
+            is_address = False
+        if not is_address:
+            raise ValueError("give a name or address, with its port if that is not 502: plc1, plc1:1502 or [fe80::1]")
+        return value
 
     @model_validator(mode="after")
     def _one_connection(self) -> Self:
         if bool(self.host) == bool(self.port):
             raise ValueError("give either host, for Modbus TCP, or port, for Modbus RTU")
         return self
+
+    @property
+    def address(self) -> tuple[str, int]:
+        """Host and port, for Modbus TCP."""
+        parts = urlsplit(f"//{self.host}")
+        return parts.hostname or "", parts.port or TCP_PORT
 
     @property
     def most_fans(self) -> int:
@@ -95,17 +99,3 @@ class ModbusConfig(PolledConfig, frozen=True):
     def why_no_commands(self) -> str:
         """Commands need a fan with a register `write`."""
         return "" if any(fan.write for fan in self.fan) else "no fan of its source has a register `write`"
-
-    def stated_tachos(self, fans: int) -> tuple[Tacho, ...] | None:
-        """The mean over average_s, in the steps of the register of each fan."""
-        if self.average_s is None or fans != len(self.fan):
-            return None
-        return tuple(
-            Tacho(
-                kind="average",
-                window_s=self.average_s,
-                update_s=self.update_s,
-                step_rad_s=0.0 if each.speed.type == "f32" else abs(each.speed.scale) * RAD_S_PER_UNIT["rpm"],
-            )
-            for each in self.fan
-        )

@@ -76,14 +76,14 @@ class ModbusDevice:
     @property
     def name(self) -> str:
         """Host or port."""
-        config = self._config
-        return f"{config.host}:{config.tcp_port}" if config.host else config.port
+        host, port = self._config.address
+        return f"{host}:{port}" if host else self._config.port
 
     @property
     def settings_to_check(self) -> str:
         """Settings that may differ between the two ends."""
         config = self._config
-        line = "" if config.host else f"baud = {config.baud}, parity = {config.parity!r}, "
+        line = "" if config.host else f'baud = {config.baud}, framing = "{config.framing}", '
         return f"{line}unit and registers"
 
     @property
@@ -146,12 +146,13 @@ class ModbusDevice:
         config = self._config
         logging.getLogger("pymodbus.logging").setLevel(logging.CRITICAL)  # a failure is a line of this source already
         if config.host:
-            return ModbusTcpClient(config.host, port=config.tcp_port, timeout=TIMEOUT_S, retries=0)
+            host, port = config.address
+            return ModbusTcpClient(host, port=port, timeout=TIMEOUT_S, retries=0)
         return ModbusSerialClient(
             self._port,
             baudrate=config.baud,
-            parity=config.parity,
-            stopbits=config.stop_bits,
+            parity=config.framing[1],
+            stopbits=int(config.framing[2]),
             timeout=TIMEOUT_S,
             retries=0,
         )

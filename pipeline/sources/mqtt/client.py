@@ -15,21 +15,19 @@ if TYPE_CHECKING:
 RECONNECT_DELAY_S, RECONNECT_DELAY_MAX_S = 1, 10
 ANSWER_S = 5.0
 """longest wait for the answer to a check"""
-NOT_REACHED = "the broker cannot be reached; check host and port, and whether it runs"
+NOT_REACHED = "the broker cannot be reached; check url, and whether the broker runs"
 
 
 def refusal(reason: object) -> str:
     """The line about a broker that does not let this client in."""
-    return f"the broker refuses this client: {reason}; check username and password"
+    return f"the broker refuses this client: {reason}; check user and password"
 
 
-def new_client(
-    settings: BrokerSettings, folder: Path, process: str, client_id: str = "", *, is_kept: bool = False
-) -> Client:
+def new_client(settings: BrokerSettings, folder: Path, client_id: str = "", *, is_kept: bool = False) -> Client:
     """A client that is not connected yet.
 
-    folder: relative paths start here. process: which needs the environment. client_id: the broker ends an older
-    connection of the same one. is_kept: the broker keeps what comes while the client is away; needs client_id.
+    folder: relative paths start here. client_id: the broker ends an older connection of the same one. is_kept: the
+    broker keeps what comes while the client is away; needs client_id.
 
     Raises:
         UserError: a password or certificate cannot be read.
@@ -40,7 +38,7 @@ def new_client(
     client = paho.Client(CallbackAPIVersion.VERSION2, client_id, clean_session=not is_kept, protocol=paho.MQTTv311)
     client.reconnect_delay_set(RECONNECT_DELAY_S, RECONNECT_DELAY_MAX_S)
     if settings.username:
-        client.username_pw_set(settings.username, settings.password(folder, process))
+        client.username_pw_set(settings.username, settings.password(folder))
     if settings.tls:
         from fantwin.pipeline.certificates import client_context  # noqa: PLC0415  slow to import
 
@@ -60,7 +58,7 @@ def connection_problems(client: Client, settings: BrokerSettings, name: str) -> 
 
     def on_connect(_client: Any, _data: Any, _flags: Any, reason: Any, _properties: Any) -> None:
         if reason.is_failure:
-            problems.append(f"{name}: the broker refuses: {reason}; check username and password")
+            problems.append(f"{name}: the broker refuses: {reason}; check user and password")
         has_answered.set()
 
     client.on_connect = on_connect
@@ -71,10 +69,10 @@ def connection_problems(client: Client, settings: BrokerSettings, name: str) -> 
 
         return [f"{name}: {tls_refusal(error, 'broker')}"]
     except OSError as error:
-        return [f"{name}: cannot be reached: {error.strerror or error}; check host and port"]
+        return [f"{name}: cannot be reached: {error.strerror or error}; check url"]
     client.loop_start()
     if not has_answered.wait(ANSWER_S):
-        problems.append(f"{name}: what listens there does not answer as a broker; check host, port and tls")
+        problems.append(f"{name}: what listens there does not answer as a broker; check url")
     client.disconnect()
     client.loop_stop()
     return problems

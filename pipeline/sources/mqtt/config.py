@@ -1,4 +1,4 @@
-"""Settings of samples from an MQTT broker: `source = { kind = "mqtt", host = "broker", topic = "plant/tray1" }`."""
+"""Settings of samples from an MQTT broker: `{ kind = "mqtt", url = "mqtt://broker", topic = "plant/tray1" }`."""
 
 from __future__ import annotations
 

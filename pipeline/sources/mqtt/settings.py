@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Self
+from typing import ClassVar, Self
 
 from pydantic import Field, model_validator
 
@@ -16,9 +17,12 @@ KEEPALIVE_S = 30
 class BrokerSettings(LogIn, frozen=True):
     """Address, user and certificates."""
 
-    host: str = Field(min_length=1, description="name or address of the broker")
-    port: int = Field(default=1883, ge=1, le=65535, description="port of the broker; with TLS usually 8883")
-    tls: bool = Field(default=False, description="whether to encrypt the connection and check the broker's certificate")
+    schemes: ClassVar[Mapping[str, int]] = {"mqtt": 1883, "mqtts": 8883}
+
+    url: str = Field(
+        description="address of the broker: mqtt://HOST, or mqtts://HOST to encrypt the connection and check the "
+        "broker's certificate; USER@ before the host logs in, :PORT after it is a port other than 1883, of mqtts 8883"
+    )
     ca: Path | None = Field(
         default=None,
         description="certificate of the authority that signed the broker's; without it, those of the system are used",
@@ -26,10 +30,15 @@ class BrokerSettings(LogIn, frozen=True):
     certificate: Path | None = Field(default=None, description="certificate of this client, if the broker asks for one")
     key: Path | None = Field(default=None, description="private key of that certificate")
 
+    @property
+    def tls(self) -> bool:
+        """Whether the connection is encrypted."""
+        return self.parts.scheme == "mqtts"
+
     @model_validator(mode="after")
     def _certificates_fit(self) -> Self:
         if not self.tls and (self.ca or self.certificate or self.key):
-            raise ValueError("ca, certificate and key need tls = true")
+            raise ValueError("ca, certificate and key need mqtts:// in url")
         if bool(self.certificate) != bool(self.key):
             raise ValueError("give certificate and key, or neither")
         return self

@@ -120,12 +120,12 @@ class MqttSource:
     def check(self) -> list[str]:
         """Problems before the start: the broker does not answer, or does not accept this client."""
         # with an id of its own: the broker ends the connection of another client with the same one
-        client = new_client(self._config, self._context.folder, "acquisition")
+        client = new_client(self._config, self._context.folder)
         return connection_problems(client, self._config, self.name)
 
     def _new_client(self, client_id: str) -> Client:
         folder, is_kept = self._context.folder, bool(client_id)
-        client = new_client(self._config, folder, "acquisition", client_id, is_kept=is_kept)
+        client = new_client(self._config, folder, client_id, is_kept=is_kept)
         client.on_connect = self._on_connect
         client.on_connect_fail = self._on_connect_fail
         client.on_disconnect = self._on_disconnect

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Literal, Self
-from urllib.parse import urlsplit
+from typing import ClassVar, Literal, Self
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, model_validator
 
 from fantwin.pipeline.sources.polling import SLOWEST_S, PolledConfig
 from fantwin.pipeline.sources.secret_file import LogIn
@@ -15,9 +15,11 @@ from fantwin.pipeline.sources.secret_file import LogIn
 class RedfishConfig(PolledConfig, LogIn, frozen=True):
     """Fans of a server by its baseboard controller. It needs the extra `devices`."""
 
+    schemes: ClassVar[Mapping[str, int]] = {"http": 80, "https": 443}
+
     kind: Literal["redfish"] = "redfish"
     period_s: float = Field(default=1.0, gt=0, le=SLOWEST_S, description="time between two readings")
-    url: str = Field(description="address of the controller, for example https://bmc1; without user and password")
+    url: str = Field(description="address of the controller, for example https://bmc1, or https://USER@bmc1 to log in")
     chassis: str = Field(default="", description="id of the chassis; needed where the controller has several")
     fans: tuple[str, ...] = Field(
         default=(),
@@ -35,21 +37,16 @@ class RedfishConfig(PolledConfig, LogIn, frozen=True):
     verify: bool = Field(default=True, description="whether the certificate of the controller is checked")
     ca: Path | None = Field(default=None, description="certificate of the authority that signed the controller's")
 
-    @field_validator("url")
-    @classmethod
-    def _plain_address(cls, value: str) -> str:
-        parts = urlsplit(value)
-        if parts.scheme not in ("http", "https") or not parts.hostname:
-            raise ValueError("write the address of the controller, for example https://bmc1")
-        if parts.username is not None:
-            raise ValueError("a configuration is recorded: give username, and password_file")
-        return value
-
     @model_validator(mode="after")
     def _has_password(self) -> Self:
-        if self.username and not (self.password_file or self.password_env):
-            raise ValueError("username needs password_file or password_env")
+        if self.username and not self.password_file:
+            raise ValueError("the user in url needs password_file")
         return self
+
+    @property
+    def address(self) -> str:
+        """Its URL without the user."""
+        return self.parts._replace(netloc=self.parts.netloc.rpartition("@")[2]).geturl()
 
     @property
     def why_no_commands(self) -> str:

@@ -52,7 +52,7 @@ class RedfishDevice:
     @property
     def name(self) -> str:
         """The address."""
-        return self._config.url
+        return self._config.address
 
     @property
     def settings_to_check(self) -> str:
@@ -67,8 +67,8 @@ class RedfishDevice:
         config = self._config
         logging.getLogger("sushy").setLevel(logging.CRITICAL)  # a failure is a line of this source already
         user, password = config.username, self._password()
-        if user and config.url.startswith("http:"):
-            raise DeviceError(f"{config.url} would send the password in the clear: use https", is_lost=True)
+        if user and config.parts.scheme == "http":
+            raise DeviceError(f"{config.address} would send the password in the clear: use https", is_lost=True)
         # sushy takes 0 for its own number of attempts, and waits between them; the poller tries again by itself
         options: dict[str, Any] = {
             "verify": str(self._folder / config.ca) if config.ca and config.verify else config.verify,
@@ -80,7 +80,7 @@ class RedfishDevice:
 
         def log_in() -> Any:
             return sushy.Sushy(
-                config.url,
+                config.address,
                 auth=SessionOrBasicAuth(user, password) if user else BasicAuth("", ""),
                 **options,
             )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -73,18 +72,6 @@ def test_what_cannot_be_used_is_one_line_that_says_what_to_do(site, harm, words)
         checked(site)
     assert "\n" not in str(refused.value)
     assert all(word in str(refused.value) for word in words), str(refused.value)
-
-
-def test_a_key_of_root_may_be_read_by_the_group_of_its_user_as_a_cluster_mounts_it(site, monkeypatch):
-    key = site.folder / "scorer.key"
-    if key.stat().st_uid != 0:
-        pytest.skip("only root has files of root")
-    monkeypatch.setattr(os, "geteuid", lambda: 1000)
-    key.chmod(0o440)
-    assert checked(site).role == "scorer"
-    key.chmod(0o444)
-    with pytest.raises(BusError, match="others may read"):
-        checked(site)
 
 
 def test_a_certificate_is_not_valid_before_its_time_and_warned_of_before_its_end(site):

@@ -31,7 +31,7 @@ url_file = "hook.url"
 [[notifier.target]]
 name = "other"
 kind = "alertmanager"
-url = "http://127.0.0.1:{port}"
+url_file = "other.url"
 """
 
 
@@ -44,8 +44,9 @@ def receiver() -> Iterator[HttpReceiver]:
 
 def site(folder: Path, receiver: HttpReceiver, alertmanager_port: int) -> Path:
     secret(folder, "hook", f"json://127.0.0.1:{receiver.port}/")
+    secret(folder, "other", f"http://127.0.0.1:{alertmanager_port}")
     config = folder / "fantwin.toml"
-    config.write_text(CONFIGURATION.format(port=alertmanager_port))
+    config.write_text(CONFIGURATION)
     return config
 
 

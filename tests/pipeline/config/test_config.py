@@ -102,13 +102,12 @@ def test_only_the_sections_of_the_stages_asked_for_are_checked():
 
 
 def test_all_that_is_wrong_in_a_section_is_one_line():
-    target = 'name = "a"\nurl_file = "u"\nquiet_hours = { begin = "22", end = "6" }\n'
+    target = 'name = "a"\nurl_file = "u"\nquiet_hours = "22-6"\n'
     with pytest.raises(ConfigError) as caught:
-        parse(f"{GOOD}[notifier]\ntimezon = 3\n[[notifier.target]]\n{target}")
+        parse(f"{GOOD}[notifier]\npge = 3\n[[notifier.target]]\n{target}")
     assert str(caught.value).partition(".toml: ")[2] == (
-        "unknown key 'notifier.timezon'; did you mean 'timezone'?; "
-        "notifier.target.0.quiet_hours.begin = '22': hours and minutes, such as \"22:00\"; "
-        "notifier.target.0.quiet_hours.end = '6': hours and minutes, such as \"22:00\""
+        "unknown key 'notifier.pge'; did you mean 'page'?; "
+        "notifier.target.0.quiet_hours = '22-6': begin and end, such as \"22:00-06:00\""
     )
     with pytest.raises(ConfigError) as caught:
         parse(GOOD + '[notifier.target]\nname = "a"\nurl_file = "u"\n')

@@ -130,7 +130,10 @@ def configured(folder: Path, source: str) -> Path:
     ("source", "hint"),
     [
         ('kind = "push"', "the fans' own controller must vary their commands"),
-        ('kind = "mqtt", host = "broker", topic = "t", send_topic = "c"', "`fantwin command --sweep` moves the fans"),
+        (
+            'kind = "mqtt", url = "mqtt://broker", topic = "t", send_topic = "c"',
+            "`fantwin command --sweep` moves the fans",
+        ),
     ],
 )
 def test_a_sweep_is_advised_only_where_it_can_be_done(tmp_path: Path, source: str, hint: str) -> None:

@@ -15,7 +15,6 @@ from fantwin.pipeline.sources.modbus.source import ModbusDevice
 from fantwin.pipeline.sources.polling import DeviceError
 from fantwin.pipeline.sources.source import SourceContext
 from fantwin.schemas import channels as of
-from fantwin.schemas.tacho import Tacho
 from fantwin.simulation.tray import SimulatedTray, TraySettings
 from tests.support.modbus_server import (
     COMMAND,
@@ -53,7 +52,7 @@ def drive() -> Drive:
 
 
 def config(port: int, *fans: dict[str, Any], **settings: Any) -> ModbusConfig:
-    return ModbusConfig.model_validate({"host": "127.0.0.1", "tcp_port": port, "fan": fans or (FAN,), **settings})
+    return ModbusConfig.model_validate({"host": f"127.0.0.1:{port}", "fan": fans or (FAN,), **settings})
 
 
 def device(port: int, *fans: dict[str, Any], **settings: Any) -> ModbusDevice:
@@ -84,7 +83,7 @@ def test_what_a_drive_refuses_is_nan_or_an_error_and_a_command_must_be_there() -
 
 
 def over_serial(line: SerialLine, **settings: Any) -> tuple[ModbusConfig, SourceContext]:
-    values = {"port": line.host, "parity": "N", "fan": (FAN,), **settings}
+    values = {"port": line.host, "framing": "8N1", "fan": (FAN,), **settings}
     return ModbusConfig.model_validate(values), SourceContext(1, "rpm", Path())
 
 
@@ -109,20 +108,20 @@ def test_registers_of_all_types_are_read_by_one_request_and_a_command_moves_the_
     assert line.transferred["host"].startswith(bytes.fromhex("03030e"))
 
 
-def test_the_registers_say_what_is_measured_where_the_averaging_time_is_known() -> None:
-    tray = '[[tray]]\nname = "a"\nfans = 1\nsource = { kind = "modbus", host = "drive", %s fan = [ %s ] }\n'
+def test_settings_of_a_line_that_cannot_be_are_one_line() -> None:
+    tray = '[[tray]]\nname = "a"\nfans = 1\nsource = { kind = "modbus", host = "drive", fan = [ %s ] }\n'
     fan = "{ speed = { address = 1, scale = 2.0 }, command = { address = 2 } }"
-    (known,) = parse_config(tray % ("average_s = 0.5,", fan), Path("fantwin.toml")).trays
-    assert known.tachos == (Tacho(kind="average", window_s=0.5, step_rad_s=2.0 * math.pi / 30.0),)
-    assert parse_config(tray % ("", fan), Path("fantwin.toml")).trays[0].tachos == (Tacho(),)
     for change, words in (
         (("address = 1,", "adress = 1,"), r"fan.0.speed.adress'; did you mean 'address'\?"),
         (("scale = 2.0", "scale = 0"), "scale is 0"),
         (('host = "drive",', ""), "give either host"),
+        (('"drive"', '"drive:port"'), "source.host = 'drive:port': give a name or address, with its port"),
+        (('"drive"', '"fe80::1"'), r"plc1, plc1:1502 or \[fe80::1\]"),
+        (('host = "drive"', 'port = "ttyUSB0", framing = "7E1"'), "source.framing = '7E1'"),
         (("fans = 1", "fans = 2"), "carries at most 1 fans"),
     ):
         with pytest.raises(ConfigError, match=words) as caught:
-            parse_config((tray % ("", fan)).replace(*change), Path("fantwin.toml"))
+            parse_config((tray % fan).replace(*change), Path("fantwin.toml"))
         assert "\n" not in str(caught.value)
 
 
@@ -146,8 +145,16 @@ def test_a_unit_that_is_too_slow_on_a_serial_line_is_a_failed_poll_and_the_next_
         made.disconnect()
 
 
+def test_a_host_may_have_a_port() -> None:
+    addresses = [
+        ModbusConfig.model_validate({"host": host, "fan": (FAN,)}).address
+        for host in ("plc1", "plc1:1502", "[::1]:1502")
+    ]
+    assert addresses == [("plc1", 502), ("plc1", 1502), ("::1", 1502)]
+
+
 def test_a_source_over_a_serial_port_opens_it_with_the_settings_of_the_line() -> None:
-    settings = {"port": "/dev/ttyUSB7", "baud": 9600, "parity": "O", "stop_bits": 2, "fan": (FAN,)}
+    settings = {"port": "/dev/ttyUSB7", "baud": 9600, "framing": "8O2", "fan": (FAN,)}
     made = ModbusDevice(ModbusConfig.model_validate(settings), SourceContext(1, "rpm", Path()))
     line = made._made_client().comm_params
     assert (line.host, line.baudrate, line.parity, line.stopbits) == ("/dev/ttyUSB7", 9600, "O", 2)

@@ -97,8 +97,8 @@ def test_a_controller_that_fails_or_is_slow_is_a_failed_poll_and_one_that_is_gon
     assert caught.value.is_lost
 
 
-def test_a_password_comes_from_a_file_or_the_environment_over_a_verified_line_only(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+def test_a_password_comes_from_a_file_of_its_owner_and_goes_over_a_verified_line_only(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     authority = trustme.CA()
     tls = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
@@ -108,28 +108,32 @@ def test_a_password_comes_from_a_file_or_the_environment_over_a_verified_line_on
     file.write_text(f"{SECRET}\n")
     controller = Controller(is_new=True, user="operator", password=SECRET)
     with redfish_server(controller, tls) as url:
-        settings = {"folder": tmp_path, "ca": "ca.pem", "username": "operator", "password_file": "bmc.secret"}
+        url = url.replace("//", "//operator@")
+        settings = {"folder": tmp_path, "ca": "ca.pem", "password_file": "bmc.secret"}
         with pytest.raises(DeviceError, match="others may read it: chmod 600"):
             connected(url, **settings)
         assert "others may read it" in device(url, **settings).check()[0]
         file.chmod(0o600)
-        file.write_text(f"{SECRET}\n")
         made = connected(url, **settings)
         assert reading(made).speed == (4000.0, 4200.0)
         made.disconnect()
         with pytest.raises(DeviceError, match="^its certificate cannot be verified: name the authority by source.ca"):
-            connected(url, folder=tmp_path, username="operator", password_file="bmc.secret")
-        monkeypatch.setenv("BMC", f"{SECRET}-not")
+            connected(url, folder=tmp_path, password_file="bmc.secret")
+        file.write_text(f"{SECRET}-not\n")
         with pytest.raises(DeviceError, match="^user or password is refused") as caught:
-            connected(url, folder=tmp_path, ca="ca.pem", username="operator", password_env="BMC")
+            connected(url, **settings)
         assert SECRET not in str(caught.value)
     with pytest.raises(DeviceError, match="would send the password in the clear"):
-        connected("http://127.0.0.1:9", username="operator", password_env="BMC")
+        connected("http://operator@127.0.0.1:9", folder=tmp_path, password_file="bmc.secret")
     assert SECRET not in caplog.text
 
 
 def test_the_configuration_keeps_no_password() -> None:
     tray = '[[tray]]\nname = "a"\nfans = 1\nsource = { kind = "redfish", url = "%s" }\n'
-    for url, words in (("https://a:b@bmc1", "a configuration is recorded"), ("bmc1", "write the address")):
+    for url, words in (
+        ("https://a:b@bmc1", "a configuration is recorded"),
+        ("bmc1", "write the address"),
+        ("https://a@bmc1", "needs password_file"),
+    ):
         with pytest.raises(ConfigError, match=words):
             parse_config(tray % url, Path("f"))

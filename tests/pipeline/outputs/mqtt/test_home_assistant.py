@@ -39,8 +39,8 @@ REQUIRED = {"binary_sensor": "state_topic", "sensor": "state_topic", "button": "
 
 def devices_of(topics: Topics | None = None, **settings: Any) -> dict[str, dict[str, Any]]:
     """The devices by the last part of their topics."""
-    config = MqttConfig.model_validate({"host": "broker", "home_assistant": "publish"} | settings)
-    messages = HomeAssistant(config, topics or Topics("fantwin", "hall"), TRAYS).messages()
+    config = MqttConfig.model_validate({"url": "mqtt://broker", "home_assistant": "publish"} | settings)
+    messages = HomeAssistant(config, topics or Topics("hall"), TRAYS).messages()
     found: dict[str, dict[str, Any]] = {}
     for topic, text in messages.items():
         match = TOPIC.fullmatch(topic)
@@ -49,7 +49,7 @@ def devices_of(topics: Topics | None = None, **settings: Any) -> dict[str, dict[
     return found
 
 
-@pytest.mark.parametrize("settings", [{}, {"accept": ("acknowledge",), "operator_name": "desk"}])
+@pytest.mark.parametrize("settings", [{}, {"accept": ("acknowledge",)}])
 def test_payloads_have_the_documented_keys_and_all_that_are_required(settings):
     devices = devices_of(**settings)
     assert devices.keys() == {"site", "tray1-0", "tray1-1", "tray-2-0", "tray-2-1", "tray-2-2"}
@@ -82,23 +82,24 @@ def test_entities_have_a_unit_and_are_unavailable_when_the_stage_is_gone_but_for
     assert "availability_topic" not in devices_of()["site"]["components"]["running"]
 
 
-def test_only_chosen_trays_and_no_more_fans_than_allowed():
+def test_only_chosen_trays_or_the_first_fans_are_devices(monkeypatch):
+    monkeypatch.setattr("fantwin.pipeline.outputs.mqtt.home_assistant.MOST_FANS", 1)
     assert devices_of(home_assistant_trays=("tray-2",)).keys() == {"site", "tray-2-0", "tray-2-1", "tray-2-2"}
-    assert devices_of(home_assistant_fans=1).keys() == {"site", "tray1-0"}
-    config = MqttConfig(host="broker", home_assistant="publish", home_assistant_fans=1)
-    assert HomeAssistant(config, Topics("fantwin", "hall"), TRAYS).left_out == 4
+    assert devices_of().keys() == {"site", "tray1-0"}
+    config = MqttConfig(url="mqtt://broker", home_assistant="publish")
+    assert HomeAssistant(config, Topics("hall"), TRAYS).left_out == 4
 
 
 def test_a_button_acknowledges_where_that_is_accepted():
-    button = devices_of(accept=("acknowledge",), operator_name="desk")["tray1-0"]["components"]["acknowledge"]
+    button = devices_of(accept=("acknowledge",))["tray1-0"]["components"]["acknowledge"]
     assert button["command_topic"] == "fantwin/hall/tray1/0/request"
     assert json.loads(button["payload_press"])["action"] == "acknowledge"
-    assert "acknowledge" not in devices_of(accept=("confirm",), operator_name="desk")["tray1-0"]["components"]
+    assert "acknowledge" not in devices_of(accept=("confirm",))["tray1-0"]["components"]
 
 
-def test_prefixes_and_shards_have_devices_of_their_own():
+def test_sites_and_shards_have_devices_of_their_own():
     def identifier(topics: Topics) -> str:
         return devices_of(topics)["site"]["device"]["identifiers"][0]
 
-    assert identifier(Topics("plant/a", "hall")) == "plant_a_hall-site"
-    assert identifier(Topics("fantwin", "hall", "2-of-4")) == "fantwin_hall_2-of-4-site"
+    assert identifier(Topics("hall")) == "fantwin_hall-site"
+    assert identifier(Topics("hall", "2-of-4")) == "fantwin_hall_2-of-4-site"

@@ -26,14 +26,14 @@ class Desk:
         self.now_ns = start_ns
         settings = target.pop("settings", {})
         self.config = NotifierConfig.model_validate(
-            {"target": [TARGET | target], "timezone": "UTC", "page": "https://hall.example", **settings}
+            {"target": [TARGET | target], "page": "https://hall.example", **settings}
         )
         self.saved = Saved(is_first=is_first)
         self.heard: list[Alarm] = []
         self.begin()
 
     def begin(self) -> None:
-        place = Place("hall", self.config.page, self.config.zone)
+        place = Place("hall", self.config.page)
         self.notifications = Notifications(self.config, place, self.saved, self.heard)
 
     def hear(self, *messages: Alarm) -> None:
@@ -201,7 +201,7 @@ def test_while_more_fans_keep_coming_messages_become_rarer():
 
 
 def test_quiet_hours_hold_what_is_less_severe_and_say_it_at_their_end():
-    desk = Desk(TEN_AT_NIGHT_NS, quiet_hours={"begin": "22:00", "end": "06:00"}, repeat_s=3600)
+    desk = Desk(TEN_AT_NIGHT_NS, quiet_hours="22:00-06:00", repeat_s=3600)
     desk.hear(alarm(fan=1), alarm(fan=2), alarm(fan=3, severity=Severity.ALARM))
     assert titles(desk.wait(60)) == ["ALARM, fan 3 of tray1"]
     desk.hear(alarm(Transition.ACKNOWLEDGED, fan=3, severity=Severity.ALARM, acknowledged=True), cleared(1))
@@ -214,8 +214,7 @@ def test_quiet_hours_hold_what_is_less_severe_and_say_it_at_their_end():
     (held,) = desk.wait(3600)
     assert held.body.startswith("Held during quiet hours:\n2 alarms in 1 tray at hall: 1 WARNING, 1 cleared")
     assert held.title.startswith("2 alarms in 1 tray")
-    within_a_day = {"begin": "21:00", "end": "23:00", "sent_from": "none"}
-    desk = Desk(TEN_AT_NIGHT_NS, quiet_hours=within_a_day, repeat_s=0)
+    desk = Desk(TEN_AT_NIGHT_NS, quiet_hours="21:00-23:00", held_severity="alarm", repeat_s=0)
     desk.hear(alarm(severity=Severity.ALARM))
     assert (desk.wait(3500), len(desk.wait(200))) == ([], 1), "no severity is excepted"
 

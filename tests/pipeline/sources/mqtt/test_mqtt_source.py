@@ -54,7 +54,7 @@ def publish(broker: MqttBroker) -> Iterator[Callable[..., None]]:
 
 
 def source_of(port: int, folder: Path = Path(), **settings: Any) -> MqttSource:
-    config = MqttConfig.model_validate({"host": "127.0.0.1", "port": port} | (settings or {"topic": "plant/tray1"}))
+    config = MqttConfig.model_validate({"url": f"mqtt://127.0.0.1:{port}"} | (settings or {"topic": "plant/tray1"}))
     return MqttSource(config, SourceContext(2, "rpm", folder))
 
 
@@ -187,15 +187,14 @@ def test_commands_are_published(broker: MqttBroker, topic: str, expected: list[t
         ({"speed_topic": "b/rpm", "command_topic": "b/{fan}"}, "speed_topic needs {fan}"),
         ({"speed_topic": "b/{fan}", "command_topic": "b/{fan}"}, "are the same"),
         ({"topic": "a", "send_topic": "b/#"}, "without + and #"),
-        ({"topic": "a", "password_env": "X"}, "a password needs username"),
-        ({"topic": "a", "username": "u", "password_env": "X", "password_file": "y"}, "not both"),
-        ({"topic": "a", "ca": "x"}, "need tls = true"),
-        ({"topic": "a", "tls": True, "key": "x"}, "give certificate and key"),
+        ({"topic": "a", "password_file": "x"}, "needs a user in url"),
+        ({"topic": "a", "ca": "x"}, "need mqtts://"),
+        ({"topic": "a", "url": "mqtts://broker", "key": "x"}, "give certificate and key"),
     ],
 )
 def test_settings_that_do_not_fit_are_refused(settings: dict[str, Any], words: str) -> None:
     with pytest.raises(ValidationError, match=words.replace("{", r"\{").replace("+", r"\+")):
-        MqttConfig.model_validate({"host": "broker", **settings})
+        MqttConfig.model_validate({"url": "mqtt://broker", **settings})
 
 
 @pytest.mark.skipif(shutil.which("mosquitto") is None, reason="needs mosquitto: amqtt forgets a client that has left")
