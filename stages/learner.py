@@ -44,18 +44,7 @@ AHEAD_NS = 60 * NS_PER_S
 class LearnerConfig(StageConfig):
     """Section `[learner]`, for trays that name no twin."""
 
-    false_alarms_per_day: float = Field(
-        default=1.0, ge=1e-6, le=8640, description="the rate to declare: false alarms per fan and day"
-    )
     first_minutes: float = Field(default=10.0, ge=1.0, description="healthy running before the first version")
-    hold_back_minutes: float = Field(
-        default=10.0, ge=0, description="samples are learned from if no alarm was raised for this long after them"
-    )
-    kept_hours: float = Field(
-        default=168.0,
-        ge=48.0,
-        description="healthy running to keep for learning, and as many hours of what is excluded",
-    )
 
 
 class LearnerCore(Core):
@@ -331,15 +320,7 @@ def build(context: Context) -> BuiltStage:
         return BuiltStage(_NamesItsTwin())
     folder = learning_folder(context.run_folder, tray.name)
     metadata, attachments = recording_metadata(context)
-    history = HealthyHistory(
-        folder,
-        context.site,
-        tray.name,
-        metadata,
-        attachments,
-        hold_back_s=60.0 * config.hold_back_minutes,
-        kept_s=3600.0 * config.kept_hours,
-    )
+    history = HealthyHistory(folder, context.site, tray.name, metadata, attachments)
     versions = TwinVersions(folder, tray.name)
     operation = OrdinaryOperation(tray)
     try:

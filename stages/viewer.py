@@ -41,12 +41,12 @@ class ViewerConfig(StageConfig):
         description='file in run_folder for the view, such as "view.rrd"; if it exists, it is kept, and view-2.rrd is '
         'written. "": no file; `fantwin view` makes one from a recording',
     )
-    serve: bool = Field(default=True, description="serve live viewers on this host (127.0.0.1)")
     grpc_port: int = Field(
         default=9876,
-        ge=1,
+        ge=0,
         le=65535,
-        description="port for the data, for the native and the browser viewer; shard K uses the K-th port from here on",
+        description="port on this host (127.0.0.1) for the data of live viewers, native and in a browser; shard K uses "
+        "the K-th port from here on; 0: no live viewers",
     )
     web_port: int = Field(
         default=9090, ge=0, le=65535, description="port of the browser viewer's page, for shards as above; 0: no page"
@@ -54,10 +54,6 @@ class ViewerConfig(StageConfig):
     layout: Literal["all", "alarms", "wear"] = Field(
         default="all",
         description="all: every fan; alarms: only the fans that are or have been in alarm; wear: change over days",
-    )
-    window_s: float = Field(default=30.0, gt=0, description="length of the rolling window, s")
-    memory_limit: str = Field(
-        default="256MB", pattern=r"^\d+(MB|GB|MiB|GiB)$", description="history kept for viewers that join late"
     )
     show: tuple[str, ...] = Field(
         default=(), max_length=64, description='fans of a fleet that always have a plot: ["tray1/3", "tray2/0"]'
@@ -97,9 +93,7 @@ def build(context: Context) -> BuiltStage:
     config: ViewerConfig = context.config
     options = ViewOptions(
         layout=config.layout,
-        window_s=config.window_s,
         show=shown_fans(config.show, context.trays),
-        memory_limit=config.memory_limit,
         file_bytes=FILE_BYTES,
         **_ports(context),
     )
@@ -111,7 +105,7 @@ def _ports(context: Context) -> dict[str, int]:
     """The ports that are served, by key: as configured, and one more for each further shard, which may be on this
     host."""
     config: ViewerConfig = context.config
-    configured = {"grpc_port": config.grpc_port, "web_port": config.web_port} if config.serve else {}
+    configured = {"grpc_port": config.grpc_port, "web_port": config.web_port} if config.grpc_port else {}
     return {key: port + context.shard_number - 1 for key, port in configured.items() if port}
 
 
@@ -119,10 +113,10 @@ def check(context: Context) -> list[str]:
     """Report a missing extra, fans to show that do not exist, and ports that another program has taken."""
     config: ViewerConfig = context.config
     problems = list(filter(None, [missing_extra("stage viewer", "view", "rerun")]))
-    if not (config.file or config.serve):
-        problems.append("viewer.serve = false and no viewer.file: nothing would be shown; set one of them")
+    if not (config.file or config.grpc_port):
+        problems.append("viewer.grpc_port = 0 and no viewer.file: nothing would be shown; set one of them")
     ports = {} if context.is_running else _ports(context)
-    attempts = [partial(check_free, port, f"viewer.{key}", "viewer.serve = false") for key, port in ports.items()]
+    attempts = [partial(check_free, port, f"viewer.{key}", "viewer.grpc_port = 0") for key, port in ports.items()]
     return [*problems, *refusals(partial(shown_fans, config.show, context.trays), *attempts)]
 
 

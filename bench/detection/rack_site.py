@@ -28,7 +28,7 @@ from fantwin.pipeline.learning.healthy_history import HealthyHistory
 from fantwin.pipeline.learning.learning_process import LearningProcess
 from fantwin.pipeline.learning.next_version import make_next_version
 from fantwin.pipeline.learning.ordinary_operation import OrdinaryOperation
-from fantwin.pipeline.learning.versions import TwinVersions, Version, learning_folder
+from fantwin.pipeline.learning.versions import DECLARED_PER_DAY, TwinVersions, Version, learning_folder
 from fantwin.pipeline.recordings.metadata import recording_metadata
 from fantwin.pipeline.runtime.stage import Core, load_stage
 from fantwin.schemas.blocks import select
@@ -150,14 +150,11 @@ class RackSite:
         of, tray = contexts["learner"], config.trays[0]
         learned = learning_folder(config.run_folder, name)
         metadata, attachments = recording_metadata(of)
-        hold_back_s, kept_s = 60.0 * of.config.hold_back_minutes, 3600.0 * of.config.kept_hours
-        history = HealthyHistory(
-            learned, config.site, name, metadata, attachments, hold_back_s=hold_back_s, kept_s=kept_s
-        )
+        history = HealthyHistory(learned, config.site, name, metadata, attachments)
         self._name = name
         self._versions = TwinVersions(learned, name)
         self._seen = pickle.loads((place / SEEN).read_bytes()) if kept.exists() else _Seen(list(changed_days))
-        learning = LearningAtOnce(learned, name, of.config.false_alarms_per_day, self._seen.learning_s)
+        learning = LearningAtOnce(learned, name, DECLARED_PER_DAY, self._seen.learning_s)
         self._learner = LearnerCore(RACK_FANS, of.config, history, self._versions, OrdinaryOperation(tray), learning)
         self._stages: list[Core] = [
             load_stage(stage).build(contexts[stage]).core for stage in ("resampler", "twin_integrator", "scorer")

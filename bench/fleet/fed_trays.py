@@ -36,7 +36,7 @@ after the warm-up of 3 s, and the ten seconds for which a fan must be like a hea
 scorer and recorder are restarted, no alarm moves"""
 SHIFT = 50
 """samples by which a tray begins later in the run of the fans than the one before"""
-BUSY = "stop_timeout_s = 120\n"
+BUSY = "watchdog_s = 120\n"
 """settings of [launcher] for a machine that has other things to do"""
 TWIN = Path(__file__).parents[2] / "pipeline" / "demo" / "twin.onnx"
 

@@ -204,7 +204,7 @@ class _Site:
             self._start_router(number)
         endpoint = json.dumps(self._routers if routers > 1 else self._routers[0])
         (folder / "site.toml").write_text(
-            f'site = "{SITE}"\n[launcher]\nstop_timeout_s = 60\n'
+            f'site = "{SITE}"\n[launcher]\nwatchdog_s = 60\n'
             f'[bus]\nmode = "client"\nendpoint = {endpoint}\n[resampler]\nrate_hz = 100\n'
             f'{RECORDS_SCORES}[[tray]]\nname = "{TRAY}"\n'
             f'fans = {FANS}\nport = "{folder / "tray"}"\nprotocol = "binary"\nspeed_unit = "rpm"\nspeed_max = 20000\n'

@@ -49,7 +49,7 @@ ANSWER_S = 4.0
 LATE_S = 10.0
 """an alarm may come so long after the end of its fault"""
 DEADLINE_S = 1800.0
-BUSY = "stop_timeout_s = 300\n"
+BUSY = "watchdog_s = 300\n"
 
 
 @dataclass

@@ -110,7 +110,7 @@ def measured(folder: Path) -> dict[str, float]:
     config = folder / "fantwin.toml"
     config.write_text(
         f'run_folder = "runs"\n[bus]\nendpoint = "{endpoint}"\n[[tray]]\nname = "{TRAY}"\nfans = {FANS}\n'
-        f'command_max = 100\nport = "{folder / "line"}"\n[viewer]\nserve = false\n',
+        f'command_max = 100\nport = "{folder / "line"}"\n[viewer]\ngrpc_port = 0\n',
         encoding="utf-8",
     )
     place = learning_folder(folder / "runs", TRAY)

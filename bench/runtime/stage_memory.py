@@ -116,7 +116,7 @@ def bare(stage: str, environment: dict[str, str]) -> tuple[float, float, float]:
 
 def at_rest(stage: str, folder: Path, environment: dict[str, str]) -> tuple[float, float]:
     """RSS and PSS in MB of a stage without input."""
-    settings = [f"bus.endpoint='{free_endpoint()}'", f"run_folder='{folder / stage}'", "viewer.serve=false"]
+    settings = [f"bus.endpoint='{free_endpoint()}'", f"run_folder='{folder / stage}'", "viewer.grpc_port=0"]
     command = [sys.executable, "-P", "-m", "fantwin", "up", "--only", stage, "-c", str(DEMO), "--until-stdin-closes"]
     if stage == "acquisition":
         command += ["--tray", "tray1"]

@@ -167,10 +167,10 @@ class LauncherConfig(Section):
         "{ scorer = 4, recorder = 2 }; without it, one process for the site, of acquisition one for each tray",
     )
     watchdog_s: float = Field(
-        default=10.0, ge=1, description="a stage whose main loop has not run for this long is killed and restarted"
-    )
-    stop_timeout_s: float = Field(
-        default=10.0, gt=0, description="how long a stage may take to stop before it is killed"
+        default=10.0,
+        ge=1,
+        description="a stage whose main loop has not run for this long is killed and restarted; one that stops and has "
+        "not ended after this long is killed",
     )
 
     @field_validator("stages", "without")

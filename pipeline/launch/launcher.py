@@ -345,7 +345,7 @@ class Launcher:
                 self.outcome.failed.append(slot.row.label)
                 why = f"no process could be started: {_reason(error)}"
                 self._say(f"{slot.row.label}: {why}; what it missed while it was down is lost")
-        until_s = time.monotonic() + self._config.launcher.stop_timeout_s
+        until_s = time.monotonic() + self._config.launcher.watchdog_s
         awaited = [slot for slot in started if slot.was_ready or slot in down]
         while time.monotonic() < until_s and not all(map(self._is_back, awaited)):
             time.sleep(_POLL_S)
@@ -365,10 +365,10 @@ class Launcher:
                 self._stop(slot, child)
 
     def _stop(self, slot: _Slot, child: Child) -> None:
-        status = child.stop(self._config.launcher.stop_timeout_s)
+        status = child.stop(self._config.launcher.watchdog_s)
         if status is None:
             self.outcome.killed.append(slot.row.label)
-            self._say(f"{slot.row.label}: did not stop in {self._config.launcher.stop_timeout_s:.0f} s, killed")
+            self._say(f"{slot.row.label}: did not stop in {self._config.launcher.watchdog_s:.0f} s, killed")
         elif status not in _ORDERLY:
             self.outcome.failed.append(slot.row.label)
             self._say(f"{slot.row.label}: ended with status {status}: {child.last_line}")

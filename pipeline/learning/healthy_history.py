@@ -31,6 +31,10 @@ from fantwin.schemas.topics import tray_key
 from fantwin.schemas.units import NS_PER_S
 
 HEALTHY, NEAR_ALARMS = "healthy", "near_alarms"
+HOLD_BACK_S = 600.0
+"""a fault begins before its alarm: of so long before one, nothing is learned"""
+KEPT_S = 7 * 24 * 3600.0
+"""of healthy running: what a plant does on each day of the week"""
 NEAR_ALARMS_KEPT_S = 24 * 3600.0
 """of running near alarms: about so much, in whole recordings"""
 LONGEST_LAG_NS = 1800 * NS_PER_S
@@ -68,8 +72,8 @@ class HealthyHistory:
         metadata: Mapping[str, str],
         attachments: Mapping[str, bytes],
         *,
-        hold_back_s: float,
-        kept_s: float,
+        hold_back_s: float = HOLD_BACK_S,
+        kept_s: float = KEPT_S,
     ) -> None:
         """hold_back_s: see above. kept_s: of healthy running outside the excluded time spans, and as much within them;
         older recordings are deleted, except for the first."""
@@ -82,7 +86,6 @@ class HealthyHistory:
         )
         self._both = self._healthy, self._near_alarms
         self._hold_back_ns = round(hold_back_s * NS_PER_S)
-        self.kept_s = kept_s
         self._waiting: deque[Raw] = deque()
         self._commissioned_t_ns = 0
         """samples up to then are of fans as they were before"""

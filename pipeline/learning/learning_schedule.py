@@ -9,15 +9,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
-from fantwin.pipeline.learning.healthy_history import HealthyHistory
+from fantwin.pipeline.learning.healthy_history import KEPT_S, HealthyHistory
 from fantwin.pipeline.learning.history_recordings import SHORTEST_RECORDING_S
 from fantwin.pipeline.learning.ordinary_operation import OrdinaryOperation
 from fantwin.pipeline.learning.versions import VersionList
 
 Work: TypeAlias = Literal["version", "check"]
 
-LONGEST_WAIT_S = 7 * 24 * 3600.0
-"""of healthy running between two versions"""
 CHECK_AFTER_S = 24 * 3600.0
 """of healthy running between two checks of the fans against the reference; of all running if much was near alarms"""
 COMMISSIONED_CHECK_S = 4000.0
@@ -126,8 +124,7 @@ class LearningSchedule:
             return self._first_s - self._history.seconds
         if listed.commissioned_t_ns > last.made_t_ns:
             return AFTER_COMMISSIONING_S - since(listed.commissioned_t_ns)
-        at_most_s = min(LONGEST_WAIT_S, self._history.kept_s)  # no more than that is kept since a version
-        return None if listed.waiting else min(last.learned_s, at_most_s) - since(last.made_t_ns)
+        return None if listed.waiting else min(last.learned_s, KEPT_S) - since(last.made_t_ns)
 
     def _is_check_due(self, listed: VersionList) -> bool:
         if not listed.versions:

@@ -26,6 +26,9 @@ REFERENCE_S = 24 * 3600.0
 TimeSpan: TypeAlias = tuple[int, int]
 """first and last time, ns since 1970"""
 
+DECLARED_PER_DAY = 1.0
+"""false alarms of a fan that a learned twin declares: days of healthy running show whether it keeps that rate"""
+
 
 class _Record(BaseModel):
     # what is extra is of a newer fantwin, as after an update that is undone

@@ -13,6 +13,8 @@ from fantwin.schemas.units import NS_PER_S
 from fantwin.scoring.column_state import NEVER_NS, ColumnState
 from fantwin.scoring.expected_reading import ExpectedReading
 
+START_SAMPLES = 5
+"""a free run starts from the mean of so many readings: one alone has the noise of its tacho"""
 MOST_STEPS = 1000
 """steps of the twin in a sample: 10 s of a twin that was trained at 100 Hz"""
 
@@ -55,10 +57,8 @@ class FreeRunInputs:
 class FreeRun(ColumnState):
     """The free runs of all fans: which are running, since when, and their state. All arrays are (fans,)."""
 
-    def __init__(self, twin: TwinFile, start_samples: int) -> None:
-        """start_samples: how many readings a start averages."""
+    def __init__(self, twin: TwinFile) -> None:
         self._twin = twin
-        self._start_samples = start_samples
         fans = twin.fans
         self._knows_density = twin.card.conditions is not None
         self._density = np.ones(fans)
@@ -140,7 +140,7 @@ class FreeRun(ColumnState):
         usable = usable & ~self.running
         self._readings[usable] += 1
         self._sum_rad_s[usable] += speed_rad_s[usable]
-        return usable & (self._readings >= self._start_samples)
+        return usable & (self._readings >= START_SAMPLES)
 
     def forget_readings(self, fans: Array) -> None:
         """Discard the readings of some fans that count towards a start."""

@@ -27,9 +27,10 @@ from fantwin.scoring.column_state import ColumnState
 from fantwin.scoring.expected_reading import AveragedCommand
 from fantwin.scoring.torque_balance import BalanceModel, TorqueBalance
 
-LONGEST_BRIDGE = (
-    1 << 16
-)  # grid samples; above half a second at 100 kHz a new start is faster than running through the loss
+HOLD_LIMIT_NS = NS_PER_S // 2
+"""the last command is held for so long without samples: later it may have changed unseen"""
+LONGEST_BRIDGE = 1 << 16
+"""grid samples; above HOLD_LIMIT_NS at 100 kHz a new start is faster than running through the loss"""
 LARGEST_MOVE_S = 0.01  # times the width of the training range: a move of the command times the gap in which it was held
 REASON = SimpleNamespace(**{each.name: np.uint8(each) for each in InvalidReason})
 """as blocks have them: an enum would make their arrays eight times as large"""
@@ -40,9 +41,7 @@ HIGHEST_SPEED = 1.5  # times the top training speed: the balance is used up to t
 class TwinIntegratorConfig(StageConfig):
     """Section `[twin_integrator]`. The tray names the twin."""
 
-    start_samples: int = Field(default=5, ge=1, description="a free run starts from the mean of this many speeds")
     warm_up_s: float = Field(default=3.0, ge=0, description="a free run is not valid for this long after its start")
-    hold_limit_s: float = Field(default=0.5, ge=0, description="how long the last command is held without samples")
 
 
 class FanCounts(ColumnState):
@@ -71,13 +70,12 @@ class TrayIntegrator:
         self.twin, self.config = twin, config
         reach_s = max(tacho.reach_s for tacho in twin.tachos)
         self._warm_up_ns = round((config.warm_up_s + reach_s) * NS_PER_S)
-        self._hold_limit_ns = round(config.hold_limit_s * NS_PER_S)
         low, high = twin.card.command_range
         self._largest_move = LARGEST_MOVE_S * (high - low)
         self._lowest_command, self._highest_command = twin.usable_commands
         self._standstill = twin.card.standstill
         self._off_below = twin.off_below if self._standstill is None else _off_below(twin, self._standstill)
-        self._run = FreeRun(twin, config.start_samples)
+        self._run = FreeRun(twin)
         self._starting: StartingFans | None = None
         if self._standstill is not None:
             self._starting = StartingFans(twin.fans, self._standstill, self._warm_up_ns, reach_s)
@@ -216,7 +214,7 @@ class TrayIntegrator:
         known = ~silent & np.isfinite(grid.command)
         command, known_before_t_ns = self._run.hold(grid.t_ns, grid.command, known)
         gap_ns = grid.t_ns[:, np.newaxis] - known_before_t_ns - grid.period_ns
-        overdue = gap_ns > self._hold_limit_ns
+        overdue = gap_ns > HOLD_LIMIT_NS
         moved = np.diff(command, axis=0, prepend=held_before[np.newaxis])
         overdue |= known & (np.abs(moved) * gap_ns > self._largest_move * NS_PER_S)
         overdue |= grid.invalid_reason == REASON.CLOCK_RESTARTED

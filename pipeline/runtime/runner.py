@@ -55,7 +55,7 @@ LOSS_REPORT_S = (
 MOST_DUE_BYTES = 8 << 20
 """of messages that are taken from the inbox to be joined: more than ever come together"""
 PRODUCERS_END_LIMIT_S = 10.0  # how long a stage whose launcher has gone waits for its producers to end
-# When each part of the end must be over, as shares of launcher.stop_timeout_s: the rest is for the process itself.
+# When each part of the end must be over, as shares of launcher.watchdog_s: the rest is for the process itself.
 CAUGHT_UP, ANSWERED, DRAINED, WORK_ENDED = 0.4, 0.55, 0.7, 0.75
 SOURCES_STOPPED, CORES_CLOSED, HEALTH_SENT, BUS_LEFT = 0.78, 0.88, 0.9, 0.95
 
@@ -139,7 +139,7 @@ class Runner:
         )
         self._tracker = self._receiver.tracker
         self._notifier = Notifier.from_environment()
-        self._ending = Ending(stage.name, config.launcher.stop_timeout_s)
+        self._ending = Ending(stage.name, config.launcher.watchdog_s)
         self._require_rights()
         self._steps = Steps(
             stage,
@@ -155,7 +155,7 @@ class Runner:
         """Run to the end and return the last health, which is published whatever happens.
 
         At the end cores are closed. A core that raised is aborted instead: its state may be half updated. The end takes
-        no longer than `launcher.stop_timeout_s`: a step that hangs, for example because a consumer takes no more
+        no longer than `launcher.watchdog_s`: a step that hangs, for example because a consumer takes no more
         messages, is left behind. `is_hung` then says that the process cannot end in order.
 
         Raises:

@@ -40,8 +40,8 @@ def viewer_urls(config: Config) -> Mapping[str, str]:
     A live viewer of Rerun 0.41 takes neither a time nor a fan in its address.
     """
     section = config.sections[VIEWER]
-    serve, grpc_port, web_port = (getattr(section, name) for name in ("serve", "grpc_port", "web_port"))
-    if not (serve and web_port):
+    grpc_port, web_port = (getattr(section, name) for name in ("grpc_port", "web_port"))
+    if not (grpc_port and web_port):
         return {}
     return {
         tray: f"http://{LOOPBACK}:{web_port + shard.number - 1}/?url="

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 from pydantic import Field, ValidationError
 
@@ -38,9 +39,11 @@ class ScorerConfig(StageConfig):
     alarm_share: float = Field(
         default=0.1, gt=0, description="share of the speed that a fault takes, from which a warning is an alarm"
     )
-    latching: bool = Field(default=False, description="whether a cleared alarm stays until it is reset")
-    confirming: bool = Field(default=False, description="whether an acknowledged alarm must be confirmed, too")
-    wear_every_s: float = Field(default=600.0, gt=0, description="how often the wear of a fan is measured")
+    alarms_need: tuple[Literal["confirm", "reset"], ...] = Field(
+        default=(),
+        description="what operators must do, besides acknowledging an alarm: confirm it, too, or reset it once it has "
+        "cleared",
+    )
     asks_for_snapshots: bool | None = Field(
         default=None,
         description="whether it continues from the snapshot that a recorder keeps, where that is newer than its own "

@@ -35,6 +35,8 @@ from fantwin.scoring.standing.against_command import KINDS, AgainstCommand
 from fantwin.scoring.standing.falls import Falls
 from fantwin.scoring.wear.wear_monitor import WearMonitor
 
+WEAR_EVERY_S = 600.0
+"""between two points of the wear of a fan, which takes days to months"""
 NO_READING = KINDS.index(Standing.NO_READING)
 NAMED_AFTER_S, FALLING_S = 3.0, 4.0
 """an onset is so old before a cause is named; so long after an alarm a fan that has lost much speed may come to rest"""
@@ -48,9 +50,10 @@ class TrayScorer:
         self.fans, self.twin = fans, twin
         self._alarm_share = config.alarm_share
         self._words = CauseWords(twin.advice, has_supply=twin.has_supply)
-        self.wear = WearMonitor(fans, config.wear_every_s)
+        self.wear = WearMonitor(fans, WEAR_EVERY_S)
         self._against = AgainstCommand(twin.standstill, twin.tachos) if twin.standstill else None
-        self.alarms = AlarmManager(fans, ConditionSettings(config.latching, config.confirming), text)
+        needs = ConditionSettings(latching="reset" in config.alarms_need, confirming="confirm" in config.alarms_need)
+        self.alarms = AlarmManager(fans, needs, text)
         self._period_ns = 0
         self._open(NS_PER_S)
         self._period_ns = 0  # of no sample yet

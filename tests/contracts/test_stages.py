@@ -98,7 +98,7 @@ def twin(tmp_path_factory: pytest.TempPathFactory) -> TwinFile:
 OFTEN: dict[str, Any] = {"declared_per_day": 8640.0}
 """a false alarm in ten seconds: so low a limit that any message may raise one"""
 
-LOOSE = TwinIntegratorConfig(start_samples=1, warm_up_s=0.0)
+LOOSE = TwinIntegratorConfig(warm_up_s=0.0)
 CORES: dict[str, Callable[[TwinFile], Core]] = {
     "resampler": lambda _twin: ResamplerCore(FANS, ResamplerConfig()),
     "twin_integrator": lambda twin: TwinIntegratorCore(twin, LOOSE, 0),

@@ -1,4 +1,4 @@
-"""Gateways that tests open."""
+"""Gateways that tests open, and free runs that start from one reading."""
 
 from __future__ import annotations
 
@@ -8,7 +8,16 @@ from typing import Any
 
 import pytest
 
+from fantwin.pipeline.prediction import free_run
 from tests.support.running_gateway import RunningGateway
+
+
+@pytest.fixture(scope="module")
+def one_reading_starts() -> Iterator[None]:
+    """A free run starts from one reading, so that it has the speed of that sample."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(free_run, "START_SAMPLES", 1)
+        yield
 
 
 @pytest.fixture

@@ -7,12 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from fantwin.pipeline.learning.healthy_history import healthy_recordings
+from fantwin.pipeline.learning.healthy_history import KEPT_S, healthy_recordings
 from fantwin.pipeline.learning.versions import Check
 from fantwin.schemas.enums import Action, FanState
 from fantwin.schemas.messages import NewTwin, Request
 from fantwin.schemas.units import NS_PER_S
-from fantwin.stages.learner import LearnerConfig
 from tests.support.one_learner import START_NS, Learner, restarted
 
 
@@ -251,9 +250,8 @@ def test_when_an_alarm_begins_its_time_is_listed(tmp_path: Path) -> None:
     learner.run(100, state=FanState.ALARM)
     assert learner.versions.read().alarms_t_ns == tuple(START_NS + second * NS_PER_S for second in (600, 1000))
     learner.run(10)
-    kept_s = round(3600 * LearnerConfig().kept_hours)
-    learner.now_s += kept_s
+    learner.now_s += round(KEPT_S)
     learner.run(10, state=FanState.ALARM)
     listed = learner.versions.read().alarms_t_ns
-    assert listed[-1] == START_NS + (1110 + kept_s) * NS_PER_S
+    assert listed[-1] == START_NS + (1110 + round(KEPT_S)) * NS_PER_S
     assert len(listed) == 3, "no recording of the time of the others has been deleted yet"

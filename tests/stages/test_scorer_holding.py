@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from fantwin.pipeline.tray_scoring import tray_scorer
 from fantwin.pipeline.tray_scoring.healthy_twin import ScorerConfig
 from fantwin.schemas.blocks import join
 from fantwin.schemas.enums import Statistic, Transition
@@ -194,8 +195,9 @@ def test_an_alarm_of_missing_readings_goes_stale_two_seconds_into_a_silence_of_i
     ]
 
 
-def test_wear_goes_on_to_be_measured_in_its_own_alarm_so_that_it_can_be_over() -> None:
-    core = core_of(config={"wear_every_s": 2.0})
+def test_wear_goes_on_to_be_measured_in_its_own_alarm_so_that_it_can_be_over(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tray_scorer, "WEAR_EVERY_S", 2.0)
+    core = core_of()
     feed(core, [prediction(noise(21 * SECOND))])
     core.tray.wear.is_over[0] = True
     _, alarms = feed(core, [prediction(noise(20 * SECOND), first=21 * SECOND)])

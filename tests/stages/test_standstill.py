@@ -18,6 +18,8 @@ from fantwin.scoring.alarms.current_alarms import current_alarm
 from fantwin.stages.scorer import ScorerCore
 from tests.stages.test_twin_integrator import core_of, physical_twin, run_freely
 
+pytestmark = pytest.mark.usefixtures("one_reading_starts")
+
 EPOCH_NS = 1_700_000_000_000_000_000
 PERIOD_S = 0.05
 HEALTHY = Standstill(

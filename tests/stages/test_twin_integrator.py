@@ -12,6 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.prediction import free_run
 from fantwin.pipeline.prediction.twin_file import TwinFile
 from fantwin.pipeline.runtime.stage import Context
 from fantwin.schemas.blocks import cut, join
@@ -27,6 +28,8 @@ from fantwin.twin.models.lag import effective_command
 from fantwin.twin.models.physical import PhysicalModel
 from fantwin.twin.models.physics import LAG
 from tests.support.twin_files import PARAMETERS, made_up_card, still_balance, write_twin
+
+pytestmark = pytest.mark.usefixtures("one_reading_starts")
 
 EPOCH_NS = 1_700_000_000_000_000_000
 STEP_NS = 10_000_000
@@ -70,9 +73,8 @@ def twin_with_friction(friction: float, fans: int = 1) -> TwinFile:
     return replace(twin, balance=balance)
 
 
-def core_of(twin: TwinFile | None = None, **config: float) -> TwinIntegratorCore:
-    settings = TwinIntegratorConfig.model_validate({"start_samples": 1, "warm_up_s": 0.0, **config})
-    return TwinIntegratorCore(twin or physical_twin(), settings, EPOCH_NS)
+def core_of(twin: TwinFile | None = None, warm_up_s: float = 0.0) -> TwinIntegratorCore:
+    return TwinIntegratorCore(twin or physical_twin(), TwinIntegratorConfig(warm_up_s=warm_up_s), EPOCH_NS)
 
 
 def of_session(grid: Grid, producer: str) -> Grid:
@@ -132,18 +134,21 @@ def test_the_prediction_is_never_corrected_by_a_measurement() -> None:
     assert b.valid[200:].all()
 
 
-def test_the_free_run_is_the_model_run_from_the_mean_of_the_first_readings_and_valid_after_it_has_warmed_up() -> None:
+def test_the_free_run_is_the_model_run_from_the_mean_of_the_first_readings_and_valid_after_it_has_warmed_up(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(free_run, "START_SAMPLES", 3)
     speed = np.array([NAN, 10.0, 20.0, 60.0, 0.0, 0.0])
     command = np.array([5.0, 5.0, 5.0, 40.0, 41.0, 42.0])
-    prediction = feed(core_of(start_samples=3), [grid_of(command, speed)])
+    prediction = feed(core_of(), [grid_of(command, speed)])
     predicted = prediction.predicted_speed_rad_s[:, 0]
     expected, _ = run_freely(np.array([[30.0, 40.0]]), command[3:, np.newaxis], np.full(3, 0.01))
     assert np.isnan(predicted[:3]).all()
     np.testing.assert_allclose(predicted[3:], expected[:, 0], rtol=1e-12)
     none, young = InvalidReason.NONE, InvalidReason.WARMING_UP
     assert prediction.invalid_reason[:, 0].tolist() == [InvalidReason.NO_SPEED] + [young] * 2 + [none] * 3
-    prediction = feed(core_of(warm_up_s=0.5, start_samples=2), [grid_of(stairs(100))])
-    assert prediction.invalid_reason[:, 0].tolist() == [young] * 51 + [none] * 49
+    prediction = feed(core_of(warm_up_s=0.5), [grid_of(stairs(100))])
+    assert prediction.invalid_reason[:, 0].tolist() == [young] * 52 + [none] * 48
 
 
 def test_a_free_run_continues_through_a_short_silence_on_the_held_command() -> None:
@@ -290,7 +295,7 @@ def test_a_bridge_of_absurdly_many_samples_is_not_run() -> None:
 
     core = core_of(replace(twin, advance_with=lambda _: counted))
     grid = grid_of(np.zeros(2), period_ns=1)
-    grid.t_ns[1] = grid.t_ns[0] + 300_000_000  # within hold_limit_s
+    grid.t_ns[1] = grid.t_ns[0] + 300_000_000  # shorter than the command is held
     core.step(grid)
     assert sum(steps) <= 4
     assert core.counters()["free_runs"] == 2
@@ -298,8 +303,7 @@ def test_a_bridge_of_absurdly_many_samples_is_not_run() -> None:
 
 def test_another_session_of_the_resampler_starts_the_twin_again() -> None:
     """Its times may differ by tens of milliseconds: on a ramp, the balance saw a jump, and a healthy fan alarmed."""
-    settings = TwinIntegratorConfig(start_samples=1, warm_up_s=0.05)
-    core = TwinIntegratorCore(physical_twin(), settings, EPOCH_NS)
+    core = core_of(warm_up_s=0.05)
     command = np.full(60, 50.0)
     blocks = [
         of_session(grid_of(command, command), "resampler-all-1"),

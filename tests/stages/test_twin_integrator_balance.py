@@ -26,6 +26,8 @@ from tests.stages.test_twin_integrator import (
 )
 from tests.support.twin_files import SIGMA_COMMAND
 
+pytestmark = pytest.mark.usefixtures("one_reading_starts")
+
 SETTLES = 31
 """samples until it is known: a third of a second"""
 

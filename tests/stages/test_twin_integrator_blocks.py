@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fantwin import pipeline
+from fantwin.pipeline.prediction import free_run, tray_integrator
 from fantwin.pipeline.prediction.twin_file import TwinFile
 from fantwin.schemas.enums import InvalidReason
 from fantwin.schemas.fields import columns
@@ -31,6 +32,8 @@ from tests.stages.test_twin_integrator import (
     twin_with_friction,
 )
 from tests.support.twin_files import small_hybrid, write_twin
+
+pytestmark = pytest.mark.usefixtures("one_reading_starts")
 
 FANS = 8  # of the demo's twin
 CONDITIONS = {"supply_voltage_v": 12.0, "temperature_c": 20.0}
@@ -127,7 +130,7 @@ def predicted(core: TwinIntegratorCore, grids: Iterable[Grid]) -> tuple[Any, ...
     seed=st.integers(0, 1000),
     size=st.integers(2, 400),
     start_samples=st.integers(1, 6),
-    hold_limit_s=st.sampled_from([0.0, 0.05, 0.5]),
+    hold_limit_ns=st.sampled_from([0, 5 * STEP_NS, 50 * STEP_NS]),
 )
 def test_blocks_of_any_size_are_predicted_the_same_to_the_bit(
     twins: dict[str, TwinFile],
@@ -136,16 +139,13 @@ def test_blocks_of_any_size_are_predicted_the_same_to_the_bit(
     seed: int,
     size: int,
     start_samples: int,
-    hold_limit_s: float,
+    hold_limit_ns: int,
 ) -> None:
     grid = grid_where(happenings, seed)
-    single, blocks = (
-        predicted(
-            core_of(twins[name], start_samples=start_samples, hold_limit_s=hold_limit_s, warm_up_s=0.05),
-            split(grid, rows),
-        )
-        for rows in (1, size)
-    )
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(free_run, "START_SAMPLES", start_samples)
+        patch.setattr(tray_integrator, "HOLD_LIMIT_NS", hold_limit_ns)
+        single, blocks = (predicted(core_of(twins[name], warm_up_s=0.05), split(grid, rows)) for rows in (1, size))
     assert single == blocks
 
 

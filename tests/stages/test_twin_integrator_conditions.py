@@ -17,6 +17,8 @@ from fantwin.schemas.units import NS_PER_S
 from tests.stages.test_twin_integrator import core_of, feed, grid_of, stairs
 from tests.support.twin_files import write_twin
 
+pytestmark = pytest.mark.usefixtures("one_reading_starts")
+
 FANS, RATE_HZ = 2, 50
 STEP_NS = NS_PER_S // RATE_HZ
 REFERENCE = ReferenceConditions(supply_voltage_v=12.0, temperature_c=20.0)

@@ -193,7 +193,7 @@ def test_an_existing_view_is_not_overwritten_and_a_file_that_cannot_be_written_i
 
 def test_live_viewers_are_served_on_the_loopback_only_and_a_second_shard_takes_another_port(tmp_path: Path) -> None:
     port = free_port()
-    live = context(tmp_path, serve=True, grpc_port=port, web_port=0)
+    live = context(tmp_path, grpc_port=port, web_port=0)
     core = build(live).core
     with socket.create_connection(("127.0.0.1", port), timeout=5):
         listening = Path("/proc/net/tcp")
@@ -205,18 +205,18 @@ def test_live_viewers_are_served_on_the_loopback_only_and_a_second_shard_takes_a
     taken = f"port {port} on 127.0.0.1 is taken"
     assert [any(taken in problem for problem in check(shard)) for shard in shards] == [True, False]
     with pytest.raises(
-        StageError, match=rf"^viewer\.grpc_port: {taken} .*; set another one, or viewer\.serve = false$"
+        StageError, match=rf"^viewer\.grpc_port: {taken} .*; set another one, or viewer\.grpc_port = 0$"
     ):
-        build(context(tmp_path / "other", serve=True, grpc_port=port, web_port=0))
+        build(context(tmp_path / "other", grpc_port=port, web_port=0))
     assert not (tmp_path / "other").exists(), "no file was begun"
     core.close()
 
 
-def context(folder: Path, *, fans: int = 3, speed_unit: Any = "rad/s", serve: bool = False, **config: Any) -> Context:
+def context(folder: Path, *, fans: int = 3, speed_unit: Any = "rad/s", **config: Any) -> Context:
     return Context(
         site="site",
         trays=(TrayConfig(name="tray1", fans=fans, speed_unit=speed_unit),),
-        config=ViewerConfig(serve=serve, **{"file": "view.rrd", **config}),
+        config=ViewerConfig(**{"file": "view.rrd", "grpc_port": 0, **config}),
         folder=folder,
         run_folder=folder,
         started_t_ns=START_NS,

@@ -113,7 +113,7 @@ def context(folder: Path, trays: int, fans: int, **config: Any) -> Context:
     return Context(
         site="site",
         trays=tuple(TrayConfig(name=f"tray{number}", fans=fans) for number in range(1, trays + 1)),
-        config=ViewerConfig(serve=False, **{"file": "view.rrd", **config}),
+        config=ViewerConfig(**{"file": "view.rrd", "grpc_port": 0, **config}),
         folder=folder,
         run_folder=folder,
         started_t_ns=START_NS,

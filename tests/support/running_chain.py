@@ -130,10 +130,10 @@ class Chain:
         self.port = folder / "tray"
         self.settings = [
             *(f"run_folder='{folder}'", f"tray.0.port='{self.port}'", f"bus.endpoint='{endpoint}'"),
-            *("viewer.serve=false", "viewer.file='view.rrd'", f"launcher.stages={json.dumps(list(stages))}"),
+            *("viewer.grpc_port=0", "viewer.file='view.rrd'", f"launcher.stages={json.dumps(list(stages))}"),
             *("recorder.topics=['raw', 'grid', 'prediction', 'score']", "recorder.flush_interval_s=1"),
             # nothing is late, hangs or is cut short where other tests hold up a process for seconds
-            *("resampler.watermark_s=600", "launcher.watchdog_s=300", "launcher.stop_timeout_s=120", *settings),
+            *("resampler.watermark_s=600", "launcher.watchdog_s=300", *settings),
         ]
         self.stages = [f"{stage}/{TRAY}" if stage == "acquisition" else stage for stage in stages]
         self.tray: RunningCommand | None = None

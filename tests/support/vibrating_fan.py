@@ -77,7 +77,7 @@ def all_messages(folder: Path, channel: str) -> list[Message]:
     twin = TwinFile.load(write_twin(folder / "twin.onnx", fans=FANS), FANS)
     raws = raw_of(channel)
     grids = through(ResamplerCore(FANS, ResamplerConfig(rate_hz=RATE_HZ)), raws)
-    of_integrator = through(TwinIntegratorCore(twin, TwinIntegratorConfig(start_samples=1), 0), grids)
+    of_integrator = through(TwinIntegratorCore(twin, TwinIntegratorConfig(), 0), grids)
     predictions = [each for each in of_integrator if isinstance(each, Prediction)]
     scores = [each for each in through(core_of(FANS), predictions) if isinstance(each, Score)]
     return [

@@ -28,7 +28,7 @@ def configuration(tmp_path: Path, endpoint: str) -> Path:
     path = tmp_path / "fantwin.toml"
     path.write_text(
         f'run_folder = "runs"\n[bus]\nendpoint = "{endpoint}"\n[[tray]]  # of the laboratory\nname = "tray1"\n'
-        f'fans = {FANS}\nspeed_unit = "rpm"\nport = "{tmp_path / "line"}"\n[viewer]\nserve = false\n',
+        f'fans = {FANS}\nspeed_unit = "rpm"\nport = "{tmp_path / "line"}"\n[viewer]\ngrpc_port = 0\n',
         encoding="utf-8",
     )
     return path

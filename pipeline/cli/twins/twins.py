@@ -20,7 +20,15 @@ from fantwin.pipeline.config.loading import load_config
 from fantwin.pipeline.config.models import Config, TrayConfig
 from fantwin.pipeline.errors import UsageError, UserError
 from fantwin.pipeline.learning.learning_process import VARIABLE
-from fantwin.pipeline.learning.versions import Check, Drop, TwinVersions, Version, VersionList, learning_folder
+from fantwin.pipeline.learning.versions import (
+    DECLARED_PER_DAY,
+    Check,
+    Drop,
+    TwinVersions,
+    Version,
+    VersionList,
+    learning_folder,
+)
 from fantwin.pipeline.recordings.dates import format_local
 from fantwin.schemas.units import NS_PER_S
 
@@ -112,10 +120,10 @@ def _learn(settings: Config, of: TrayConfig, *, only_if_changed: bool, json_outp
     """
     from fantwin.pipeline.learning.next_version import make_next_version  # noqa: PLC0415  loads scoring
 
-    folder, rate = learning_folder(settings.run_folder, of.name), settings.sections["learner"].false_alarms_per_day  # type: ignore[attr-defined]
+    folder = learning_folder(settings.run_folder, of.name)
     doing = f"{'checking' if only_if_changed else 'learning'} the twin of {of.name}"
     with interruptible("no version was made"), working(doing) as say:
-        version = make_next_version(folder, of.name, rate, say, only_if_changed=only_if_changed)
+        version = make_next_version(folder, of.name, DECLARED_PER_DAY, say, only_if_changed=only_if_changed)
     listed = TwinVersions(folder, of.name).read()
     lines = [check_line(listed.check) if listed.check else NO_REFERENCE] if only_if_changed else []
     if version:

@@ -84,7 +84,7 @@ def demo(
     out = out.resolve()
     _clear(out)
     overrides = [
-        "viewer.serve=false",
+        "viewer.grpc_port=0",
         f"run_folder={json.dumps(str(out))}",
         f"tray.0.port={json.dumps(str(out / 'tray'))}",
         f"bus.endpoint='tcp/127.0.0.1:{free_port()}'",

@@ -34,6 +34,8 @@ from fantwin.schemas.channels import CHANNELS
 from fantwin.schemas.messages import Array
 
 APPLICATION = "fantwin"
+MEMORY_LIMIT = "256MB"
+"""history for viewers that join late, half an hour of the demo's eight fans; a recording has all of it"""
 FLUSH_LIMIT_S = 2.0
 """how long a flush may take; it is called twice a second and usually takes milliseconds"""
 # Rerun's page server runs in a shell that ends with this process, even when it is killed: the pipe to its input closes.
@@ -46,7 +48,6 @@ class ViewOptions:
 
     Attributes:
         show: fans of a fleet that always have a plot.
-        memory_limit: of the history kept for viewers that join late.
         file_bytes: size at which the file ends; the viewer sets one.
         grpc_port: where data are served to viewers on this host; None: nowhere.
         web_port: where the page of the browser viewer is served; None: nowhere.
@@ -55,7 +56,6 @@ class ViewOptions:
     layout: LayoutName = "all"
     window_s: float = 30.0
     show: Sequence[Fan] = ()
-    memory_limit: str = "256MB"
     file_bytes: float = math.inf
     grpc_port: int | None = None
     web_port: int | None = None
@@ -110,7 +110,7 @@ class RerunSink:
         grpc_port, web_port = options.grpc_port, options.web_port
         for key, port in (("grpc_port", grpc_port), ("web_port", web_port)):
             if port is not None:
-                check_free(port, f"viewer.{key}", "viewer.serve = false")
+                check_free(port, f"viewer.{key}", "viewer.grpc_port = 0")
         self._recording = rr.RecordingStream(APPLICATION)
         self._bands = RerunBands(self._recording)
         self._is_fleet = is_fleet(trays)
@@ -125,7 +125,7 @@ class RerunSink:
             # Without a footer, memory does not grow with the file, and the file can be opened after a crash.
             sinks.append(rr.FileSink(self._file.pipe, write_footer=False))
         if grpc_port is not None:
-            server = rr.GrpcServerSink(LOOPBACK, grpc_port, server_memory_limit=options.memory_limit)
+            server = rr.GrpcServerSink(LOOPBACK, grpc_port, server_memory_limit=MEMORY_LIMIT)
             sinks.append(server)
         self._recording.set_sinks(*sinks, default_blueprint=self._blueprint())
         if self._file is not None:

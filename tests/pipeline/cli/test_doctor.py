@@ -43,7 +43,7 @@ def examine(capsys: pytest.CaptureFixture[str], config: Path | None = None, *set
     code = 0
     try:
         # the ports of the viewer may be taken on this computer
-        overrides = ["viewer.serve=false", *settings] if config else []
+        overrides = ["viewer.grpc_port=0", *settings] if config else []
         doctor(config=config, overrides=overrides, json_output=True, listen_s=0.0)
     except typer.Exit as end:
         code = end.exit_code
@@ -139,7 +139,6 @@ def test_the_ports_of_the_own_running_site_are_no_problem_and_those_of_a_strange
         viewer_port = taken.getsockname()[1]
         settings = [f"tray.0.port='{port}'", f"run_folder='{tmp_path}'", f"bus.endpoint='{endpoint}'"]
         settings += [
-            "viewer.serve=true",
             f"viewer.grpc_port={viewer_port}",
             "viewer.web_port=0",
             "launcher.stages=['resampler', 'viewer']",

@@ -18,7 +18,7 @@ PATH = Path("fantwin.toml")
     "text",
     [
         '[[tray]]\nname = "a"\nfans = 2\n',
-        'site = "lab"  # ours\n\n  [[ tray ]]  # the only one\n  name = "a"\n  fans = 2\n[viewer]\nserve = false\n',
+        'site = "lab"  # ours\n\n  [[ tray ]]  # the only one\n  name = "a"\n  fans = 2\n[viewer]\ngrpc_port = 0\n',
         '# [[tray]]\n[viewer]\n[[tray]]\nfans = 2\nname = "a"\n[tray.source]\nkind = "[[tray]]"\n',
         'site = """\n[[tray]]\n"""\n[[tray]]\nname = "a"\n',
         '[[tray]]\nname = "b"  # old\ntwin = "b.onnx"\n[tray.source]\nkind = "serial"\n\n[[tray]]  # new\nname = "a"\n',

@@ -11,6 +11,7 @@ import pytest
 
 from fantwin.pipeline.replay.offline.replay_input import open_replay_input
 from fantwin.pipeline.replay.offline.rescoring import rescore
+from fantwin.pipeline.tray_scoring import tray_scorer
 from fantwin.schemas.enums import Action, FanState, Transition
 from tests.support.killed_site import CALIBRATION, FANS, Site, balanced_hybrid
 from tests.support.offline_replay import made_equal, recorded, verified
@@ -117,10 +118,12 @@ def test_with_a_new_calibration_alone_what_was_learned_and_alarms_go_on(tmp_path
     assert made_equal(verified(recording)) > 600
 
 
-def test_wear_goes_on_in_a_replay_as_it_did_when_a_twin_took_over(tmp_path: Path) -> None:
+def test_wear_goes_on_in_a_replay_as_it_did_when_a_twin_took_over(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The second twin takes one more of the command for healthy."""
-    settings = "wear_every_s = 1.0\n"
-    site = Site(tmp_path, 7, raw_samples=20, learns=True, scorer_settings=settings)
+    monkeypatch.setattr(tray_scorer, "WEAR_EVERY_S", 1.0)
+    site = Site(tmp_path, 7, raw_samples=20, learns=True)
     model = balanced_hybrid()
     site.put_in_force("tray1-1", write_twin(tmp_path / "1.onnx", model, fans=FANS, name="tray1-1").read_bytes())
     site.run(1200)

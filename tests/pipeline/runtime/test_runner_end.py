@@ -130,7 +130,7 @@ def test_row_04_a_loop_that_hangs_is_left_behind_in_time(config, monkeypatch, wh
             return []
 
     stop = threading.Event()
-    settings = replace(config, launcher=LauncherConfig(stop_timeout_s=0.5))
+    settings = replace(config, launcher=LauncherConfig(watchdog_s=1.0))
     runner = Runner(toy(lambda _context: BuiltStage(Hangs()), core_per_tray=False), settings, None, stop)
     errors: list[UserError] = []
 

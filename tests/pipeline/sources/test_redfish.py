@@ -107,8 +107,8 @@ def test_a_password_comes_from_a_file_of_its_owner_and_goes_over_a_verified_line
     file = tmp_path / "bmc.secret"
     file.write_text(f"{SECRET}\n")
     controller = Controller(is_new=True, user="operator", password=SECRET)
-    with redfish_server(controller, tls) as url:
-        url = url.replace("//", "//operator@")
+    with redfish_server(controller, tls) as address:
+        url = address.replace("//", "//operator@")
         settings = {"folder": tmp_path, "ca": "ca.pem", "password_file": "bmc.secret"}
         with pytest.raises(DeviceError, match="others may read it: chmod 600"):
             connected(url, **settings)

@@ -108,7 +108,7 @@ def test_the_runtime_loads_and_runs_it_by_its_card_alone(trained: TrainedTwin, t
     path = trained.save(tmp_path / "toy.onnx")
     twin = TwinFile.load(path, 2)
     run = linear_run(4)
-    core = TwinIntegratorCore(twin, TwinIntegratorConfig(start_samples=1, warm_up_s=0.5), 0)
+    core = TwinIntegratorCore(twin, TwinIntegratorConfig(warm_up_s=0.5), 0)
     valid = np.ones(run.command.shape, np.bool_)
     grid = Grid(
         fans=2,

@@ -77,7 +77,7 @@ def test_each_other_layout_of_a_live_view_a_recording_and_a_fleet_opens_without_
 def test_a_live_viewer_follows_an_old_recording(tmp_path: Path) -> None:
     scores, _ = made_up_tray(seconds=5)
     port = free_port()
-    core = build(context(tmp_path, serve=True, grpc_port=port, web_port=0)).core
+    core = build(context(tmp_path, grpc_port=port, web_port=0)).core
     with rerun_picture.headless_viewer() as viewer:
         viewer.open(f"rerun+http://127.0.0.1:{port}/proxy")
         for number, item in enumerate(scores):
