@@ -56,8 +56,9 @@ VARIADIC: dict[str, tuple[str, ...]] = {
 
 app = typer.Typer(
     name="fantwin",
-    epilog="Exit codes: 0 success; 1 failed, and one line says why; 2 wrong usage; 3 data were lost; 4 bad "
-    "recordings were skipped.",
+    epilog="Exit codes: 0 success; 1 failed, and one line says why; 2 wrong usage; 3 finished with a bad result: data "
+    "were lost or could not be read in full, or a declared rate was not kept; 4 bad recordings were skipped; 130 "
+    "interrupted by Ctrl-C.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,

@@ -12,6 +12,7 @@ import re
 from collections.abc import Callable, Iterator, Sequence
 from importlib import import_module
 from pathlib import Path
+from textwrap import fill
 from typing import Any
 
 import typer
@@ -28,7 +29,7 @@ _INTRODUCTION = f"""# Commands
 `fantwin COMMAND --help` says the same on a terminal. Every command prints JSON for machines with `--json`, and what
 went wrong as one line on standard error.
 
-{app.info.epilog}
+{fill(app.info.epilog or "", 120)}
 
 This page is made from the commands in the code: `make reference`. Options of several commands:
 """

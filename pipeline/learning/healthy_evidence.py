@@ -121,8 +121,8 @@ def _of_mean(runs: Sequence[LearnedRun]) -> str:
         return ""
     than = "faster" if share > 0.0 else "slower"
     return (
-        f"{run.tray.path}: {run.tray.tray} fan {fan} is {100 * size:.2g} % {than} than its twin in the "
-        f"mean, half of all differ by {100 * median:.2g} % or less: {SO_LEAVE_IT_OUT}"
+        f"{run.tray.path}: {run.tray.tray} fan {fan} is {100 * size:.2g} % {than} than its twin on "
+        f"average, the median of all fans is {100 * median:.2g} %: {SO_LEAVE_IT_OUT}"
     )
 
 

@@ -23,7 +23,7 @@ from fantwin.scoring.model.priors import Priors
 from fantwin.scoring.unseen_error import UnseenError
 
 FALSE_ALARMS_PER_DAY = 0.03
-"""declared, of a fan, where nobody says otherwise: one in a month"""
+"""declared, of a fan, where nobody says otherwise: about one a month"""
 
 
 class ScorerConfig(StageConfig):
@@ -33,8 +33,8 @@ class ScorerConfig(StageConfig):
         default=None,
         gt=0,
         le=8640,
-        description="declared rate of false alarms of a fan; default: that of the twin's calibration, else 0.03, which "
-        "is one a month",
+        description="declared rate of false alarms of a fan; default: that of the twin's calibration, else 0.03, "
+        "about one a month",
     )
     alarm_share: float = Field(
         default=0.1, gt=0, description="share of the speed that a fault takes, from which a warning is an alarm"

@@ -34,7 +34,7 @@ from fantwin.scoring.model.priors import Priors
 
 EXIT_BROKEN = 3
 MEANING = {
-    "twin_share": "how far fans and runs differ from the twin in the mean, share of the speed",
+    "twin_share": "how far fans and runs differ from the twin on average, share of the speed",
     "air": "what the air does within an hour, share of the speed",
     "wander": "wandering of the speed over seconds, share of the speed",
 }
@@ -93,8 +93,8 @@ def calibrate(
         int,
         typer.Option(
             min=0,
-            help="So many alarms, perhaps false ones, were raised while these were recorded, and the time around them "
-            "is not in the recordings: they count as found.",
+            help="Number of alarms, perhaps false ones, that were raised during these recordings, and whose time is "
+            "not in them: they count as found.",
         ),
     ] = 0,
     output: Annotated[
@@ -227,7 +227,7 @@ def _rate_lines(calibration: Calibration) -> list[str]:
     """The false alarms that were found, what was done about them, and what may be promised."""
     per_day, fan_hours, (low, high) = calibration.false_alarms_per_day, calibration.fan_hours, calibration.interval_95
     lines = [
-        f"false alarms: {calibration.found} found, {number_text(expected_alarms(fan_hours, per_day))} declared "
+        f"false alarms: {calibration.found} found, {number_text(expected_alarms(fan_hours, per_day))} expected "
         f"({number_text(low)} to {number_text(high)} per fan and day with 95 %)",
         f"limit: the logarithm of that by theory times {calibration.limit_factor:.3g}: without this there were more"
         if calibration.limit_factor > 1.0

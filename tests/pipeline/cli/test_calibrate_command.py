@@ -104,7 +104,7 @@ def test_without_an_output_the_twin_itself_is_calibrated_and_people_read_what_wa
     assert (found.data[0]["from_s"], found.data[0]["to_s"]) == (10.0, 40.0)
     assert found.fan_hours == pytest.approx(FANS * 30 / 3600, rel=0.1)
     assert "twin.onnx: calibrated on 0.01" in printed and "learned: " in printed and "limit: by theory" in printed
-    assert re.search(r"false alarms: \d found, 0.\d+ declared \(", printed)
+    assert re.search(r"false alarms: \d found, 0.\d+ expected \(", printed)
     assert "target: 1 false alarm per fan and day; 72 fan-hours are needed to show it" in printed
     drops = [line for line in printed.splitlines() if line.startswith("found at")]
     assert re.search(r"found at \d+ rad/s: a drop of [\d.]+ rad/s within 1 s, [\d.]+ rad/s within 10 s", printed)

@@ -138,7 +138,7 @@ def test_a_fan_that_differs_from_the_others_or_has_most_of_the_alarms_is_named()
     assert outlier_warnings(alike) == []
     slower = told(ToldRuns([[0.5]] * 5, 72.0, [0.01, 0.012, -0.12, 0.02, 0.005]), 1.0)
     assert outlier_warnings(slower) == [
-        "a.mcap: tray1 fan 2 is 12 % slower than its twin in the mean, half of all differ by 1.2 % or less: "
+        "a.mcap: tray1 fan 2 is 12 % slower than its twin on average, the median of all fans is 1.2 %: "
         "if something was wrong there, calibrate without this recording"
     ]
     (warning,) = outlier_warnings(told(ToldRuns([[1.2], [1.1] * 9], 72.0), 1.0))
