@@ -83,7 +83,7 @@ def main(
     except UnknownMechanismError as error:
         raise SystemExit(str(error)) from error
     sizes = Sizes(fans, declared_days, calibration_days, 0.0, runs, fault_runs, 60.0, seed)
-    data = RackData(rack_data or keep, rack_count or racks, report_hz, 3600.0 * test_hours, 0)
+    data = RackData(rack_data or keep, rack_count or racks, report_hz, 3600.0 * test_hours, seed)
     every: dict[str, Part] = {
         "simulated": SimulatedPart(sizes),
         "rack": RackPart(data, learn, racks),

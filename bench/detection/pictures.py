@@ -145,7 +145,7 @@ def _next_grid(tray: SimulatedTray) -> Grid | None:
 
 
 def _expected(scorer: TrayScorer) -> tuple[float, float]:
-    """How far a healthy fan tends to be from its twin, rad/s, and the standard deviation of that."""
+    """Expected distance of a healthy fan from its twin, rad/s, and its standard deviation."""
     model = scorer._decision.model
     steady, covariance = model.steady[FAN, :FAULT_STATE], model.covariance[FAN, :FAULT_STATE, :FAULT_STATE]
     return float(model.expected_rad_s[FAN]), float(np.sqrt(steady @ covariance @ steady))

@@ -5,7 +5,7 @@ not know the phases of the first and the last pulse, nor how the speed wanders. 
 counts, as many as tell most, differ from the healthy ones; the variance of the sum is resolution^2 / 6 and, for each
 count, that of the wandering. He can tell once the sum is a deviation that the counts of a healthy fan exceed once a
 day. (Wandering that outlasts a count makes him slower.) Of missing readings each adds its log likelihood ratio; he
-can tell once the fault is likelier by as many times as there are counts in a day.
+can tell once the fault is more probable by as many times as there are counts in a day.
 """
 
 from __future__ import annotations

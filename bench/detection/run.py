@@ -66,8 +66,8 @@ def main(
     libraries: Annotated[bool, typer.Option(help="PyOD and river as well.")] = True,
     seed: Annotated[int, typer.Option(help="Seed of all random numbers.")] = 1,
     racks: Annotated[int, typer.Option(help="Simulated racks of four fans.")] = 50,
-    judged: Annotated[int, typer.Option(help="Only the first so many of them learn and are judged; 0 for all.")] = 0,
-    healthy_racks: Annotated[int, typer.Option(help="So many are judged without faults, too; -1 for all.")] = -1,
+    judged: Annotated[int, typer.Option(help="Number of them that learn and are judged; 0 for all.")] = 0,
+    healthy_racks: Annotated[int, typer.Option(help="Number that are judged without faults, too; -1 for all.")] = -1,
     report_hz: Annotated[
         list[float] | None, typer.Option(help="Reports of the racks a second; repeatable. Default: 2, 10 and 100.")
     ] = None,

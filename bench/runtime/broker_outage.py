@@ -115,7 +115,7 @@ class Operator:
 
 
 class Latency:
-    """The highest and the mean 99th percentile of the other stages, over the healths that are looked at."""
+    """The highest and the mean 99th percentile of the other stages, over their health messages."""
 
     def __init__(self, watcher: SiteWatcher) -> None:
         self._watcher = watcher
