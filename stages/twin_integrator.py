@@ -115,7 +115,7 @@ class TwinIntegratorCore(Core):
         return card
 
     def counters(self) -> Mapping[str, int]:
-        """docs/explanation/deciding.md explains each counter."""
+        """docs/explanation/prediction.md explains each counter."""
         return {**self._samples.counters(), **self.tray.counters()}
 
     def notes(self) -> list[str]:

@@ -132,7 +132,7 @@ class TrayIntegrator:
         return [*self._run.states, *starting, *conditions, *own]
 
     def counters(self) -> dict[str, int]:
-        """docs/explanation/deciding.md explains each counter. Those that are 0 are left out, but for samples out of
+        """docs/explanation/prediction.md explains each counter. Those that are 0 are left out, except samples out of
         range."""
         counts = {**self._counts.totals(), "missing_grid_samples": self._missing_grid_samples}
         return {name: count for name, count in counts.items() if count or name == OUT_OF_RANGE_COUNT}
