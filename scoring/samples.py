@@ -1,4 +1,4 @@
-"""Samples of a prediction by what they say."""
+"""Masks of the samples of a prediction, by reason and by reading."""
 
 from __future__ import annotations
 

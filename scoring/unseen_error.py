@@ -18,8 +18,8 @@ class UnseenError:
 
     table, drive: of its card; drive: None where it has none. viscous, drag: (fans,) of the torque balance.
 
-    The table is asked at pairs of speed and command of a healthy fan. A fault takes a fan to pairs that nobody has seen
-    either, and must not widen its own limits.
+    The table is read only at pairs of speed and command of a healthy fan: a fault takes a fan to unseen pairs, too, and
+    must not widen its own limits.
     """
 
     table: ModelUncertainty
@@ -38,7 +38,7 @@ class UnseenError:
         )
 
     def of(self, prediction: Prediction) -> tuple[Array, Array]:
-        """(n, fans) each, of the predicted speed, rad/s, and of the torque balance, in the unit of the command.
+        """Error of the predicted speed, rad/s, and of the torque balance, in the unit of the command, (n, fans) each.
 
         The balance may be wrong in what this command does to a healthy fan, and in what a healthy fan needs at the
         measured speed. An error of the speed counts as that of the command which keeps a fan at the speed. 0 without a

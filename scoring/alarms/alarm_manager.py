@@ -241,7 +241,8 @@ class AlarmManager:
         return replace(last, header=Header(), request="", operator_name="", comment="", marked_onset_t_ns=0)
 
     def _alike(self, alarm: Alarm) -> int:
-        """Number of other fans with an alarm of this kind, to the same side and of the same time; 0 if they are few."""
+        """Number of other fans whose alarm has the same statistic and direction and began within AT_ONCE_NS; 0 unless
+        they are most of the tray."""
         found = sum(
             other.active
             and not other.stale

@@ -252,7 +252,7 @@ class FanCondition:
     def _take_feedback(
         self, action: Action, operator_name: str, reason: str, onset_t_ns: int
     ) -> tuple[Transition, str]:
-        """Keep what an operator says of the present occurrence; of an earlier one, its message is all that says it."""
+        """Keep an operator's mark on the present occurrence; a mark on an earlier one is only in its message."""
         meant_t_ns = self.onset_meant(onset_t_ns)
         if not meant_t_ns:
             began = "no alarm began then, or too many have been raised since"

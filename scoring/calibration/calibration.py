@@ -1,11 +1,11 @@
 """Calibration of a twin's alarms by healthy recordings: the entry `calibration` of its card, and the check of a limit.
 
-The limit of the statistic follows from the declared rate alone (scoring.model.onsets). Healthy recordings check it.
-Where they have more false alarms than chance explains, they show more than the model knows, and the log of the limit
-is raised until they have no more than declared. It is not raised for what is far beyond chance: that is a fault.
+The limit follows from the declared rate alone (scoring.model.onsets), and healthy recordings check it. If they have
+more false alarms than chance explains, the log of the limit is raised until they have no more than declared. Peaks far
+beyond chance do not raise it: they are faults.
 
-A rate can be shown only by enough running: if SHOWN_BY false alarms are to be expected of it and none is found, the
-rate is no higher than declared with a probability of 95 % (the rule of three). With less it is a target.
+A rate can be shown only by enough running: at the declared rate, SHOWN_BY false alarms must be expected. If none
+occurs, the true rate is no higher than declared, with 95 % confidence (the rule of three). With less it is a target.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ SHOWN_BY = 3.0
 EXCEEDED_UNTIL = 0.5
 """score below which an excursion above the limit has ended"""
 BEYOND = 1.0 + 1e-9
-"""a limit is so far above the peak that must not exceed it"""
+"""ratio of a raised limit to the peak that must stay below it"""
 
 
 class Calibration(BaseModel):
@@ -110,7 +110,7 @@ class Excursions:
         self._ended: list[float] = []
 
     def take(self, score: Array) -> None:
-        """The score at the end of a bin, (fans,)."""
+        """Process the score at the end of a bin, (fans,)."""
         is_one = (self._peak > 0.0) | (score > 1.0)
         if is_one.any():
             self._peak = np.where(is_one, np.maximum(self._peak, score), 0.0)
@@ -125,6 +125,6 @@ class Excursions:
 
 
 def raised_limit(peaks: Sequence[float], allowed: int) -> float:
-    """Find the lowest factor of the limit, at least 1, that at most `allowed` of all peaks above 1 exceed."""
+    """Find the least factor of the limit, at least 1, that no more than `allowed` of the peaks exceed."""
     falling = sorted(peaks, reverse=True)
     return max(1.0, falling[allowed] * BEYOND) if allowed < len(falling) else 1.0

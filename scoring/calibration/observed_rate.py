@@ -1,6 +1,6 @@
 """Observed rate of false alarms, beside the declared one.
 
-Operators say which alarms were false. An alarm on which nobody has said anything may be either, so it is counted apart.
+Operators say which alarms were false. An alarm that is not marked may be either, so it is counted apart.
 """
 
 from __future__ import annotations

@@ -130,7 +130,7 @@ def likely_causes(causes: Sequence[RatedCause]) -> str:
 
 
 def likely_with_share(causes: Sequence[RatedCause]) -> str:
-    """The same with the probability: "blocked or no power, 40 % each"."""
+    """Likely causes for people with their probabilities: "blocked or no power, 40 % each"."""
     found = likely(causes)
     if not found or found[0].cause == CANNOT_TELL:
         return likely_causes(causes)
@@ -157,7 +157,7 @@ def short_name(cause: str) -> str:
 
 
 def with_share(cause: Diagnosis) -> str:
-    """The short name and the probability; that of none of them is left out, as it does not add up with the others."""
+    """Short name and probability; `cannot_tell` is shown without one, which would not add up with the others."""
     share = "" if cause.cause == CANNOT_TELL else f" {100 * cause.probability:.0f} %"
     return f"{short_name(cause.cause)}{share}"
 

@@ -59,7 +59,7 @@ class CauseWords:
     """Writes the causes of the alarms of one tray."""
 
     def __init__(self, advice: Advice, has_supply: bool) -> None:
-        """has_supply: whether the twin allows for a measured supply voltage, which then explains nothing more."""
+        """has_supply: whether the twin allows for a measured supply voltage; less drive is then the driver's."""
         self._advice, self._has_supply = advice, has_supply
 
     def of(self, causes: Sequence[PossibleCause], seen: SeenSinceOnset, fan: SteadyFan) -> tuple[Diagnosis, ...]:
@@ -111,7 +111,7 @@ class CauseWords:
 def says_more(causes: Sequence[Diagnosis], than: Sequence[Diagnosis]) -> bool:
     """Return whether causes are worth a message after others: in another order, or with other probabilities.
 
-    A fan that did not turn and turns again has recovered: causes found from then on are of the fault's end.
+    A fan that turns again has recovered: causes found after that describe the end of the fault.
     """
     stood, stands = (bool(each) and is_of_standstill(each[0]) for each in (than, causes))
     if stood and not stands:

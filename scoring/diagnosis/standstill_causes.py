@@ -1,13 +1,12 @@
 """Why a fan does not turn, or does not stop, as commanded.
 
-A fan that loses its power coasts; a rotor that is held stops within a reading or two, and a tacho that loses its signal
-reads as if it did. What tells them apart is how long the fan ran on: the integral of the share of its speed that is
-left, in seconds at full speed, which is the area that the rotor turns. A reading is a mean over some time, so the first
-one of the fall contains full speed: only those after it count, which is the area but for what was turned by then.
+A fan without power coasts. A held rotor stops within a reading or two, and a tacho without signal reads as if it did.
+The *area* of the fall tells them apart: the integral of the share of the speed that is left, in seconds at full speed.
+The first reading of the fall is a mean that contains full speed, so only the later ones count.
 
-    held rotor    area: exponential, a small share of a coast; some are only braked: any share of one
-    lost signal   area: as of a held rotor
-    no power      area: lognormal around a healthy coast; with the plug off, as of a lost signal
+    held rotor    exponential, a small share of a coast; one in ten is only braked: any share of a coast
+    lost signal   as for a held rotor
+    no power      lognormal around a healthy coast; with the plug off, as for a lost signal
 
 A fan that was never seen to turn under this command says nothing about the cause: the priors remain.
 """
@@ -58,12 +57,12 @@ HELD, BRAKED = 0.05, 0.1
 BEGUN = 0.85
 """share of the speed below which a reading belongs to a fall"""
 COAST, COAST_SPREAD = 0.92, 0.25
-"""median of a coast until the reading of a fan at rest, of a whole one; and spread of its logarithm"""
+"""median area of a coast down to the reading of a fan at rest, share of a whole coast; and spread of its logarithm"""
 PHASES, HALVINGS = 20, 20
 """number of phases of a reading at which a fall may begin, and steps of a bisection"""
 LEAST_HELD_S = 0.02
 LEAST_DENSITY = 1e-3
-"""density per coast of a fall that lasts longer than any cause explains"""
+"""density per coast of a fall longer than any cause explains; no power gets it"""
 
 
 @dataclass(frozen=True)
@@ -117,7 +116,7 @@ def _weighed(priors: Mapping[str, float], fall: Fall) -> dict[str, float]:
 
 
 def _density(area: Callable[[float], float], constant: float, rest: float, tacho: float) -> float:
-    """Density of the rest of a fall: by distribution of its area, over the phases of a reading.
+    """Density of the rest of a fall, from the distribution of its area, as a mean over the phases of a reading.
 
     The first reading of the fall ends within the time of one after the fall begins; where it is too high to belong to
     the fall, the next is the first. constant: usual time constant of the fall.
@@ -143,15 +142,15 @@ def _area_with(rest: float, until: float) -> float:
 
 
 def _stopped(share: float) -> float:
-    """Probability that a rotor that is held turns at most a share of a healthy coast."""
+    """Probability that a held rotor turns at most a share of a healthy coast."""
     return -math.expm1(-max(share, 0.0) / HELD)
 
 
 def _braked(share: float) -> float:
-    """The same of one that is only braked."""
+    """Probability that a braked rotor turns at most a share of a healthy coast."""
     return min(max(share, 0.0), 1.0)
 
 
 def _coasted(share: float) -> float:
-    """The same of one that coasts."""
+    """Probability that a coasting rotor turns at most a share of a healthy coast."""
     return 0.5 * math.erfc(-math.log(share / COAST) / COAST_SPREAD / math.sqrt(2.0)) if share > 0.0 else 0.0

@@ -1,7 +1,8 @@
 """Bins of the predictions of one tray: all that the model sees of them.
 
 A bin is a fixed interval of time since the epoch, so how samples are cut into messages changes nothing. Within a bin of
-several samples, one that lies far from their median is a wrong reading of the tacho and does not count.
+several samples, one far from their median is marked as wrong. It does not count unless later readings agree with it
+(scoring.model.wrong).
 """
 
 from __future__ import annotations
@@ -19,15 +20,15 @@ from fantwin.scoring.unseen_error import UnseenError
 
 SHORTEST_S = 0.1
 WRONG_SHARE = 0.05
-"""share of the top speed: a reading that is farther from the median of its bin is wrong"""
+"""share of the top speed: a reading that is farther from the median of its bin is marked as wrong"""
 FASTEST = 10.0
-"""times the top speed: a faster reading is as impossible as this"""
+"""multiple of the top speed to which readings are clipped"""
 LARGEST_COMMAND = 1e9
-"""a larger command or torque balance is as impossible as this"""
+"""value to which commands and torque balances are clipped"""
 HAIR = 1e-3
-"""share of a reading: readings that differ by more are two"""
+"""share of a reading by which two samples must differ to be two readings"""
 RANKED_FROM = 4
-"""samples of a bin; of fewer none can be said to be wrong"""
+"""least number of samples in a bin among which wrong ones are looked for"""
 COLUMNS = (
     "measured",
     "predicted",
@@ -213,7 +214,7 @@ class Bins:
         )
 
     def _wrong(self, deviation: Array, half_range: Array) -> Array:
-        """(n, fans) readings far from the others of a bin, where these are more."""
+        """Find readings far from the others of a bin, where these are more, (n, fans)."""
         if len(deviation) < RANKED_FROM:
             return np.zeros(deviation.shape, np.bool_)
         count = np.isfinite(deviation).sum(axis=0)
@@ -225,7 +226,7 @@ class Bins:
 
 
 def mean(values: Array, counts: Array) -> Array:
-    """(fans,) the mean of those values that count, (n, fans); 0 where none does."""
+    """Mean of those values that count, (n, fans), as (fans,); 0 where none does."""
     total: Array = np.where(counts, values, 0.0).sum(axis=0)
     return total / np.maximum(counts.sum(axis=0), 1)
 
@@ -237,7 +238,7 @@ def differ(before_rad_s: Array, newest_rad_s: Array) -> Array:
 
 
 def newest(values: Array, counts: Array) -> Array:
-    """(fans,) the last of those values that count, (n, fans); NaN where none does."""
+    """Last of those values that count, (n, fans), as (fans,); NaN where none does."""
     last = len(values) - 1 - counts[::-1].argmax(axis=0)
     found: Array = np.where(counts.any(axis=0), values[last, np.arange(values.shape[1])], np.nan)
     return found

@@ -22,27 +22,27 @@ from fantwin.scoring.model.saved import Saved, part, within
 from fantwin.scoring.model.wrong import FAR_SIGMAS, WrongReadings
 
 AGREED_SIGMAS = 8.0
-"""the filter of a fan in alarm takes no reading for farther from what is expected"""
+"""standard deviations to which the filter clips the distance of a reading of a fan in alarm"""
 OF_RATE = 0.8
-"""share of the declared rate that the speed has; missing readings have the rest"""
+"""share of the declared rate for speed and torque balance; missing readings have the rest"""
 WALKS_PER_SQRT_S = 0.1
-"""how fast the fault of an alarm may change, of its largest size"""
+"""random walk of the fault of an alarm: share of its largest size in one second"""
 TOLD_APART = 16.0
-"""square of that size over the largest variance that its changing gives it: with more, coarse readings could not tell a
-small fault from none, and its alarm would stay"""
+"""least ratio of the square of that size to the variance of the walk: with more variance, coarse readings could not
+tell a small fault from none, and its alarm would never clear"""
 OVER_S, OVER_ODDS = 10.0, 100.0
 """time for which a healthy fan is likelier, by these odds, than the fault at its largest, until that is over"""
 LEFT_SIGMAS = 3.0
 """what is left of a fault may be an error of the healthy state up to so many standard deviations: then a healthy fan is
 likelier than a smaller fault by OVER_ODDS at most"""
 PROBABLE = 0.05
-"""probability from which a fault may be that of an alarm"""
+"""least probability of a fault that an alarm may have"""
 SMALLEST = 0.01
-"""share of the speed: what a fault takes at least"""
+"""least share of the speed that a fault is taken to cost"""
 FORGETS_S = 60.0
-"""longest gap after which the evidence before it counts"""
+"""longest gap after which earlier evidence still counts"""
 KEPT_FROM = 0.5
-"""score from which a snapshot keeps the evidence; less begins again"""
+"""score above which a snapshot keeps the evidence of a fan"""
 HIGHEST_SCORE = 99.0
 
 
@@ -90,28 +90,28 @@ class Decision(Saved):
         self.log_statistic = np.full(count, -np.inf)
         self.wrong = WrongReadings(fans, self.bin_s, period_s, math.log(bins / OF_RATE))
         self.alarms: dict[int, FanInAlarm] = {}
-        """what speaks for the causes of each alarm"""
+        """evidence for the causes of each alarm"""
         self.active = np.zeros(count, np.bool_)
-        """(fans,) whether the speed or the torque balance has an alarm"""
+        """(fans,) true where the speed or the torque balance has an alarm"""
         self._raised, self.onset = np.zeros(count, np.int64), np.zeros(count, np.int64)
         """(fans,) bins in which an alarm was raised, and in which its fault probably began"""
         self._peak, self._over_s = np.zeros((2, count))
         """(fans,) share of the speed that the fault surely took, at most, with its sign; and for how long it is over"""
         faults = len(self._hypotheses.faults)
         self._shape, self._is_probable = np.ones((count, faults)), np.zeros((count, faults), np.bool_)
-        """(fans, faults) share of the speed that each takes where that of an alarm was at its largest; which it may
-        be"""
+        """(fans, faults) share of the speed that each took where the fault of an alarm was at its largest; and true
+        where it may be this fault"""
         self._shows = np.ones(count)
-        """(fans,) how much of its largest share a fault takes at the present speed, at least"""
+        """(fans,) least part of its largest share that a fault takes at the present speed"""
         self.is_returning = np.zeros(count, np.bool_)
-        """(fans,) an alarm is active and a healthy fan is likelier"""
+        """(fans,) true where an alarm is active and a healthy fan is more probable"""
         self.in_balance = np.zeros(count, np.bool_)
-        """(fans,) whether the torque balance is what is compared"""
+        """(fans,) true where the torque balance is read, and not the speed"""
         self.now: Inputs | None = None
         """what drove the model within the last bin; None: there was none"""
         self.deviation_rad_s, self.deviation_std_rad_s = np.zeros(count), np.zeros(count)
-        """(fans,) newest reading less what is expected of this fan when it is healthy, and the standard deviation of
-        that; by the torque balance, of the speed that it tends to"""
+        """(fans,) newest reading less the one expected of this fan when it is healthy, and the standard deviation of
+        this; where the torque balance is read, of the steady speed"""
 
     @property
     def number(self) -> int:
@@ -120,11 +120,11 @@ class Decision(Saved):
 
     @property
     def has_alarm(self) -> Array:
-        """(fans,) of either kind."""
+        """Return where a fan has an alarm of either kind, (fans,)."""
         return self.active | self.missing.is_active
 
     def take(self, one: Bin) -> list[Change]:
-        """What changes with a bin. Bins come in order of time."""
+        """Process a bin; return the alarms that it raises or clears. Bins come in order of time."""
         passed = (one.t_ns - self.operation.t_ns) // self._bin_ns if self.operation.t_ns else 1
         if passed > 1:
             self._rest(passed - 1)
@@ -150,8 +150,8 @@ class Decision(Saved):
 
     @property
     def deviation_score(self) -> Array:
-        """(fans,) log of the statistic over that of the limit; of an alarm the log of the odds of its fault, over the
-        same: below 1 while a healthy fan is likelier."""
+        """Score of speed and torque balance, (fans,): log R over log L; in an alarm the log odds of its fault over
+        log L, below 1 while a healthy fan is more probable."""
         before = (self.log_statistic / self.log_limit).clip(0.0, 1.0)
         odds = self._log_odds() / self.log_limit
         during = np.where(self.is_returning, odds.clip(0.0, 1.0), odds.clip(1.0, HIGHEST_SCORE))
@@ -159,11 +159,11 @@ class Decision(Saved):
 
     @property
     def score(self) -> Array:
-        """(fans,) the larger one of that and of the score of missing readings."""
+        """Score, (fans,): the larger of `deviation_score` and the score of missing readings."""
         return np.maximum(self.deviation_score, self.missing.score)
 
     def raised_s(self, fan: int) -> float:
-        """How long ago the alarm of a fan was raised."""
+        """Time since the alarm of a fan was raised."""
         return float(self.number - self._raised[fan]) * self.bin_s
 
     def go_on_from(self, before: Decision) -> None:
@@ -176,7 +176,7 @@ class Decision(Saved):
 
     @property
     def fault(self) -> tuple[Array, Array]:
-        """(fans,) what the fault of an alarm takes (-) or adds, and its standard deviation: shares of the speed."""
+        """Effect of the fault of an alarm (- slower), (fans,), and its standard deviation: shares of the speed."""
         return self.model.mean[:, FAULT], np.sqrt(self.model.covariance[:, FAULT, FAULT])
 
     def begin_again(self, fans: Array) -> None:
@@ -238,7 +238,7 @@ class Decision(Saved):
             self.alarms.clear()
 
     def _weigh(self, one: Bin, now: Inputs) -> tuple[Inputs, Array]:
-        """Let model and evidence take the readings up; returns what counts, and what the columns of the faults do."""
+        """Update model and evidence with a bin; return the inputs that count, and `forces` of each onset."""
         model, evidence = self.model, self._evidence
         evidence.begin(now.moved_to_rad_s - now.moves_rad_s2 * self.bin_s)
         largest = self._peak * self._shows
@@ -267,7 +267,7 @@ class Decision(Saved):
         return now, pushes
 
     def _counts(self, one: Bin, now: Inputs) -> Array:
-        """(n, fans) whether a sample of a bin counts: it is none of a tacho gone wrong."""
+        """Find the samples of a bin that count, (n, fans): all but wrong readings of the tacho."""
         fans, found = self._fans, self.model.innovation(now)
         expected = now.deviation_rad_s - found.distance_rad_s
         of_sample = np.square(fans.noise_rad_s) * (1.0 - 1.0 / np.maximum(now.readings, 1.0))  # of which it is a mean
@@ -283,15 +283,15 @@ class Decision(Saved):
         return is_known & counts & (~one.wrong | self.wrong.agree)
 
     def _raise(self, fan: int, pushes: Array, speed_rad_s: float) -> None:
-        """Begin an alarm: what the filter has taken of the likeliest fault is given back, and the fault becomes a
-        state. pushes: (onsets, COLUMNS) of `forces`."""
+        """Begin an alarm: the part of the most probable fault that the filter has absorbed is taken out of its healthy
+        states, and the fault becomes a state. pushes: (onsets, COLUMNS) of `forces`."""
         evidence, model = self._evidence, self.model
         self.alarms[fan] = FanInAlarm(fan, self._fans, model, evidence, self._hypotheses)
         terms = evidence.log_terms(fan)
         onset, fault = (int(index) for index in np.unravel_index(int(np.argmax(terms)), terms.shape))
         columns = np.array(self._hypotheses.faults[fault].columns)
         sizes, of_sizes = self._hypotheses.sizes(evidence.sums, fan, onset, fault)
-        makes = evidence.sums.taken(fan, onset)[columns]  # of the states less what the filter has taken for its own
+        makes = evidence.sums.taken(fan, onset)[columns]  # of the states less what the filter has absorbed
         makes[:, FAULT] = pushes[onset, columns] / max(speed_rad_s, SLOWEST_RAD_S)
         model.mean[fan] += sizes @ makes
         model.covariance[fan] += makes.T @ of_sizes @ makes
@@ -313,8 +313,8 @@ class Decision(Saved):
         self.log_statistic[fan] = -np.inf
 
     def _shares(self, now: Inputs) -> Array:
-        """(fans, faults) share of the present speed that each takes of a fan that does not move, of a size that does
-        not grow."""
+        """Find the share of the present speed that each fault takes of a fan at a steady speed, (fans, faults), if its
+        size does not grow."""
         nothing, speed = np.zeros(len(now.speed_rad_s)), now.speed_rad_s[:, np.newaxis]
         steady = replace(now, rate_rad_s2=nothing, moves_rad_s2=nothing)
         pushes = forces(self._fans, steady, np.zeros(1), speed, self._hypotheses.columns)
@@ -342,8 +342,8 @@ class Decision(Saved):
         return expected * (self.model.mean[:, FAULT] - 0.5 * expected) / np.maximum(self._own_variance(), 1e-12)
 
     def _is_over(self, known: Array, shares: Array) -> Array:
-        """(fans,) whether for some time a healthy fan has been likelier than the fault at its largest. shares: see
-        `_shares`."""
+        """Return where a healthy fan has been more probable than the fault at its largest for OVER_S, (fans,). shares:
+        see `_shares`."""
         model, peak = self.model, self._peak
         size, variance = model.mean[:, FAULT], model.covariance[:, FAULT, FAULT]
         surely = _surely(size, self._own_variance())

@@ -18,13 +18,13 @@ COLUMNS = 9
 GROWS_S = 60.0
 """unit of time of what grows"""
 LARGEST_FRICTION = 10.0
-"""times the speed: what a friction that is harmless at the top speed does at a low one"""
+"""largest effect of a friction, in multiples of the speed: it would be harmless at the top speed"""
 
 
 @dataclass(frozen=True)
 class Fault:
-    """A cause, and how it shows: columns of `forces` with prior standard deviations of their sizes (shares of the top
-    speed, in GROWS_S where it grows; s for RISES and FALLS), and the sign of the first (0: both)."""
+    """Cause and its signature. columns: of `forces`; std: prior standard deviations of their sizes, shares of the top
+    speed (per GROWS_S if it grows; s for RISES and FALLS); sign: of the first size, 0 for either."""
 
     cause: str
     columns: tuple[int, ...]
@@ -33,9 +33,9 @@ class Fault:
     mean: float
     """prior mean of the size of the first"""
     weight: float
-    """prior probability, of a fan whose command is a torque: there the course over the speed tells one from another"""
+    """prior probability, of a fan whose command is a torque: there the effect over the speed tells faults apart"""
     of_own_drive: float
-    """prior of a fan that controls its speed by itself: there the course over the time tells"""
+    """prior of a fan that controls its speed by itself: there the effect over time tells them apart"""
 
 
 FAULTS = (
@@ -53,17 +53,17 @@ FAULTS = (
 )
 
 UNSTEADY = ("unsteady", 0.05, (8.0, 30.0))
-"""cause, prior probability, and times of the variance of a healthy fan by which the readings vary more: a fault without
-a course"""
+"""cause, prior probability, and additional variance of the readings in multiples of a healthy fan's: a fault without a
+signature"""
 
 
 def forces(fans: Fans, now: Inputs, age_s: Array, then_rad_s: Array, columns: int = COLUMNS) -> Array:
-    """Effect (fans, onsets, columns) of each column of size 1 on what a fan tends to, rad/s, or on its reading.
+    """Effect (fans, onsets, columns) of a unit size of each column on the steady speed, or on the reading, rad/s.
 
     A torque moves the steady speed by itself over the slope of the torque that the fan needs; a weak drive takes a
     share of that and of what turns the rotor faster. Of a fan that controls its speed by itself drag takes a share of
-    the speed. age_s: (onsets,); then_rad_s: (fans, onsets), the speed at the onset; columns: number of the first ones,
-    which are asked for.
+    the speed. age_s: (onsets,); then_rad_s: (fans, onsets), the speed at the onset; columns: how many of them,
+    from the first.
     """
     speed, top = now.speed_rad_s, fans.top_rad_s
     steeper = fans.slope(top) / fans.slope(speed)

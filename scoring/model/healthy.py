@@ -2,7 +2,7 @@
 
 With w the speed, w' its rate, both as the twin predicts them, a healthy fan in bin k deviates from its twin by
 
-    s = w (h(w).theta + load sag + a + c + v + u + f) - rise w'+ - fall w'-  what it tends to
+    s = w (h(w).theta + load sag + a + c + v + u + f) - rise w'+ - fall w'-  its steady speed
     x = keep x + (1 - keep) s,   keep = exp(-bin / time constant)        its rotor follows
     y = mean of x - late w' - e_k-1 + e_k + white                        and its tacho shows
 
@@ -10,7 +10,7 @@ With w the speed, w' its rate, both as the twin predicts them, a healthy fan in 
     rise, fall  s                    errors of its time constants
     late        s                    how late the tacho shows the speed, other than when the twin was trained
     sag         share                what the load of the other fans of the tray does to the supply
-    a           share                age: how the fan changes within days and months, a random walk
+    a           share                wear: how the fan changes within days and months, a random walk
     c           share                what the air does: an Ornstein-Uhlenbeck process over an hour
     v           share                what theta does not resolve: constant at one speed and command
     u           share                the wandering of the speed: an Ornstein-Uhlenbeck process over seconds
@@ -20,9 +20,9 @@ With w the speed, w' its rate, both as the twin predicts them, a healthy fan in 
     q           rad/s                s as the torque balance shows it, which passes the filter of the balance
 
 The time constant is that of the twin's torque balance, J w' = torque - viscous w - drag w|w| - friction: the deviation
-of two solutions of it decays with (viscous + drag (w + w_twin)) / J. So one state joins both residuals: the speed
-shows x, and the torque balance what x tends to. Where the free run is not known, or is known worse, the balance is
-what is read.
+of two solutions of it decays with (viscous + drag (w + w_twin)) / J. So one state joins both residuals: the speed shows
+x, and the torque balance s. In each bin one of them is read: the balance where the free run is not known, or where the
+balance has much less noise.
 
 A Kalman filter gives the innovations and their variance. All that is uncertain is in it: twin, few data, air, motion,
 counts. Nothing else widens a limit.
@@ -47,32 +47,31 @@ K = len(KNOTS)
 RISE, FALL, LATE, SAG, AGE, AIR, LOCAL, WANDER, FAULT, COUNT, ROTOR, BALANCE, SHOWN = range(K, K + 13)
 STATES = K + 13
 SLOW = slice(WANDER)
-"""states that keep their value during a fault"""
+"""states that are frozen during a fault"""
 FADING = slice(AIR, WANDER + 1)
-"""states of which a bin keeps a share"""
+"""states that decay; a bin keeps a share of each"""
 FOLLOWING = slice(ROTOR, SHOWN + 1)
-"""the states that follow what a fan tends to"""
+"""states that follow the steady speed"""
 HALF = np.tril_indices(STATES)
 CARRIED = SHOWN
-"""number of the states that the next bin follows from: all but the last, what a tacho shows but for e_k and white"""
+"""number of states that the next bin depends on: all but SHOWN, what a tacho shows without e_k and white noise"""
 BOTH_BUT_NOT = np.array([[1.0], [-1.0]])
-"""directions in which a reading tells of two states, but not between two of which nothing is learned"""
+"""signs of the outer products in `update`: the covariance of two states that learn nothing is not reduced"""
 UNSEEN_S = 100.0
-"""time for which an error of the twin where it was not trained keeps its value: how heat and supply move it there is
-not known either"""
+"""time constant of the unseen error: how heat and supply act there is not known, either"""
 SLOWEST_RAD_S = 10.0
-"""errors in rad/s are no larger share of a lower speed"""
+"""lowest speed by which an error in rad/s is divided to make it a share"""
 
 
 def hats(share: Array) -> Array:
-    """(n, K) hat functions on KNOTS at shares of the top speed, (n,)."""
+    """Hat functions on KNOTS at shares of the top speed, (n,), as (n, K)."""
     place = np.interp(share, KNOTS, np.arange(K))
     return np.maximum(0.0, 1.0 - np.abs(place[:, np.newaxis] - np.arange(K)))
 
 
 @dataclass(frozen=True, eq=False)
 class Innovation:
-    """Innovation of the readings of a bin: how far each is from what was expected, (fans,), and how sure that was."""
+    """Innovation of the readings of a bin: distance of each from the expected one, (fans,), and its variance."""
 
     distance_rad_s: Array
     variance: Array
@@ -97,11 +96,11 @@ class HealthyFans(Saved):
         self.kept = np.ones((count, 3))
         """(fans, 3) share of FADING that a bin keeps"""
         self.tends = np.zeros((count, 3, STATES))
-        """rows of FOLLOWING: these are the rows times the states before"""
+        """(fans, 3, STATES) rows that give the states FOLLOWING from the states before"""
         self.follows = np.ones((count, 3))
-        """share by which they approach in a bin what a fan tends to"""
+        """(fans, 3) share of the distance to the steady speed that each goes in a bin"""
         self._has_begun = np.zeros(count, np.bool_)
-        """(fans,) true after the first reading, at which a rotor is where it tends to"""
+        """(fans,) true after the first reading, at which a rotor is at its steady speed"""
         self._holds = np.ones(count)
         """(fans,) 1 where no reading ends, so that the error of the last count is kept"""
         self._filters = 1.0 - math.exp(-bin_s * fans.balance_filter_per_s)
@@ -118,7 +117,7 @@ class HealthyFans(Saved):
         """(fans,) variance of the noise of the torque balance, as speed"""
         self.tends[:, SHOWN - ROTOR, COUNT] = -1.0
         self.steady = np.zeros((count, COUNT))
-        """(fans, COUNT) factors of the states in what a fan tends to"""
+        """(fans, COUNT) factors of the states in the steady speed"""
 
     def of(self, fan: int) -> HealthyFans:
         """A copy for one fan."""
@@ -143,7 +142,7 @@ class HealthyFans(Saved):
         self.covariance[fan] = _prior(self._fans.of(fan), self._priors, self._period_s)[0]
 
     def rest(self, bins: int) -> None:
-        """Let time pass in which nothing is known: at the next reading a rotor is where it tends to."""
+        """Let time pass in which nothing is known: at the next reading a rotor is at its steady speed."""
         passed_s, p = bins * self._bin_s, self._priors
         kept = np.ones(STATES)
         kept[LOCAL], kept[WANDER] = math.exp(-passed_s / p.local_s), math.exp(-passed_s / p.wander_s)
@@ -212,7 +211,7 @@ class HealthyFans(Saved):
         states[:, COUNT] *= self._holds[:, np.newaxis]
 
     def _follow(self, now: Inputs) -> None:
-        """Set how rotor, balance and tacho follow what the fan tends to at this speed."""
+        """Set how rotor, balance and tacho follow the steady speed of the fan."""
         fans, speed, tends, follows = self._fans, now.speed_rad_s, self.tends, self.follows
         decay = np.maximum(fans.viscous + fans.drag * (now.measured_rad_s + speed), 1e-9) / fans.inertia * self._bin_s
         follows[:, 0], follows[:, 1] = -np.expm1(-decay), self._filters
@@ -252,7 +251,7 @@ class HealthyFans(Saved):
 
     def update(self, found: Innovation, gain: Array, distance_rad_s: Array) -> None:
         """Update the states by the readings. gain: (fans, STATES), with_states over variance, or 0 where nothing is
-        learned; distance: as far as it counts."""
+        learned; distance_rad_s: (fans,), clipped."""
         self.mean += gain * distance_rad_s[:, np.newaxis]
         halves = np.empty((len(gain), STATES, 2))
         np.divide(found.with_states, np.sqrt(found.variance)[:, np.newaxis], out=halves[:, :, 0])

@@ -1,11 +1,11 @@
 """Evidence for each cause of an alarm, from its onset on, for as long as it lasts.
 
-The model of a healthy fan goes on as though nothing were wrong, and the sums of each onset that was possible when the
-alarm was raised go on with it, so what a fan does long afterwards still counts. What grows may end to grow: each onset
-stands once for each time after which it may have ended.
+A copy of the model of a healthy fan goes on as though nothing were wrong, and with it the sums of each onset that was
+possible when the alarm was raised. So what a fan does long afterwards still counts. A growing fault may stop growing:
+each onset appears once for each time after which it may have stopped.
 
-A fault may also have no course: then the readings vary more than those of a healthy fan, by times of their variance S.
-With z = nu / sqrt(S), log BF = sum (z^2 r / (1 + r) - log(1 + r)) / 2 for r times.
+A fault may also have no signature: then the readings scatter more than those of a healthy fan, with 1 + r times their
+variance S. With z = nu / sqrt(S), log BF = sum (z^2 r / (1 + r) - log(1 + r)) / 2.
 """
 
 from __future__ import annotations
@@ -25,21 +25,21 @@ from fantwin.scoring.model.operation import Fans, Inputs
 from fantwin.scoring.model.saved import part, within
 
 ENDS_S = (15.0, 30.0, 60.0, 120.0, 240.0, 480.0, np.inf)
-"""times after its onset at which a growth may end, equally probable"""
+"""times after its onset at which a fault may stop growing, equally probable"""
 FIRST = np.arange(1)
 FAR = 16.0
-"""largest square of a distance, in standard deviations: a wrong reading is no more than that"""
+"""cap on the square of a distance, in standard deviations, so that one wrong reading does not decide"""
 RECENT_S, STEADY = 5.0, 1.5
-"""time over which a fan is looked at for whether it is steady again, and largest mean square then"""
+"""time constant over which the scatter of a fan is averaged, and largest mean square of a steady one"""
 HOPELESS, MOST = 12.0, 24
-"""log of the odds against an onset from which on it no longer counts; and number of those that do"""
+"""log odds against an onset from which it is dropped; and largest number of onsets"""
 
 
 class FanInAlarm:
     """Fan with an alarm."""
 
     def __init__(self, fan: int, fans: Fans, model: HealthyFans, evidence: Evidence, hypotheses: Hypotheses) -> None:
-        """Begin with the bin that raised the alarm; model: which has not heard of the alarm."""
+        """Begin with the bin that raised the alarm; model: as it was before the alarm."""
         self._fans, self._model, self._hypotheses = fans.of(fan), model.of(fan), hypotheses.of(fan)
         onsets = np.flatnonzero(np.isfinite(evidence.log_terms(fan)).any(axis=1))
         ages_s = evidence.age_s[onsets]
@@ -58,11 +58,11 @@ class FanInAlarm:
 
     @property
     def age_s(self) -> float:
-        """Age of the likeliest onset."""
+        """Age of the most probable onset."""
         return float(self._ages_s[self._terms.max(axis=1).argmax()])
 
     def take(self, now: Inputs, bin_s: float, square: float) -> None:
-        """Take the reading of a bin up. now: of this fan; square: of its distance, in standard deviations, from what is
+        """Add the reading of a bin. now: of this fan; square: of its distance, in standard deviations, from the reading
         expected with the fault of the alarm."""
         self._ages_s = self._ages_s + bin_s
         self._has_changed |= now.changes[:, np.newaxis]
@@ -86,13 +86,13 @@ class FanInAlarm:
 
     @property
     def probabilities(self) -> Array:
-        """Probabilities (onsets, faults) of the posterior, of faults with a course."""
+        """Probabilities (onsets, faults) of the posterior, of faults with a signature."""
         weights = np.exp(self._terms - self._terms.max())
         return np.asarray(weights / weights.sum())
 
     @property
     def unsteady(self) -> float:
-        """Probability that the fault has no course."""
+        """Probability that the fault has no signature."""
         _, prior, times = UNSTEADY
         squares, number = self._varies[0]
         logs = 0.5 * np.array([squares * r / (1.0 + r) - number * math.log1p(r) for r in times])
@@ -103,7 +103,7 @@ class FanInAlarm:
 
     @property
     def varies(self) -> bool:
-        """Return whether the fault probably has no course, and the fan is not steady again."""
+        """Return whether the fault probably has no signature, and the fan is not steady again."""
         squares, number = self._varies[1]
         return squares > STEADY * number and self.unsteady > 0.5
 
@@ -144,7 +144,7 @@ class FanInAlarm:
         """Continue from a state.
 
         Raises:
-            KeyError, ValueError: it is none.
+            KeyError, ValueError: it is not such a state.
         """
         self._ends_s, self._ages_s = stored["ends_s"], stored["ages_s"]
         self._then_rad_s, self._log_weight = stored["then_rad_s"], stored["log_weight"]

@@ -1,13 +1,13 @@
 """Learned priors: those that healthy recordings have narrowed or widened.
 
 Three of them differ most between makes of fan and places, and show in any healthy run: the wandering of the speed over
-seconds, what the air does over minutes, and how far fans and runs differ in the mean. The first two follow from how
+seconds, what the air does over minutes, and how far fans and runs differ on average. The first two follow from how
 much more two segments of steady running differ the farther apart they are, in which the noise of the tacho cancels.
 A tacho that counts pulses hides both: of such fans only the means are learned from.
 
-What was measured on a few fan-hours is not what the next month brings. So the logarithm of a variance is a weighted
-mean of what was measured and of the prior: the prior counts as one fan's measurement on one day would, but where more
-than the prior was measured, only the number of segments counts against it.
+A few fan-hours do not show the next month. So the logarithm of each variance is a weighted mean of the measured one and
+the prior. If the measured one is smaller, the prior counts as much as a day's measurement of one fan. If it is larger,
+only the number of segments limits its weight.
 
 Each run is added up on its own, in bounded memory. The sums of many runs give the same priors in any order.
 """
@@ -30,7 +30,7 @@ SEGMENT_S = 2.0
 NEAR, FAR, FARTHEST = 2, 5, 15
 """distances of the segments that are compared, in segments"""
 STEADY, SLOWEST = 0.02, 0.1
-"""shares of the top speed: largest movement within what is compared, as of the load, and least speed"""
+"""largest movement of the speed, share of the top speed, and of the load within what is compared; and least speed"""
 COMPARED_AT_ONCE = 500
 """segments that are kept until they are compared"""
 FEWEST = 30
@@ -40,7 +40,7 @@ POPULATION = 2.0
 DAY = 1.0
 """the same between days, of one fan"""
 LEAST = 0.05
-"""share of a prior standard deviation: no smaller one is believed"""
+"""least share of a prior standard deviation that is believed"""
 SECONDS_PER_DAY = 86400.0
 
 
@@ -148,7 +148,7 @@ class HealthyRun:
 
 
 def learned_priors(runs: Sequence[RunSums]) -> Priors:
-    """The priors of a population, as healthy runs have narrowed or widened them; the order of the runs is no matter."""
+    """Return the priors of a population, narrowed or widened by healthy runs, in any order."""
     priors = Priors()
     fan_days = math.fsum(float(judged_s) for run in runs for judged_s in run.judged_s) / SECONDS_PER_DAY
     pairs = [math.fsum(run.pairs[which] for run in runs) for which in range(3)]
@@ -182,7 +182,8 @@ def _grown(pairs: list[float], squares: list[float], apart: tuple[int, int], sha
 
 
 def _between(prior: float, variance: float, number: float, fan_days: float) -> float:
-    """A standard deviation between the prior one and that of a measured variance. number: of measurements."""
+    """Weigh a measured variance against a prior standard deviation; return a standard deviation. number: of
+    measurements."""
     if number < 1.0 or (number < FEWEST and variance < prior**2):
         return prior
     measured = math.log(max(variance, (LEAST * prior) ** 2))

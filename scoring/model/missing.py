@@ -18,13 +18,14 @@ NOTHING, LARGEST = -30.0, 60.0
 LEAST_RATIO, LARGEST_SHARE = 2.0, 0.9
 """least ratio of the losses of a loose wire to those of a healthy line, and the largest share that it loses"""
 LONGEST_BURST = 5
-"""missing readings in a row from which on nothing is learned of a healthy line: the tacho may be dead"""
+"""number of missing readings in a row from which nothing is learned of a healthy line: the tacho may be dead"""
 OVER_S = 10.0
-"""time for which a healthy line must be likelier before an alarm is over"""
+"""time for which a healthy line must be more probable before an alarm clears"""
 
 
 class MissingReadings(Saved):
-    """Shiryaev-Roberts again: a healthy line loses a share of readings and another of those after a missing one.
+    """Shiryaev-Roberts statistic of a loose wire against a healthy line, which loses one share of readings, and another
+    share after a missing one.
 
     In an alarm the shares of a loose wire are weighed by all that it has lost since, so that a burst with which it
     began is not taken for its share.
@@ -38,17 +39,17 @@ class MissingReadings(Saved):
         self._counts = PRIOR.copy()
         self._log_terms = np.full((fans, len(SHARES)), NOTHING)
         self._returned = np.zeros(fans)
-        """(fans,) log of how much likelier a healthy line is by the newest readings"""
+        """(fans,) log odds of a healthy line, by the newest readings"""
         self._returns_s = np.zeros(fans)
-        """(fans,) time for which it has been likelier"""
+        """(fans,) time for which it has been more probable"""
         self._run = np.zeros(fans)
-        """(fans,) readings that are missing one after the other"""
+        """(fans,) number of missing readings in a row"""
         self.is_active = np.zeros(fans, np.bool_)
         self.score = np.zeros(fans)
         """(fans,) log of the statistic over that of the limit; in an alarm until it clears"""
 
     def take(self, missing: Array) -> None:
-        """The counts of a bin, (fans, 4), as in `Bin.missing`."""
+        """Process the counts of a bin, (fans, 4), as in `Bin.missing`."""
         gain = missing @ self._log_ratios()
         readings, lost = missing[:, ::2].sum(axis=1), missing[:, 1::2].sum(axis=1)
         self._run = np.where(lost < readings, 0.0, self._run + lost)
@@ -72,19 +73,19 @@ class MissingReadings(Saved):
 
     @property
     def share(self) -> Array:
-        """(fans,) likeliest share of missing readings."""
+        """Most probable share of missing readings, (fans,)."""
         found: Array = self._shares()[self._log_terms.argmax(axis=1)]
         return found
 
     @property
     def explains_silence(self) -> Array:
-        """Return where a loose wire makes the present silence more often than a false alarm comes, (fans,)."""
+        """Return where a loose wire causes such a silence more often than false alarms are declared, (fans,)."""
         share = self.share
         found: Array = self.is_active & (share < LARGEST_SHARE) & (-np.log(share) * self._run < self._log_limit)
         return found
 
     def _is_over(self, gain: Array, known: Array) -> Array:
-        """Return where a line is healthy again, (fans,). known: (fans,) whether there should have been a reading."""
+        """Return where a line is healthy again, (fans,). known: (fans,) true where there should have been a reading."""
         back = self._returned - (_log_sum(self._log_terms + gain) - _log_sum(self._log_terms))
         self._returned = np.where(self.is_active, np.maximum(back, 0.0), 0.0)
         self._returns_s = np.where(self._returned > 0.0, self._returns_s + known * self._bin_s, 0.0)
@@ -92,13 +93,13 @@ class MissingReadings(Saved):
         return found
 
     def _shares(self) -> Array:
-        """(SHARES,) shares that a loose wire loses, each well above that of a healthy line."""
+        """Shares that a loose wire loses, (SHARES,), each well above that of a healthy line."""
         readings, lost, *_ = self._counts.tolist()
         return np.maximum(SHARES, min(LEAST_RATIO * lost / readings, LARGEST_SHARE))
 
     def _log_ratios(self) -> Array:
-        """(4, SHARES) log of how much likelier each reading is of a loose wire than of a healthy line, as `Bin.missing`
-        counts them."""
+        """Log likelihood ratios of a loose wire against a healthy line, (4, SHARES), for each count of
+        `Bin.missing`."""
         readings, lost, missing, lost_again = self._counts.tolist()
         healthy = np.array([[lost / readings], [lost_again / missing]])
         shares = self._shares()
@@ -107,7 +108,7 @@ class MissingReadings(Saved):
 
 
 def _log_sum(logs: Array) -> Array:
-    """(fans,) logarithm of the sum of exp(logs) over the shares. logs: (fans, SHARES)."""
+    """Logarithm of the sum of exp(logs) over the shares, (fans,). logs: (fans, SHARES)."""
     largest = logs.max(axis=1)
     found: Array = largest + np.log(np.exp(logs - largest[:, np.newaxis]).sum(axis=1))
     return found

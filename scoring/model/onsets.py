@@ -1,19 +1,19 @@
 """Evidence for a fault: Bayes factors of its onset and cause, added up to a Shiryaev-Roberts statistic.
 
-A fault that began with bin tau changes the innovations by rho times its sizes, where rho is what it adds to the
-readings less what the filter has taken up of it since (Willsky and Jones, 1976). With normal priors of the sizes, each
-onset and cause has a Bayes factor against a healthy fan from two sums alone,
+A fault that began with bin tau changes the innovations by rho times its sizes, where rho, its signature, is what it
+adds to the readings less what the filter has absorbed of it since (Willsky and Jones, 1976). With normal priors of the
+sizes, each onset and cause has a Bayes factor against a healthy fan from two sums alone,
 
     A = sum rho rho' / S,   B = sum rho nu / S,   log BF = B' (A + 1/prior)^-1 B / 2 - log|1 + prior A| / 2
 
-R, the sum of all of them by their weights, grows by one a bin in the mean while a fan is healthy (R_t - t is a
-martingale), so the mean time until R > L is at least L bins: the limit is the declared time itself.
+R, the sum of all of them by their weights, grows by one per bin on average while a fan is healthy (R_t - t is a
+martingale), so the mean time until R > L is at least L bins: the limit is the declared mean time between two false
+alarms, in bins.
 
 Onsets of about geometric age stand for all; one that is dropped hands its weight on.
 
-The filter answers all onsets and causes alike: what they are now follows from what they were some bins ago, from what
-they have done since, and from what was read since, by factors that are those of the filter alone. So only the factors
-are followed from bin to bin, and every BATCH bins all is gathered.
+The filter applies one linear map to all onsets and causes. So only the factors of this map are updated in each bin;
+every BATCH bins they are multiplied into the parts.
 """
 
 from __future__ import annotations
@@ -36,18 +36,18 @@ NEVER = -1
 BATCH = 8
 """bins"""
 FARTHEST, STEPS = 5.0, 256
-"""largest argument for which the chance that a size has the sign of its fault is looked up, in standard deviations over
-the root of 2; and steps of the table of its logarithm within one"""
+"""largest argument of the table of log erfc, and its steps within one; erfc gives the chance that a size has the sign
+of its fault"""
 LOG_ERFC = np.log(erfc(np.arange(-FARTHEST, FARTHEST + 2.0 / STEPS, 1.0 / STEPS))).astype(np.float32)
 LARGEST_LOG = 80.0
-"""a larger one is no logarithm of a number in single precision"""
+"""largest logarithm that is exponentiated: single precision overflows at 88"""
 
 
 class Sums:
     """Sums of the evidence for each onset, of all fans side by side: A and B of the module, and what they follow from.
 
-    What each column has made of the states, less what the filter took up, is `_factors` times `_parts`. The parts are
-    what it had made of the states at the last gathering, and for each bin since what it did to the rotor and its rho.
+    The effect of each column on the states, less what the filter has absorbed, is `_factors` times `_parts`. The parts
+    are this effect at the last gathering and, for each bin since, the effect on the rotor and rho.
     """
 
     def __init__(self, fans: int, onsets: int, columns: int, pairs: Sequence[tuple[int, int]]) -> None:
@@ -64,7 +64,7 @@ class Sums:
         self.squares = np.zeros((fans, onsets, columns), np.float32)
         """(fans, onsets, columns) the diagonals of A"""
         self.crossed = {pair: np.zeros((fans, onsets), np.float32) for pair in pairs}
-        """(fans, onsets) products of A that are used besides"""
+        """(fans, onsets) products off the diagonal of A that a fault uses"""
         self.products = np.zeros((fans, onsets, columns), np.float32)
 
     def of(self, fan: int, onsets: Array, columns: int) -> Sums:
@@ -93,7 +93,7 @@ class Sums:
         """Continue for some fans from a state.
 
         Raises:
-            KeyError, ValueError: it is none.
+            KeyError, ValueError: it is not such a state.
         """
         self._parts[fans, :CARRIED] = stored["taken"]
         self.squares[fans], self.products[fans] = stored["squares"], stored["products"]
@@ -106,7 +106,7 @@ class Sums:
         return slice(onset * columns, (onset + 1) * columns)
 
     def taken(self, fan: int, onset: int) -> Array:
-        """(columns, STATES): what each column has made of the states less what the filter took up."""
+        """Effect of each column on the states, less what the filter has absorbed, (columns, STATES)."""
         found: Array = (self._factors[fan, :, : self._used] @ self._parts[fan, : self._used, self._of(onset)]).T
         return found
 
@@ -119,7 +119,7 @@ class Sums:
 
     def add(self, forces: Array, model: HealthyFans, found: Innovation, gain: Array, distance_rad_s: Array) -> None:
         """Add the readings of a bin. forces: (fans, onsets, columns); gain: of the model, 0 where a reading does not
-        count; distance_rad_s: (fans,) as far as it counts."""
+        count; distance_rad_s: (fans,), clipped."""
         if self._used == self._parts.shape[1]:
             self._gather()
         done, read, self._used = self._used, self._used + 1, self._used + 2
@@ -196,12 +196,12 @@ class Hypotheses:
         return found
 
     def log_weights(self) -> Array:
-        """(faults, fans) logarithms of the prior weights."""
+        """Logarithms of the prior weights, (faults, fans)."""
         with np.errstate(divide="ignore"):
             return np.log(self._weights)[:, self._has_own_drive.astype(np.int64)]
 
     def weighed(self, bayes_factors: Array) -> Array:
-        """(fans, onsets): mean over the faults of Bayes factors (faults, fans, onsets)."""
+        """Mean over the faults of Bayes factors (faults, fans, onsets), (fans, onsets)."""
         of_kinds = self._weights.T @ bayes_factors.reshape(len(self.faults), -1)
         of_torque, of_own = of_kinds.reshape(2, *bayes_factors.shape[1:])
         return np.where(self._has_own_drive[:, np.newaxis], of_own, of_torque)
@@ -210,7 +210,7 @@ class Hypotheses:
         """Log Bayes factors (faults, fans, onsets), by elimination of one size after the other; the first comes last,
         for its sign.
 
-        has_changed: (fans, onsets) whether the reading has since: then its tacho is not stuck.
+        has_changed: (fans, onsets) true where the reading has changed since: then its tacho is not stuck.
         """
         shape = (len(self.faults), *sums.squares.shape[:2])
         products = (self._first @ sums.products.reshape(-1, self.columns).T).reshape(shape)
@@ -276,7 +276,7 @@ def _without_others(fault: Fault, sums: Sums) -> tuple[Array, Array, Array]:
 
 
 class Evidence:
-    """Onsets and what speaks for each, of all fans side by side."""
+    """Onsets and the evidence for each, of all fans side by side."""
 
     def __init__(self, fans: int, hypotheses: Hypotheses, bin_s: float) -> None:
         """Begin without a reading."""
@@ -302,7 +302,7 @@ class Evidence:
         return (self.number - self.began + 1) * self._bin_s
 
     def begin(self, speed_rad_s: Array) -> None:
-        """A new bin: one onset more, in the place of one of the older ones. speed_rad_s: (fans,) before it."""
+        """Begin a bin with a new onset, in the place of an older one. speed_rad_s: (fans,) before it."""
         self.number += 1
         slot = self._place()
         self.began[slot], self.weight[slot] = self.number, 1.0
@@ -314,7 +314,8 @@ class Evidence:
         self.has_changed |= changes[:, np.newaxis] & (self.began < self.number)
 
     def _place(self) -> int:
-        """An unused one, the oldest if it is too old, or the one without which the ages are nearest to geometric."""
+        """Return the place of a new onset: an unused one, that of the oldest if it is too old, or the one without which
+        the ages are nearest to geometric."""
         order = self._order
         began = self.began[order]
         drop = 0
@@ -325,17 +326,17 @@ class Evidence:
         return order[-1]
 
     def add(self, forces: Array, model: HealthyFans, found: Innovation, gain: Array, distance_rad_s: Array) -> None:
-        """The readings of a bin, as in `Sums.add`."""
+        """Add the readings of a bin, as in `Sums.add`."""
         self.sums.add(forces, model, found, gain, distance_rad_s)
         self._log_bayes_factors = self._hypotheses.log_bayes_factors(self.sums, self.has_changed)
 
     @property
     def _counts(self) -> Array:
-        """Return which onsets count, (fans, ONSETS)."""
+        """Return where onsets count, (fans, ONSETS)."""
         return self.began > self.since[:, np.newaxis]
 
     def log_terms(self, fan: int) -> Array:
-        """(ONSETS, faults) log of Bayes factor and weight of a fan's onsets and faults."""
+        """Log of Bayes factor and weight of a fan's onsets and faults, (ONSETS, faults)."""
         terms = self._log_bayes_factors[:, fan] + self._hypotheses.log_weights()[:, fan, np.newaxis]
         found: Array = np.where(self._counts[fan], terms + np.log(self.weight), -np.inf).T
         return found
@@ -345,7 +346,7 @@ class Evidence:
         self.since[fan] = self.number
 
     def kept(self, fans: Array) -> dict[str, Array]:
-        """The state of some fans; of the others it begins again."""
+        """Return the state of some fans; `restore_kept` starts the others again."""
         return {
             "fans": fans,
             "number": np.array(self.number),
@@ -361,7 +362,7 @@ class Evidence:
         """Continue from such a state.
 
         Raises:
-            KeyError, ValueError: it is none.
+            KeyError, ValueError: it is not such a state.
         """
         fans, self.number = stored["fans"], int(stored["number"])
         self.began, self.weight = stored["began"].copy(), stored["weight"].copy()
@@ -372,7 +373,7 @@ class Evidence:
         self.sums.restore(fans, stored)
 
     def log_statistic(self) -> Array:
-        """(fans,) log R."""
+        """Log R, (fans,)."""
         logs, counts, beyond = self._log_bayes_factors, self._counts, 0.0
         if logs.max() > LARGEST_LOG:
             logs = np.where(counts, logs, -np.inf)

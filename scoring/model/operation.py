@@ -12,14 +12,15 @@ from fantwin.scoring.model.bins import Bin
 from fantwin.scoring.model.saved import Saved
 
 BACKLASH = 0.01
-"""share of the top speed, or of the largest command: less may be what a loop makes of the noise of a tacho"""
+"""share of the top speed, or of the largest command, below which a movement is ignored: a speed loop makes it from the
+noise of its tacho"""
 FASTEST = 2.0
-"""times the top speed: a free run that is beyond it has diverged"""
+"""multiple of the top speed beyond which a free run has diverged"""
 LOWEST_ERROR = 0.01
 """standard deviation of the lowest command that acts, share of the commands"""
 STEADY_S = 0.5
-"""time over which the measured speed is averaged where the torque balance is used: that tells what a fan tends to at a
-speed, and not what its speed loop does around it"""
+"""time constant by which the measured speed is averaged where the torque balance is read: it removes what a speed loop
+does around a speed"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +56,7 @@ class Fans:
     may_have_plateau: Array
     """true if its speed may be constant below some command, of which the twin knows nothing"""
     prefers_balance: Array
-    """true if the torque balance tells more than the speed, where both are known"""
+    """true if the torque balance is read, and not the speed, where both are known"""
 
     def of(self, fan: int) -> Fans:
         """Select one fan."""
@@ -77,7 +78,7 @@ class Inputs:
     """the newest reading; NaN without one"""
     rate_rad_s2: Array
     moved_to_rad_s: Array
-    """speed, as far as it has moved by more than what a speed loop makes of the noise of its tacho"""
+    """speed, followed with BACKLASH, so that the noise of a tacho is no movement"""
     moves_rad_s2: Array
     """rate of that speed"""
     load: Array
@@ -92,7 +93,7 @@ class Inputs:
     """standard deviation of its error near the command from which on the speed rises, and below it"""
     half_range_rad_s: Array
     readings: Array
-    """0: nothing new is known"""
+    """number of readings that end in the bin; 0: nothing new is known"""
     is_new: Array
     """true where a reading ends that its tacho holds"""
     ends: Array
@@ -102,6 +103,7 @@ class Inputs:
     deviation_rad_s: Array
     """distance from the free run; or what it would be at a steady speed by the torque balance"""
     is_balance: Array
+    """true where the torque balance is read, and not the speed"""
 
     def of(self, fan: int) -> Inputs:
         """Inputs of one fan."""
@@ -178,7 +180,7 @@ class Operation(Saved):
         )
 
     def _of_lowest(self, command: Array) -> Array:
-        """(fans,) error of the speed near the command from which on it rises: the twin knows it to LOWEST_ERROR.
+        """Error of the speed near the command from which on it rises, (fans,): the twin knows it to LOWEST_ERROR.
 
         The curve of a fan bends sharply there, that of a twin is smooth. On simulated racks the bend was found 0.004
         above to 0.014 of the commands below the true one.
@@ -191,13 +193,13 @@ class Operation(Saved):
         return np.nan_to_num(error * slope * near)
 
     def samples_rad_s(self, one: Bin, now: Inputs) -> Array:
-        """(n, fans) deviation of each sample of a bin, as that of its inputs; NaN where there is none."""
+        """Deviation of each sample of a bin, (n, fans), as that of its inputs; NaN where there is none."""
         balances = -one.balances_command / self._fans.slope(now.speed_rad_s)
         found: Array = np.where(now.is_balance, balances, one.deviations_rad_s)
         return found
 
     def read(self, one: Bin, now: Inputs, counts: Array) -> Inputs:
-        """The inputs with what counts of the readings that end now: a reading that is held counts once.
+        """Return the inputs with the readings that end now and count: a reading that is held counts once.
 
         counts: (n, fans) samples of the bin.
         """

@@ -12,7 +12,8 @@ Positive: TypeAlias = Annotated[float, Field(gt=0)]
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid", allow_inf_nan=False))
 class Priors:
-    """Standard deviations, of a population of fans, and how fast they change."""
+    """Prior standard deviations of a population of fans (shares of the speed unless named otherwise), and how fast the
+    states change: ageing, sag of the supply at full load, air and its time constant, local error, wandering."""
 
     twin_share: Positive = 0.02
     """error of a twin that is common to all speeds"""

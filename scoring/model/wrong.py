@@ -1,9 +1,10 @@
 """Wrong readings of a tacho: far from what is expected, and gone with the next.
 
-Boards show twice, half or an impossible speed, or none, for a reading or some. A fan with a fault stays far, so a far
-reading counts once others have agreed with it: as many as healthy tachos do not show wrong, one after the other, in the
-declared time. How long wrong readings last is a matter of the board, so that all fans of a tray tell it. Two are surely
-two readings where they differ, or where the second is shown for longer than one would be.
+Boards show twice or half the speed, an impossible speed or 0 rpm, for one reading or a few. A fan with a fault stays
+far. So a far reading counts only once more readings in a row agree with it than a healthy tacho shows wrong within the
+declared time between false alarms. A run of wrong readings is a *spell*. Its length depends on the board, so it is
+learned from all fans of a tray. Two samples are two readings if they differ, or if they last longer than one reading
+would.
 """
 
 from __future__ import annotations
@@ -15,18 +16,18 @@ from fantwin.scoring.model.operation import Fans
 from fantwin.scoring.model.saved import Saved
 
 FAR_SIGMAS = 4.5
-"""a reading that is farther from what is expected is far"""
+"""distance from the expected reading, in standard deviations, beyond which a reading is far"""
 PRIOR = (0.5, 1000.0)
-"""times that readings of a tacho of which nothing is known were wrong, and readings"""
+"""spells and readings, as if counted before the first reading of a tacho"""
 PRIOR_LONGER = 10.0
-"""such times of which no more went on than chance would have it"""
+"""spells, as if counted for the tray, that went on as often as by chance"""
 LONGEST = 4
 """wrong readings, one after the other; more are no tacho's"""
 MANY, SAID_FROM = 0.02, 20.0
 """share of wrong readings with which a tacho is not sound, and how often they were wrong before that is said"""
 FEWEST, ONE_MORE = 2, 2
-"""readings that must agree at least; and samples more than they take where they are alike: a reading may be seen in one
-sample more than its time, and the last one has to be seen"""
+"""least number of readings that must agree; and samples that equal readings must last beyond their time, because one
+may show in one sample more, and the last must be seen"""
 
 
 class WrongReadings(Saved):
@@ -39,22 +40,22 @@ class WrongReadings(Saved):
         the samples; log_limit: of the declared time."""
         count = len(fans.top_rad_s)
         self._held = np.maximum(np.round(np.where(fans.held_s > 0.0, fans.held_s, bin_s) / period_s), 1.0)
-        """(fans,) a reading is shown in so many samples"""
+        """(fans,) number of samples that show one reading"""
         self._holds = fans.held_s > 0.0
-        """(fans,) whether a tacho holds its readings, so that they tell one from another"""
+        """(fans,) true where a tacho holds its readings, so that a different sample is another reading"""
         self._log_limit = log_limit
         self._times, self._readings, self._std = np.zeros((3, count))
-        """(fans,) how often they were wrong for a while; how many there were; and what is expected of a healthy fan has
-        this standard deviation, rad/s: in an alarm the one of before it, since the fault is not known yet"""
+        """(fans,) number of spells; number of readings; standard deviation of the reading expected of a healthy fan,
+        rad/s, during an alarm that of before it, since the fault is not known yet"""
         self.begin_again(np.ones(count, np.bool_))
         self._lasted = np.zeros(LONGEST)
-        """how often those of the tray were wrong for at least 1, 2, ... readings"""
+        """number of spells of the tray that lasted at least 1, 2, ... readings"""
         self._side, self._long, self._different = np.zeros((3, 2, count))
-        """(2, fans) from what is expected, and from a healthy fan: on which side the newest reading is far, 0: it is
-        not; how many samples ago the first far one on this side was, itself included; number of different readings
-        since then, the first one included"""
+        """(2, fans), from the expected reading and from that of a healthy fan: side on which the newest reading is
+        far, 0 if it is not; samples since the first far one on that side, itself included; different readings since
+        then, the first one included"""
         self.agree = np.zeros(count, np.bool_)
-        """(fans,) whether the newest reading is far, and enough before it were"""
+        """(fans,) true where the newest reading is far, and enough before it were"""
 
     @property
     def many(self) -> Array:
@@ -64,20 +65,20 @@ class WrongReadings(Saved):
 
     @property
     def waits(self) -> Array:
-        """(fans,) whether the newest reading was far."""
+        """Return where the newest reading was far, (fans,)."""
         return self._side[0] != 0.0
 
     @property
     def may_be(self) -> Array:
-        """(fans,) whether the newest reading is far, and too few before it were."""
+        """Return where the newest reading is far, and too few before it were, (fans,)."""
         return self.waits & ~self.agree
 
     def counts(self, distances_rad_s: Array, std_rad_s: Array, another: Array, raised: Array) -> Array:
-        """(n, fans) whether each sample of a bin counts.
+        """Find the samples of a bin that count, (n, fans).
 
-        distances_rad_s: (2, n, fans) from what is expected, and from a healthy fan, NaN without a reading; std_rad_s:
-        (fans,) of that; another: (n, fans) whether a reading is another than the one before; raised: (fans,) how many
-        samples ago an alarm was raised, -1: there is none.
+        distances_rad_s: (2, n, fans) from the expected reading, and from that of a healthy fan, NaN without a reading;
+        std_rad_s: (fans,) of the expected reading; another: (n, fans) true where a reading is another than the one
+        before; raised: (fans,) samples since an alarm was raised, -1 without an alarm.
         """
         known = np.isfinite(distances_rad_s[0])
         self._std = np.where(raised < 0, std_rad_s, self._std)
@@ -104,27 +105,27 @@ class WrongReadings(Saved):
         return known & ~waits
 
     def begin_again(self, fans: Array) -> None:
-        """Forget what the tachos of some fans have shown wrong, (fans,) of bool."""
+        """Forget the wrong readings of some fans, (fans,) of bool."""
         self._times[fans], self._readings[fans] = PRIOR
 
     def forget(self) -> None:
-        """Nothing agrees with what was read before a gap."""
+        """Forget far readings from before a gap."""
         self._side[:] = 0.0
 
     def _are_enough(self, agree_at: Array) -> Array:
-        """(fans,) whether at least agree_at readings in a row are far."""
+        """Return where at least agree_at readings in a row are far, (fans,)."""
         samples = (agree_at - 1.0) * self._held + ONE_MORE
         return (self._long[0] >= samples) | (self._different[0] >= agree_at)
 
     def _learn(self, ends: Array) -> None:
-        """Where far readings end that were too few, or with which an alarm began, they were wrong. ends: (fans,)."""
+        """Count far readings that end as a spell: too few agreed, or an alarm began with them. ends: (fans,)."""
         readings = np.ceil(self._long[1] / self._held)
         was_wrong = ends & (readings <= LONGEST)
         self._times += was_wrong
         self._lasted += (readings[was_wrong] > np.arange(LONGEST)[:, np.newaxis]).sum(axis=1)
 
     def _agree_at(self) -> Array:
-        """(fans,) number of readings in a row that must be far before they count."""
+        """Number of readings in a row that must be far before they count, (fans,)."""
         share = self._times / self._readings
         times = self._lasted[:, np.newaxis] + PRIOR_LONGER * 0.5 * share  # on the same side
         goes_on = times[1:] / (self._lasted[:-1, np.newaxis] + PRIOR_LONGER)

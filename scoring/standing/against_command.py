@@ -1,4 +1,4 @@
-"""Fans that stand or turn against their command. Until they have done as commanded for a while, the alarm stands."""
+"""Fans that stand or turn against their command. Their alarm stays until they have done as commanded for a while."""
 
 from __future__ import annotations
 
@@ -27,7 +27,8 @@ KINDS = (None, *Standing)
 
 
 class AgainstCommand(Saved):
-    """Check of each fan of a tray against its command. A fan that could not show that it obeys changes nothing."""
+    """Check of each fan of a tray against its command. Samples that show neither obeying nor disobeying change
+    nothing."""
 
     KEPT = ("_arrived_t_ns", "_obeyed_ns", "_is_against")
 

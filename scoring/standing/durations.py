@@ -15,7 +15,8 @@ class Durations:
         self._period_ns = period_ns
 
     def of(self, grows: Array, ends: Array, before_ns: Array) -> Array:
-        """(..., n, fans) ns: it grows with samples of `grows`, and begins again with those of `ends`; both as many.
+        """Durations, ns, (..., n, fans): they grow with samples of `grows` and begin again with those of `ends`, both
+        as many.
 
         before_ns: (..., fans) after the last block, and after this one when it returns.
         """

@@ -11,7 +11,7 @@ from fantwin.scoring.model.saved import Saved
 STANDS, FALLS = 0.08, 0.85
 """shares of the expected speed: below, a fan stands; above, it has not begun to fall"""
 CONSTANT = 0.02
-"""share of a reading: two above FALLING that differ by less are of a fan that turns slowly and does not fall"""
+"""relative difference below which two readings above FALLING show a fan that turns slowly, not one that falls"""
 FALLING = 0.6
 """share of the expected speed: a fan below it may come to rest"""
 STEADY = 0.1

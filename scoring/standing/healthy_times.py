@@ -14,7 +14,7 @@ UNKNOWN_START_S = 30.0  # beyond the reach, if no start was seen
 
 
 def lag_s(reach_s: Array) -> Array:
-    """(fans,) s, the longest time until readings show what a command has done."""
+    """Longest time, s, until readings show the effect of a command, (fans,)."""
     return MIN_MOVE_S + reach_s
 
 
@@ -24,7 +24,7 @@ def lapse_limit_s(healthy: Standstill) -> float:
 
 
 def start_limit_s(healthy: Standstill, reach_s: Array) -> Array:
-    """(fans,) longest time, s, for which a fan may stand after a command that turns it."""
+    """Longest time, s, for which a fan may stand after a command that turns it, (fans,)."""
     limit_s = UNKNOWN_START_S + reach_s
     if healthy.start_s is not None:
         limit_s = np.maximum(MARGIN * healthy.start_s, lag_s(reach_s))
@@ -32,13 +32,13 @@ def start_limit_s(healthy: Standstill, reach_s: Array) -> Array:
 
 
 def coast_limit_s(healthy: Standstill, reach_s: Array) -> Array:
-    """(fans,) longest time, s, for which a fan may turn after a command that stops it; infinite if unknown."""
+    """Longest time, s, for which a fan may turn after a command that stops it, (fans,); infinite if unknown."""
     if healthy.coast_s is None:
         return np.inf + reach_s
     return np.maximum(MARGIN * healthy.coast_s, lag_s(reach_s))
 
 
 def slowing_limit_s(healthy: Standstill, reach_s: Array) -> Array:
-    """(fans,) longest time, s, for which readings may show that it keeps its speed then; infinite if unknown."""
+    """Longest time, s, for which readings may show that it keeps its speed then, (fans,); infinite if unknown."""
     slowing_s = np.inf if healthy.slowing_s is None else max(MARGIN * healthy.slowing_s, MIN_MOVE_S)
     return slowing_s + reach_s

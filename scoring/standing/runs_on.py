@@ -27,7 +27,7 @@ from fantwin.scoring.standing.healthy_times import coast_limit_s, lag_s, slowing
 
 PEAK_STEPS = 64.0  # in a rad/s: peaks are rounded, so that sums with the next are exact, however blocks are cut
 BEYOND_SPEEDS_RAD_S = 2.0**20
-LONG_AGO_NS = 1 << 60  # when a stop was that nobody has seen: the speed that it began with is not known
+LONG_AGO_NS = 1 << 60  # age of a stop that was not observed: the speed at its beginning is not known
 KINDS = (Standing.TURNED_AGAIN, Standing.KEEPS_SPEED, Standing.COASTS_TOO_LONG)
 
 
@@ -51,12 +51,12 @@ class RunsOn(Saved):
 
     @property
     def memory_s(self) -> float:
-        """Memory of gaps, none: in one the fan may have been started and stopped again."""
+        """Longest gap that is bridged: none, because the fan may have been started and stopped within it."""
         return 0.0
 
     def update(self, command: Array, speed_rad_s: Array, counts: Durations) -> tuple[Array, Array, Array]:
-        """(n, fans) the time in multiples of what is healthy, 0 where it does not run on; whether the fan stands as it
-        should; and the number of the kind in KINDS. command, speed_rad_s: (n, fans)."""
+        """Return the time in multiples of a healthy one, 0 where a fan does not run on; where a fan stands as it
+        should; and the number of the kind in KINDS. All (n, fans), also command and speed_rad_s."""
         stops, turns = self._healthy.stops(command, speed_rad_s), self._healthy.turns(speed_rad_s)
         stands = np.isfinite(speed_rad_s) & ~turns
         ran_on = counts.of(stops & turns, ~stops | stands, self._lasted_ns[0])
@@ -72,7 +72,7 @@ class RunsOn(Saved):
         return ratio, stops & stands, np.where(rested > 0, 0, np.where(keeps_speed, 1, 2))
 
     def _peaks(self, readings: Array, ends: Array) -> Array:
-        """(n, fans) the highest of the readings since the last end."""
+        """Return the highest of the readings since the last end, (n, fans)."""
         since = ends.cumsum(axis=0) * BEYOND_SPEEDS_RAD_S  # so that a reading after an end is above all before it
         offset = np.vstack((self._peak_rad_s, np.round(readings * PEAK_STEPS) / PEAK_STEPS + since))
         peaks = np.maximum(np.maximum.accumulate(offset, axis=0)[1:] - since, 0.0)

@@ -2,8 +2,8 @@
 
 It needs no prediction: what commands do to healthy fans, and how long starts and coasts take, is in the twin's card
 (schemas.standstill). While a fan starts it may read as standing for three times the longest healthy start. Once it has
-turned, only lapses of its tacho explain a reading of a fan that stands. A tacho that gives no reading may not be read
-for its reach and `MISSING_S` more.
+turned, only lapses of its tacho explain a reading of a fan that stands. A tacho may give no reading for its reach plus
+`MISSING_S`.
 """
 
 from __future__ import annotations
@@ -49,8 +49,8 @@ class StandsStill(Saved):
         return float(np.max(self._start_limit_s))
 
     def update(self, command: Array, speed_rad_s: Array, counts: Durations) -> tuple[Array, Array, Array]:
-        """(n, fans) the time in multiples of what is healthy; whether the fan turns as it should; and the number of
-        the kind in KINDS. command, speed_rad_s: (n, fans)."""
+        """Return the time in multiples of a healthy one; where a fan turns as it should; and the number of the kind in
+        KINDS. All (n, fans), also command and speed_rad_s."""
         healthy = self._healthy
         drives, known, turns = healthy.drives(command), np.isfinite(speed_rad_s), healthy.turns(speed_rad_s)
         driven = counts.of(drives, ~drives, self._lasted_ns[0])

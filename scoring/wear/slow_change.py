@@ -1,4 +1,4 @@
-"""Slow change of one fan, and what is said of it in words long before it is wear that reaches a limit."""
+"""Slow change of one fan, and the notices about it before it reaches the limit."""
 
 from __future__ import annotations
 

@@ -4,14 +4,14 @@ Points are (time, value, standard error). Memory is bounded: when the series is 
 and from then on a stored point is the mean of twice as many. A complete point is kept to the second, its value to a
 hundredth of its standard error: all digits would be most of a snapshot, and say nothing.
 
-Slope: the median of the slopes between all pairs of points (Theil 1950; Sen, JASA 63 (1968) 1379), which tolerates a
-third of outliers. Interval: the errors of a fan are correlated over hours (temperature, day and night), so that
-successive points count for less. The means of at least BATCHES intervals show how much less (batch means, as for the
-output of simulations: Law, Simulation Modeling and Analysis, 2015, section 9.5.3). Means that are still correlated
-count as (1 - rho) / (1 + rho) each, where rho is their lag-one correlation, corrected for the bias of a short series
-(Marriott and Pope, Biometrika 41 (1954) 390; the effective number as in Yue and Wang, Water Resources Management 18
-(2004) 201). The interval is that of a regression line by Student's t with this effective number; the scatter is
-estimated by the median absolute deviation and is at least the points' own errors.
+Slope: the median of the slopes between all pairs of points (Theil 1950; Sen, JASA 63 (1968) 1379), which tolerates 29 %
+of outliers. Interval: the errors of a fan are correlated over hours (temperature, day and night), so that successive
+points count for less. The means of at least BATCHES intervals show how much less (batch means, as for the output of
+simulations: Law, Simulation Modeling and Analysis, 2015, section 9.5.3). Means that are still correlated count as (1 -
+rho) / (1 + rho) each, where rho is their lag-one correlation, corrected for the bias of a short series (Marriott and
+Pope, Biometrika 41 (1954) 390; the effective number as in Yue and Wang, Water Resources Management 18 (2004) 201). The
+interval is that of a regression line by Student's t with this effective number; the scatter is estimated by the median
+absolute deviation and is at least the points' own errors.
 
 A limit is reached between the earliest and the latest time at which the line with its uncertainty crosses it (Fieller).
 """

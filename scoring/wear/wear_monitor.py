@@ -154,8 +154,8 @@ class WearMonitor:
             self._series[fan] = WearSeries()
 
     def problem(self, now_ns: int) -> str:
-        """Line while a fan will likely reach its limit within days by a change of its own, or may have reached it;
-        empty otherwise, and once that is sure."""
+        """Line about a fan that will likely reach its limit within REPORT_WITHIN_DAYS, or may have; empty otherwise,
+        and once it surely has."""
         soon = []
         for fan in self._changed_fans():
             found = self.of(fan)
