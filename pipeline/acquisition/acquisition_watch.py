@@ -17,7 +17,7 @@ from fantwin.schemas.topics import alive_key, health_key, sessions_key
 
 STAGE = "acquisition"
 MOST_SESSIONS = 64
-"""number of last healths that are kept"""
+"""number of last health messages that are kept"""
 
 
 def _nothing() -> None:
@@ -28,7 +28,7 @@ class TrayAcquisition:
     """Tracks which session of acquisition has the tray, and what it says of itself."""
 
     def __init__(self, bus: Bus, site: str, tray: str, on_change: Callable[[], None] = _nothing) -> None:
-        """on_change: called from a thread of the bus after a token or a health has come; it must not block."""
+        """on_change: called from a thread of the bus after a token or a health message has come; it must not block."""
         self._bus = bus
         self._site = site
         self._tray = tray
@@ -40,7 +40,7 @@ class TrayAcquisition:
         self._healths: dict[str, Health] = {}
         """last health of each producer, in the order heard"""
         self._watched: set[str] = set()
-        """the keys of healths that are listened to"""
+        """the keys of health messages that are listened to"""
         self._ends = [
             bus.watch_alive(alive_key(site, STAGE, "*"), self._on_token),
             bus.watch_alive(sessions_key(site, STAGE), self._on_session),

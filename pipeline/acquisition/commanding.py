@@ -152,7 +152,7 @@ class CommandSender:
 
 def why_not_sent(tray: str, before: Health | None, after: Health) -> str:
     """Why acquisition has not sent a command of a tray to its device; empty if it has sent all. before, after: its
-    healths before the commands in question and after them."""
+    health messages before the commands in question and after them."""
     if before and after.header.producer != before.header.producer:
         before = None
     if _not_sent(after) <= (_not_sent(before) if before else 0):

@@ -28,7 +28,7 @@ class BelievedOutputs:
         return health if len(believed) == len(health.outputs) else replace(health, outputs=believed)
 
     def _may_write(self, health: Health, key: str) -> bool:
-        """Whether the process of a health may publish on a key. A stage that this version does not know may: no
+        """Whether the process of a health message may publish on a key. A stage that this version does not know may: no
         certificate exists for such a stage."""
         role = self._roles.get(f"{health.stage}.{health.instance}") or self._roles.get(health.stage)
         if role is None:

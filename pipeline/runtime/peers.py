@@ -46,7 +46,7 @@ class Peers:
             _remember(self._left_s, change.key, time.monotonic())
 
     def add_health(self, key: str, health: Health) -> None:
-        """The session with the liveliness key `key` has published a health."""
+        """The session with the liveliness key `key` has published a health message."""
         is_producer = any(output.key in self._read_keys for output in health.outputs)
         _remember(self._reported, key, _Reported(is_producer, health.is_last))
 

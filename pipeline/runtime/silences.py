@@ -31,12 +31,12 @@ from fantwin.schemas.units import NS_PER_S
 BEGINS_NS = 5 * NS_PER_S
 """this long after its first health that is not STARTING, a session has read what its device had kept"""
 MOST_DELAY_S = 0.4
-"""a health that took this much longer to arrive than the fastest of the last ones is late; less than a resampler
-waits"""
+"""a health message that took this much longer to arrive than the fastest of the last ones is late; less than a
+resampler waits"""
 MOST_HEARD = 8
 """producers of a tray whose earlier health is remembered"""
 _DELAYS = 16
-"""number of the last healths that are compared; after as many, a step of a host clock no longer matters"""
+"""number of the last health messages that are compared; after as many, a step of a host clock no longer matters"""
 RESTART_S = 5.0
 """how long the next session is awaited after the end of one that did not end in order"""
 
@@ -53,7 +53,7 @@ class _Ended:
 @dataclass(slots=True)
 class _Heard:
     """The earlier health of a producer. begun_t_ns: time of its first health after its start, ns. ages_s: of its last
-    healths on arrival, plus an unknown constant, because clocks differ."""
+    health messages on arrival, plus an unknown constant, because clocks differ."""
 
     begun_t_ns: int
     ages_s: deque[float] = field(default_factory=lambda: deque(maxlen=_DELAYS))
@@ -124,15 +124,15 @@ class Silences:
         self._ended[tray] = _Ended(self._reporting[tray][1], at_s)
 
     def _is_of_owner(self, health: Health, key: str, tray: str) -> bool:
-        """Whether a health is of the session that owns the tray in its stage; where there is none, of any producer that
-        is no stranger on this key."""
+        """Whether a health message is of the session that owns the tray in its stage; where there is none, of any
+        producer that is no stranger on this key."""
         owner = self._sessions.owner(health.stage, tray)
         if owner is not None:
             return owner.producer == health.header.producer
         return not self._sessions.is_stranger(key, health.header.producer)
 
     def _heard_of(self, tray: str, health: Health) -> _Heard:
-        """What is remembered of the producer of a health; while it is starting, it begins with this one."""
+        """What is remembered of the producer of a health message; while it is starting, it begins with this one."""
         of_tray, producer = self._heard.setdefault(tray, {}), health.header.producer
         if producer not in of_tray:
             of_tray[producer] = _Heard(health.t_ns)

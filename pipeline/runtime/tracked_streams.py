@@ -40,7 +40,7 @@ class Waiting:
     """A stream waits for the missing messages before number `until`.
 
     Attributes:
-        shown_by: the message that showed the gap; None: a health did.
+        shown_by: the message that showed the gap; None: a health message did.
         since_s: when the first of these messages were asked for, or the last ones came, monotonic.
         held: what has arrived since.
     """

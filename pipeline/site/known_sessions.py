@@ -78,7 +78,7 @@ class KnownSessions:
         return producer in self._known
 
     def is_launched(self, health: Health) -> bool:
-        """Whether this process has started the session of a health."""
+        """Whether this process has started the session of a health message."""
         session = self._known.get(health.header.producer)
         return session is not None and (session.name, session.process_id) in self._launched
 
@@ -99,8 +99,8 @@ class KnownSessions:
         return self._sessions.is_stranger(key, producer)
 
     def is_health_of_stage(self, health: Health) -> bool:
-        """Whether a health is that of a session of its stage. Where no session has shown a token, it may come from
-        whatever is on the bus under the name of the stage."""
+        """Whether a health message is that of a session of its stage. Where no session has shown a token, it may come
+        from whatever is on the bus under the name of the stage."""
         name = (health.stage, health.instance)
         session = self._known.get(health.header.producer)
         if session is not None:

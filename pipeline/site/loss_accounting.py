@@ -10,11 +10,11 @@ sessions.
 * Last: once the stage has stopped, the last that is known to be published, if its producer had ended by then: the stage
   has heard the producer's successor, or the launcher stopped the producer first. Otherwise the last that it had.
 
-Where healths do not say which messages a session lacked, the count is an upper bound: what a killed session received
-after its last health, or had not saved by then, counts as lost unless another had it; so does what a session missed
-after its first message, up to as many as there are numbers that no earlier one covers. Only what arrived at a stage
-that had to end may count too low: it is among what the stage never had, or comes on top, and the larger of the two
-counts.
+Where health messages do not say which messages a session lacked, the count is an upper bound: what a killed session
+received after its last health, or had not saved by then, counts as lost unless another had it; so does what a session
+missed after its first message, up to as many as there are numbers that no earlier one covers. Only what arrived at a
+stage that had to end may count too low: it is among what the stage never had, or comes on top, and the larger of the
+two counts.
 """
 
 from __future__ import annotations

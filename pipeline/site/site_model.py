@@ -35,8 +35,8 @@ from fantwin.scoring.calibration.observed_rate import ObservedRate, declared_per
 from fantwin.scoring.wear.recorded_wear import wear_in, wear_rows
 
 SILENT_AFTER_S = 5.0
-"""a tray without a score for so long is silent; and so is a stage without a health, which may have left the bus. A fan
-is judged now if it was this recently"""
+"""a tray without a score for so long is silent; and so is a stage without a health message, which may have left the
+bus. A fan is judged now if it was this recently"""
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,7 +24,7 @@ from fantwin.schemas.units import NS_PER_S
 START_LIMIT_S = 60.0
 """silence while a stage starts: it may load large libraries and ask others for what it missed"""
 SILENT_AFTER_S = 5.0
-"""without a health, which every stage sends once a second"""
+"""without a health message, which every stage sends once a second"""
 STARVED_AFTER_S = 5.0
 LATE_AFTER_S = 5.0
 WHY_SILENT = "it hangs, is blocked or gets no processor time"
@@ -62,12 +62,12 @@ class StageView:
 
     @property
     def rate_in_hz(self) -> float:
-        """Messages received a second between the last two healths."""
+        """Messages received a second between the last two health messages."""
         return self._rate(sum(i.received for i in self.health.inputs), lambda h: sum(i.received for i in h.inputs))
 
     @property
     def rate_out_hz(self) -> float:
-        """Messages published a second between the last two healths."""
+        """Messages published a second between the last two health messages."""
         return self._rate(sum(o.published for o in self.health.outputs), lambda h: sum(o.published for o in h.outputs))
 
     def _rate(self, now: int, count: Callable[[Health], int]) -> float:

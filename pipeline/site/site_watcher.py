@@ -27,7 +27,8 @@ from fantwin.schemas.topics import alive_key, health_key, sessions_key, tray_key
 from fantwin.scoring.alarms.current_alarms import CurrentAlarm
 
 MOST_WATCHED_SESSIONS = 1000
-"""so many last healths are kept; of more, those heard longest ago are forgotten, those of launched sessions last"""
+"""number of last health messages that are kept; of more, those heard longest ago are forgotten, those of launched
+sessions last"""
 SAMPLED_S = 0.1
 """time between two scores of a tray that a command looks at: a fast line sends hundreds a second"""
 MOST_UNKNOWN_SESSIONS = 64

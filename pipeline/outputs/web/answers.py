@@ -100,7 +100,7 @@ class ExplainedCause(Cause):
 
 
 class Alarm(BaseModel):
-    """A current alarm. probability: of the likeliest cause. now: what its fan does now, in words."""
+    """A current alarm. probability: of the most probable cause. now: what its fan does now, in words."""
 
     tray: str
     fan: int

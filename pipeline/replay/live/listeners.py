@@ -181,7 +181,8 @@ class Listeners:
         return {name: count for name, count in lost.items() if count > 0}
 
     def _behind(self, producer: str, published: Mapping[str, int], old: Mapping[str, int]) -> list[str]:
-        """The stages without a health newer than the `old` one that shows that they received all that was sent."""
+        """The stages without a health message newer than the `old` one that shows that they received all that was
+        sent."""
         healths = [view.health for view in self._views()]
         sent = {(key, producer): count for key, count in published.items()}
         for each in healths:
