@@ -10,9 +10,10 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, settings
 
+from tests.support.made_once import MadeOnce, TrainedOnce
 from tests.support.ports import free_port
+from tests.support.site_users import quick_hasher
 from tests.support.small_disk import mount, unmount
-from tests.support.trained_once import TrainedOnce
 
 # The same examples on every run, and no judgement of how long one takes: machines differ.
 settings.register_profile("house", derandomize=True, deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -76,12 +77,30 @@ def endpoint() -> str:
 
 
 @pytest.fixture(scope="session")
-def trained_once(tmp_path_factory: pytest.TempPathFactory) -> TrainedOnce:
-    """Twins that are trained once in a session, whichever worker needs them first."""
+def made_once(tmp_path_factory: pytest.TempPathFactory) -> MadeOnce:
     own = tmp_path_factory.getbasetemp()
-    folder = (own.parent if "PYTEST_XDIST_WORKER" in os.environ else own) / "trained-once"
-    folder.mkdir(exist_ok=True)
-    return TrainedOnce(folder)
+    place = (own.parent if "PYTEST_XDIST_WORKER" in os.environ else own) / "made-once"
+    place.mkdir(exist_ok=True)
+    return MadeOnce(place)
+
+
+@pytest.fixture(scope="session")
+def trained_once(made_once: MadeOnce) -> TrainedOnce:
+    return TrainedOnce(made_once)
+
+
+@pytest.fixture(scope="module")
+def quickly_hashed() -> Iterator[None]:
+    """A hash of a password takes 64 MB and a tenth of a second, which the tests that ask for this do not look at."""
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr("fantwin.pipeline.site.users.hasher", quick_hasher)
+        yield
+
+
+@pytest.fixture
+def never_silent(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What was fed is the state of now, whatever time passes."""
+    monkeypatch.setattr("fantwin.pipeline.site.site_model.SILENT_AFTER_S", 1e9)
 
 
 @pytest.fixture

@@ -16,7 +16,7 @@ from fantwin.twin.finishing import TrainedTwin
 from fantwin.twin.kinds import KINDS
 from fantwin.twin.runs import Array
 from tests.support import fan_data
-from tests.support.trained_once import TrainedOnce
+from tests.support.made_once import TrainedOnce
 
 MOST_ITERATIONS = 2
 RUN = fan_data.rough_run(1, 6.0, fans=2)

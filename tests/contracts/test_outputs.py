@@ -14,13 +14,13 @@ import pytest
 from fantwin.schemas.enums import FanState, Severity, Transition
 from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Alarm
-from tests.stages.test_gateway import NOW_NS, alarm, score
 from tests.support.outputs import OUTPUTS, Output
 from tests.support.running_chain import eventually
 from tests.support.running_core import TRAY
 from tests.support.score_data import one_sample
-from tests.support.site_users import quickly_hashed  # noqa: F401  a fixture
+from tests.support.site_messages import NOW_NS, alarm, score
 
+pytestmark = pytest.mark.usefixtures("quickly_hashed")
 SEEN = {"acknowledged": True, "confirmed": True, "operator_name": "ann"}
 SHELVED = {"shelved_until_t_ns": NOW_NS + 10**13}
 _numbers = itertools.count(100)

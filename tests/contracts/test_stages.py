@@ -47,7 +47,7 @@ from fantwin.stages.mqtt import MqttCore
 from fantwin.stages.notifier import NotifierCore
 from fantwin.stages.resampler import ResamplerConfig, ResamplerCore
 from fantwin.stages.twin_integrator import TwinIntegratorConfig, TwinIntegratorCore
-from tests.stages.test_viewer import FakeSink
+from tests.support.drawn_views import FakeSink
 from tests.support.message_strategies import any_message
 from tests.support.scored_blocks import core_of, prediction_of
 from tests.support.twin_files import write_twin

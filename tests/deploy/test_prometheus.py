@@ -20,12 +20,12 @@ from fantwin.schemas.fields import columns
 from fantwin.schemas.header import Header
 from fantwin.schemas.health import Health, Input, LatencyBucket, Output
 from fantwin.schemas.messages import Score
-from tests.stages.test_gateway import alarm, score
 from tests.support.grafana_schema import problems_of
 from tests.support.running_chain import eventually
 from tests.support.running_core import FANS, SITE, TRAY
 from tests.support.running_gateway import Client, RunningGateway
 from tests.support.running_prometheus import DEPLOY, RunningPrometheus, needs_prometheus
+from tests.support.site_messages import alarm, score
 
 RULES = DEPLOY / "prometheus" / "fantwin.rules.yml"
 RULE_TESTS = RULES.with_name("fantwin.rules.test.yml")

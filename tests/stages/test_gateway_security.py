@@ -20,12 +20,13 @@ from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.outputs.web.shared_answer import SharedAnswer
 from fantwin.pipeline.site import login_failures
 from fantwin.pipeline.site.users import UserRole
-from tests.stages.test_gateway import SCRIPT, alarm, granted, score
 from tests.support.running_core import TRAY
 from tests.support.running_gateway import Client, RunningGateway
 from tests.support.site_certificates import SiteCertificates
-from tests.support.site_users import PASSWORD, make_users, quickly_hashed  # noqa: F401  a fixture
+from tests.support.site_messages import SCRIPT, alarm, granted, score
+from tests.support.site_users import PASSWORD, make_users
 
+pytestmark = pytest.mark.usefixtures("quickly_hashed")
 ACT, ASKED = f"/api/v1/fans/{TRAY}/2/requests", {"action": "acknowledge"}
 OTHER_PASSWORD = "another horse battery"
 

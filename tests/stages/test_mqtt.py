@@ -21,14 +21,14 @@ from fantwin.pipeline.sources.mqtt.config import MqttConfig as SourceConfig
 from fantwin.schemas.enums import Action, FanState, Transition
 from fantwin.schemas.messages import Alarm, Request
 from fantwin.stages.mqtt import build, check
-from tests.stages.test_gateway import alarm, granted, never_silent, score  # noqa: F401  a fixture
 from tests.support.mosquitto import Listener, Mosquitto, needs_mosquitto, retained_by
 from tests.support.ports import free_port
 from tests.support.running_chain import eventually
 from tests.support.running_core import FANS, SITE, TRAY
 from tests.support.running_mqtt import ROOT, RunningMqtt
+from tests.support.site_messages import alarm, granted, score
 
-pytestmark = needs_mosquitto
+pytestmark = [needs_mosquitto, pytest.mark.usefixtures("never_silent")]
 FAN = f"{ROOT}/{TRAY}/2"
 ACCEPTING: dict[str, Any] = {"accept": ("acknowledge", "shelve")}
 

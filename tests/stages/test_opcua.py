@@ -25,11 +25,12 @@ from fantwin.pipeline.site.users import UserRole
 from fantwin.schemas.enums import Transition
 from fantwin.schemas.messages import Alarm, Request
 from fantwin.stages.opcua import check
-from tests.stages.test_gateway import alarm, score
 from tests.support.running_core import SITE, TRAY
 from tests.support.running_opcua import RunningOpcua
-from tests.support.site_users import OPERATOR, PASSWORD, VIEWER, make_users, quickly_hashed  # noqa: F401  a fixture
+from tests.support.site_messages import alarm, score
+from tests.support.site_users import OPERATOR, PASSWORD, VIEWER, make_users
 
+pytestmark = pytest.mark.usefixtures("quickly_hashed")
 ALARM = f"ns=2;s={TRAY}/2/Alarm"
 SUPPRESS = ua.NodeId(ua.ObjectIds.AlarmConditionType_Suppress)
 

@@ -11,13 +11,13 @@ import pytest
 from fantwin.schemas.enums import Action, FanState, Transition
 from fantwin.schemas.messages import Alarm, Request
 from fantwin.scoring.alarms.alarm_state import UNTIL_IT_CLEARS_T_NS
-from tests.stages.test_gateway import NOW_NS, alarm, score
 from tests.support.node_opcua import PACKAGE, VERSION, WHAT, NodeOpcua
 from tests.support.node_packages import node_modules
 from tests.support.running_chain import eventually
 from tests.support.running_core import SITE, TRAY
 from tests.support.running_opcua import RunningOpcua
-from tests.support.site_users import OPERATOR, PASSWORD, VIEWER, quickly_hashed  # noqa: F401  a fixture
+from tests.support.site_messages import NOW_NS, alarm, score
+from tests.support.site_users import OPERATOR, PASSWORD, VIEWER
 
 FAN = f"ns=2;s={TRAY}/2"
 ALARM = f"{FAN}/Alarm"
@@ -77,12 +77,6 @@ def opcua(_installed: Path, tmp_path_factory: pytest.TempPathFactory, scorer: Sc
         yield running
     finally:
         running.close()
-
-
-@pytest.fixture
-def never_silent(monkeypatch: pytest.MonkeyPatch) -> None:
-    """One score is enough, also on a slow host."""
-    monkeypatch.setattr("fantwin.pipeline.site.site_model.SILENT_AFTER_S", 600.0)
 
 
 @pytest.fixture(scope="module")

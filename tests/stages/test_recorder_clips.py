@@ -19,9 +19,9 @@ from fantwin.pipeline.recordings.recorder_config import RecorderConfig
 from fantwin.schemas.enums import Severity, Transition
 from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Alarm
-from tests.stages.test_recorder import NOW_NS, SECOND_NS, Disk, envelope, old_parts
 from tests.support.clipped_recordings import record
 from tests.support.offline_replay import recorded, recording_of
+from tests.support.stub_disk import NOW_NS, SECOND_NS, Disk, envelope, old_parts
 
 FREE = 1 << 40
 

@@ -15,7 +15,7 @@ from fantwin.pipeline.recordings.recorder_config import RecorderConfig
 from fantwin.pipeline.recordings.sequence_ledger import SequenceLedger
 from fantwin.pipeline.recordings.stored_recordings import StoredPart
 from fantwin.stages.recorder import STAGE
-from tests.stages.test_recorder import NOW_NS, SECOND_NS, Disk, context, envelope, old_parts, raw, recorder
+from tests.support.stub_disk import NOW_NS, SECOND_NS, Disk, context, envelope, old_parts, raw, recorder
 
 
 def ten_days_of_parts() -> list[StoredPart]:

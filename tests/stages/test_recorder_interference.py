@@ -14,7 +14,7 @@ from fantwin.pipeline.recordings.contents import contents_of
 from fantwin.pipeline.recordings.reading import read_metadata, read_recording
 from fantwin.pipeline.recordings.recorder import Recorder
 from fantwin.stages.recorder import STAGE
-from tests.stages.test_recorder import RAW_KEY, SECOND_NS, context, envelope, raw
+from tests.support.stub_disk import RAW_KEY, SECOND_NS, context, envelope, raw
 
 START_NS = context(Path()).started_t_ns
 STREAM = (RAW_KEY, "acquisition-1")

@@ -16,7 +16,7 @@ from fantwin.schemas.blocks import join
 from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Grid, Raw
 from fantwin.stages.resampler import ResamplerConfig, ResamplerCore
-from tests.stages.test_resampler import NAN, at, raw
+from tests.support.clockless_device import NAN, at, raw
 
 WHAT_HAPPENS = (
     *("regular", "jitter", "dense", "sparse", "losses"),

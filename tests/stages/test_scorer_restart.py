@@ -23,10 +23,10 @@ from fantwin.schemas.units import NS_PER_S
 from fantwin.scoring.alarms.alarm_flags import is_listed, is_retained, is_silenced
 from fantwin.scoring.alarms.current_alarms import CurrentAlarm
 from fantwin.stages.scorer import ScorerCore
-from tests.stages.test_scorer import eventful_prediction
 from tests.support.scored_blocks import (
     EPOCH_NS,
     core_of,
+    eventful_prediction,
     feed,
     learned,
     prediction_of,

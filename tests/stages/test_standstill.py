@@ -16,7 +16,7 @@ from fantwin.schemas.reference_conditions import ReferenceConditions
 from fantwin.schemas.standstill import Standstill
 from fantwin.scoring.alarms.current_alarms import current_alarm
 from fantwin.stages.scorer import ScorerCore
-from tests.stages.test_twin_integrator import core_of, physical_twin, run_freely
+from tests.support.integrated_twins import core_of, physical_twin, run_freely
 
 pytestmark = pytest.mark.usefixtures("one_reading_starts")
 

@@ -11,7 +11,7 @@ from fantwin.schemas.blocks import cut
 from fantwin.schemas.enums import InvalidReason
 from fantwin.schemas.messages import Grid
 from fantwin.schemas.twin_card import DriveCard
-from tests.stages.test_twin_integrator import (
+from tests.support.integrated_twins import (
     NAN,
     STEP_NS,
     Floats,

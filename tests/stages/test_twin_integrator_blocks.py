@@ -19,7 +19,7 @@ from fantwin.schemas.enums import InvalidReason
 from fantwin.schemas.fields import columns
 from fantwin.schemas.messages import Grid, Prediction
 from fantwin.stages.twin_integrator import TwinIntegratorCore
-from tests.stages.test_twin_integrator import (
+from tests.support.integrated_twins import (
     EPOCH_NS,
     NAN,
     STEP_NS,

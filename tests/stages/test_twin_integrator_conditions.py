@@ -14,7 +14,7 @@ from fantwin.schemas.enums import InvalidReason
 from fantwin.schemas.messages import Array, Grid, Prediction
 from fantwin.schemas.reference_conditions import ReferenceConditions
 from fantwin.schemas.units import NS_PER_S
-from tests.stages.test_twin_integrator import core_of, feed, grid_of, stairs
+from tests.support.integrated_twins import core_of, feed, grid_of, stairs
 from tests.support.twin_files import write_twin
 
 pytestmark = pytest.mark.usefixtures("one_reading_starts")

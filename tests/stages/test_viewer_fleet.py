@@ -12,42 +12,21 @@ import pytest
 from fantwin.pipeline.config.models import TrayConfig
 from fantwin.pipeline.outputs.rerun.fleet_view import FleetView
 from fantwin.pipeline.outputs.rerun.viewer_core import FLUSH_PERIOD_NS, ViewerCore
-from fantwin.pipeline.runtime.stage import Context, StageError
+from fantwin.pipeline.runtime.stage import StageError
 from fantwin.pipeline.site.fleet import Fan
 from fantwin.schemas.messages import Alarm, Score
 from fantwin.stages.viewer import ViewerConfig, build, check, topics_read
-from tests.stages.test_viewer import FakeSink, rows_of, sent, styles_of
+from tests.support.drawn_fleets import TRAYS, context, last_t_ns, messages_of, play
+from tests.support.drawn_views import FakeSink, rows_of, sent, styles_of
 from tests.support.score_data import START_NS, STEP_NS, made_up_tray
 
 HOLD_S, WINDOW_S = 3, 4
-TRAYS = ("tray1", "tray2", "tray3")
 
 
 def fleet_core(sink: FakeSink, *, show: tuple[Fan, ...] = (), for_alarms: int = 2, hold_s: int = HOLD_S) -> ViewerCore:
     trays = [TrayConfig(name=name, fans=3) for name in TRAYS]
     fleet = FleetView(trays, show, for_alarms, hold_s * 1_000_000_000, WINDOW_S * 1_000_000_000)
     return ViewerCore("site", trays, sink, fleet)
-
-
-def messages_of(seconds: float = 20.0, **of_tray: Any) -> list[Score | Alarm]:
-    """Of three trays, in order of time; fan 2 of tray2 is in alarm from 8.5 to 14.5 s. of_tray: for `made_up_tray`."""
-    found: list[Score | Alarm] = []
-    for tray in TRAYS:
-        options = {"faulty_fan": 2 if tray == "tray2" else None, "gap_fan": None}
-        scores, alarms = made_up_tray(tray=tray, seconds=seconds, **{**options, **of_tray})
-        found += [*scores, *alarms]
-    return sorted(found, key=last_t_ns)
-
-
-def last_t_ns(message: Any) -> int:
-    return int(message.t_ns[-1]) if isinstance(message, Score) else message.t_ns
-
-
-def play(core: ViewerCore, messages: list[Score | Alarm]) -> None:
-    """With a tick after each message, at the time of its last sample."""
-    for message in messages:
-        core.step(sent(message))
-        core.tick(last_t_ns(message))
 
 
 def drawn(sink: FakeSink, fan: Fan) -> tuple[np.ndarray, np.ndarray]:
@@ -107,17 +86,6 @@ def test_scores_that_do_not_fit_or_decode_are_counted_and_reported_until_they_do
     core.step(score())
     core.tick(START_NS + 4 * FLUSH_PERIOD_NS)
     assert core.problem() == "" and len(sink.traces) > 0
-
-
-def context(folder: Path, trays: int, fans: int, **config: Any) -> Context:
-    return Context(
-        site="site",
-        trays=tuple(TrayConfig(name=f"tray{number}", fans=fans) for number in range(1, trays + 1)),
-        config=ViewerConfig(**{"file": "view.rrd", "grpc_port": 0, **config}),
-        folder=folder,
-        run_folder=folder,
-        started_t_ns=START_NS,
-    )
 
 
 @pytest.mark.parametrize(("fans", "is_fleet"), [(32, False), (33, True)])

@@ -2,10 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+from fantwin.pipeline.prediction.tray_twin import load_tray_twin
+from fantwin.pipeline.recordings.writing import RecordingWriter
+from fantwin.pipeline.replay.offline.calibration_of_twin import calibration_in
+from fantwin.schemas.enums import Action, Severity, Transition
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Alarm
+from fantwin.schemas.topics import tray_key
 from fantwin.schemas.units import NS_PER_S
+from fantwin.scoring.alarms.alarm_state import GIVES_FEEDBACK
+from fantwin.scoring.calibration.calibration import Calibration
 from fantwin.twin.evaluation.resampling import thinned
+from fantwin.twin.export.card_entries import with_card_entries
 from fantwin.twin.runs import Run
 from tests.support.fan_data import published_run
 from tests.support.written_recordings import write_run
@@ -40,3 +52,39 @@ def recorded(
     if has_fault:
         speed_rad_s[(run.t_s >= fault_s[0]) & (run.t_s < fault_s[1]), -1] *= 0.4
     return write_run(path, Run(run.name, run.t_s + start_ns(seed) / NS_PER_S, run.command, speed_rad_s))
+
+
+FAULTY_NS = start_ns(5)
+
+
+def with_alarm(path: Path, action: Action | None) -> Path:
+    """A recording that has nothing but the alarm of the fault, and what an operator says of it."""
+    onset_t_ns, cleared_t_ns = (FAULTY_NS + second * NS_PER_S for second in FAULT_S)
+    state: dict[str, Any] = {"fan": 1, "severity": Severity.ALARM, "onset_t_ns": onset_t_ns, "message": "slow"}
+    state |= {"residual_rad_s": 1.0, "residual_std_rad_s": 1.0}
+    alarms = [
+        Alarm(**state, active=True, t_ns=onset_t_ns + NS_PER_S, transition=Transition.RAISED),
+        Alarm(**state, active=False, t_ns=cleared_t_ns + NS_PER_S, transition=Transition.CLEARED),
+    ]
+    if action is not None:
+        said = {"transition": GIVES_FEEDBACK[action][0], "marked_onset_t_ns": onset_t_ns, "operator_name": "ann"}
+        alarms.append(Alarm(**state, **said, active=False, t_ns=cleared_t_ns + 60 * NS_PER_S, comment="door"))
+    path.unlink(missing_ok=True)
+    with RecordingWriter(path, {"site": "plant", "trays": "tray1"}) as writer:
+        for number, alarm in enumerate(alarms):
+            message = replace(alarm, header=Header("scorer-1", number, "tray1"))
+            writer.add_message(tray_key("plant", "tray1", "alarm"), message, message.t_ns)
+    return path
+
+
+def calibration_of(twin: Path) -> Calibration:
+    calibration = calibration_in(twin, load_tray_twin(twin))
+    assert calibration
+    return calibration
+
+
+def changed(path: Path, calibrated: Path, **changes: Any) -> Path:
+    """The twin with another calibration."""
+    entry = calibration_of(calibrated).model_dump(mode="json") | changes
+    path.write_bytes(with_card_entries(calibrated.read_bytes(), {"calibration": entry}))
+    return path

@@ -15,7 +15,7 @@ from fantwin.schemas.enums import FanState
 from fantwin.schemas.messages import Message, NewTwin, Raw, Score
 from fantwin.schemas.units import NS_PER_S
 from fantwin.stages.learner import LearnerConfig, LearnerCore
-from tests.pipeline.learning.test_versions import version
+from tests.support.learned_versions import version
 
 START_NS = 1_800_000_000 * NS_PER_S
 TRAY = TrayConfig.model_validate({"name": "tray1", "fans": 1})

@@ -19,7 +19,7 @@ from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.messages import Message, Score
 from fantwin.schemas.topics import tray_key
 from fantwin.schemas.units import NS_PER_S
-from tests.stages.test_viewer import FakeSink
+from tests.support.drawn_views import FakeSink
 from tests.support.message_receivers import HttpReceiver
 from tests.support.mosquitto import Mosquitto, retained_by
 from tests.support.notified_alarms import START_NS, notifier_core, secret

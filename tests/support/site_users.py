@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
-import pytest
 from argon2 import PasswordHasher
 
 from fantwin.pipeline.site.users import User, UserRole, write_users
@@ -17,14 +15,6 @@ ROLES = {OPERATOR: UserRole.OPERATOR, VIEWER: UserRole.VIEWER}
 
 def quick_hasher() -> PasswordHasher:
     return PasswordHasher(time_cost=1, memory_cost=8, parallelism=1)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def quickly_hashed() -> Iterator[None]:
-    """For the modules that import it: a hash that takes 64 MB and a tenth of a second is not what they test."""
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setattr("fantwin.pipeline.site.users.hasher", quick_hasher)
-        yield
 
 
 def make_users(path: Path, password: str = PASSWORD, **roles: UserRole) -> Path:

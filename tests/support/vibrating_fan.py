@@ -32,7 +32,7 @@ from fantwin.stages.acquisition import AcquisitionConfig
 from fantwin.stages.resampler import ResamplerConfig, ResamplerCore
 from fantwin.stages.twin_integrator import TwinIntegratorConfig, TwinIntegratorCore
 from fantwin.stages.viewer import build
-from tests.stages.test_viewer import context, rows_of, sent
+from tests.support.drawn_views import context, rows_of, sent
 from tests.support.fantwin_command import fantwin
 from tests.support.running_core import FANS, SITE, TRAY
 from tests.support.running_gateway import Client, RunningGateway

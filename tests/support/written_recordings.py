@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from mcap.reader import make_reader
+from mcap.stream_reader import StreamReader
+from mcap_protobuf.decoder import DecoderFactory
 
+from fantwin.pipeline.recordings.parts import RecordingParts
 from fantwin.pipeline.recordings.reading import read_recording
+from fantwin.pipeline.recordings.sequence_ledger import SequenceLedger
 from fantwin.pipeline.recordings.writing import RecordingWriter
 from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Alarm, Array, Raw
@@ -70,3 +76,57 @@ def write_run(path: Path, run: Run, unit: str = "rad/s") -> Path:
 
 def sequences(path: Path) -> list[int]:
     return [envelope.message.header.sequence for envelope in read_recording(path, topics=("raw",))]
+
+
+STREAM = (RAW_KEY, "acquisition-1")
+
+
+def small(path: Path) -> Path:
+    """A recording of many small chunks, an attachment and two topics."""
+    with RecordingWriter(path, {"site": "plant"}, {"tray1.onnx": os.urandom(300)}) as writer:
+        for sequence in range(40):
+            writer.add_message(RAW_KEY, raw(sequence, samples=2), 1000 + sequence)
+            if sequence == 20:
+                writer.add_message(ALARM_KEY, alarm(0), 1000 + sequence)
+            if sequence % 5 == 4:
+                writer.flush()
+    return path
+
+
+def chunk_ends(path: Path) -> list[tuple[int, int]]:
+    """The end of each chunk, and the number of messages up to it."""
+    with path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+        assert summary is not None
+        raw_only = [5 * (number + 1) + (number >= 4) for number in range(len(summary.chunk_indexes))]
+        ends = [chunk.chunk_start_offset + chunk.chunk_length for chunk in summary.chunk_indexes]
+        return list(zip(ends, raw_only, strict=True))
+
+
+def read_by_others(path: Path) -> list[tuple[str, int]]:
+    """All messages, read by the reader of the library, which must find an index and correct checksums."""
+    with path.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
+        summary = reader.get_summary()
+        assert summary is not None and summary.statistics is not None
+        found = [(channel.topic, message.sequence) for _, channel, message in reader.iter_messages()]
+        assert summary.statistics.message_count == len(found)
+        assert summary.statistics.chunk_count == len(summary.chunk_indexes)
+        assert summary.statistics.attachment_count == len(list(reader.iter_attachments()))
+        assert summary.statistics.metadata_count == len(list(reader.iter_metadata()))
+    with path.open("rb") as file:  # and one after the other, without the index
+        assert len([r for r in StreamReader(file, validate_crcs=True).records if type(r).__name__ == "Message"]) == len(
+            found
+        )
+    return found
+
+
+def parts_in(folder: Path, session: str = "s1") -> RecordingParts:
+    return RecordingParts(folder / "r.mcap", {"site": "plant"}, {"configuration.toml": b"site = 'plant'"}, session)
+
+
+def part(parts_in: RecordingParts, numbers=(), ledger: SequenceLedger | None = None) -> RecordingWriter:
+    writer = parts_in.begin(5_000_000_000, ledger or SequenceLedger(parts_in.before), {})
+    for sequence in numbers:
+        writer.add_message(RAW_KEY, raw(sequence), sequence)
+    return writer

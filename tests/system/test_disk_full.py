@@ -14,8 +14,8 @@ from fantwin.pipeline.recordings.contents import contents_of
 from fantwin.pipeline.recordings.reading import read_metadata, read_recording
 from fantwin.pipeline.recordings.recorder import Recorder
 from fantwin.stages.recorder import STAGE
-from tests.stages.test_recorder import RAW_KEY, SECOND_NS, context, envelope
 from tests.support.small_disk import SIZE_BYTES, mount, unmount
+from tests.support.stub_disk import RAW_KEY, SECOND_NS, context, envelope
 from tests.support.written_recordings import raw
 
 STREAM = (RAW_KEY, "acquisition-1")

@@ -14,14 +14,14 @@ from playwright.sync_api import Browser, Route, expect
 
 from fantwin.schemas.enums import Action, FanState, Feedback, Transition
 from fantwin.schemas.messages import Alarm, Diagnosis, Request
-from tests.stages.test_gateway import NOW_NS, alarm, golden_twin, marked, score
 from tests.support.page_browser import DEADLINE_MS, inaccessible, opened, running_browser
 from tests.support.running_chain import eventually
 from tests.support.running_core import FANS, TRAY
 from tests.support.running_gateway import RunningGateway
-from tests.support.site_users import PASSWORD, make_users, quickly_hashed  # noqa: F401  a fixture
+from tests.support.site_messages import NOW_NS, alarm, golden_twin, marked, score
+from tests.support.site_users import PASSWORD, make_users
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("quickly_hashed")]
 FAULTY = 2
 CELL = f"{TRAY} fan {FAULTY} alarm"
 FOCUSED = "(document.activeElement.ariaLabel ?? document.activeElement.innerText).replace(/\\s+/g, ' ').trim()"
@@ -49,8 +49,7 @@ class Scorer:
 
 
 @pytest.fixture
-def gateway(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[RunningGateway]:
-    monkeypatch.setattr("fantwin.pipeline.site.site_model.SILENT_AFTER_S", 1e9)
+def gateway(tmp_path: Path, never_silent: None) -> Iterator[RunningGateway]:
     running = RunningGateway(tmp_path, Scorer(), users=make_users(tmp_path / "users.toml"))
     running.feed(score(), score(1.0, state=FanState.ALARM), alarm())
     try:

@@ -13,7 +13,7 @@ from fantwin.twin.fitting.identification import identify
 from fantwin.twin.measurement import measurement_of
 from fantwin.twin.runs import Run
 from tests.support.fan_data import PUBLISHED_PARAMETERS, counted_run
-from tests.support.trained_once import TrainedOnce
+from tests.support.made_once import TrainedOnce
 
 # Not a multiple of the sample period: ages of readings then take all values, as between clocks that drift.
 TACHO = Tacho(kind="count", window_s=0.53)

@@ -17,7 +17,7 @@ from fantwin.twin.placing import place_twin
 from fantwin.twin.runs import Array, Run
 from tests.support import fan_data
 from tests.support.fantwin_command import error_of
-from tests.support.trained_once import TrainedOnce
+from tests.support.made_once import TrainedOnce
 
 OWN_S, TEST_S = 20.0, 40.0
 

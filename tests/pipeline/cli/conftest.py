@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import fcntl
-import os
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -13,11 +11,10 @@ import pytest
 from fantwin.pipeline.learning import drops_found
 from tests.support.fantwin_command import fantwin
 from tests.support.healthy_site import EPOCH_NS, HEALTHY_S, OTHER_S, PER_DAY, recorded
+from tests.support.made_once import MadeOnce
 
-MadeOnce = Callable[[str, Callable[[Path], None]], Path]
 
-
-@pytest.fixture(scope="session", autouse=True)
+@pytest.fixture(scope="module", autouse=True)
 def _short_steady_time() -> Iterator[None]:
     """The drops that a twin finds are asked of fans that have run steadily for seconds, not for a minute."""
     with pytest.MonkeyPatch.context() as patch:
@@ -34,27 +31,7 @@ def _restored_signals() -> Iterator[None]:
         signal.signal(number, handler)
 
 
-@pytest.fixture(scope="session")
-def made_once(tmp_path_factory: pytest.TempPathFactory) -> MadeOnce:
-    """The folder of a name, filled by whichever worker needs it first. Tests must not change what is in it."""
-    own = tmp_path_factory.getbasetemp()
-    shared = (own.parent if "PYTEST_XDIST_WORKER" in os.environ else own) / "made-once"
-    shared.mkdir(exist_ok=True)
-
-    def made(name: str, make: Callable[[Path], None]) -> Path:
-        folder, done = shared / name, shared / f"{name}.done"
-        with (shared / f"{name}.lock").open("w") as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX)
-            if not done.exists():
-                folder.mkdir()
-                make(folder)
-                done.touch()
-        return folder
-
-    return made
-
-
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def healthy(made_once: MadeOnce) -> Path:
     """Four recordings of two simulated fans, one of them with a fault of fan 1; their twin; the twin with limits, and
     the JSON of its calibration."""

@@ -17,14 +17,13 @@ from fantwin.pipeline.learning.healthy_evidence import Check
 from fantwin.pipeline.prediction.tray_twin import load_tray_twin
 from fantwin.pipeline.recordings.reading import read_recording
 from fantwin.pipeline.recordings.writing import RecordingWriter
-from fantwin.pipeline.replay.offline.calibration_of_twin import calibration_in, number_text
+from fantwin.pipeline.replay.offline.calibration_of_twin import number_text
 from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Raw
 from fantwin.schemas.topics import tray_key
 from fantwin.scoring.calibration.calibration import Calibration
-from fantwin.twin.export.card_entries import with_card_entries
 from tests.support.fantwin_command import error_of, fantwin
-from tests.support.healthy_site import FANS, HEALTHY_S, OTHER_S, PER_DAY, recorded
+from tests.support.healthy_site import FANS, HEALTHY_S, OTHER_S, PER_DAY, calibration_of, changed, recorded
 from tests.support.twin_files import write_twin
 
 RATE = ("--false-alarms-per-day", PER_DAY)
@@ -40,19 +39,6 @@ def done(*words: object, exit_code: int = 0) -> str:
 
 def card(twin: Path) -> dict[str, Any]:
     return json.loads(load_tray_twin(twin).card_json)
-
-
-def calibration_of(twin: Path) -> Calibration:
-    calibration = calibration_in(twin, load_tray_twin(twin))
-    assert calibration
-    return calibration
-
-
-def changed(path: Path, calibrated: Path, **changes: Any) -> Path:
-    """The twin with another calibration."""
-    entry = calibration_of(calibrated).model_dump(mode="json") | changes
-    path.write_bytes(with_card_entries(calibrated.read_bytes(), {"calibration": entry}))
-    return path
 
 
 def test_the_calibration_is_in_the_card_and_in_one_document_and_the_rest_of_the_twin_is_unchanged(

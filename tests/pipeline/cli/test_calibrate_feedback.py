@@ -16,10 +16,8 @@ from fantwin.pipeline.replay.offline.marked_alarms import alarms_in, marked_alar
 from fantwin.schemas.enums import Action
 from fantwin.schemas.messages import Alarm
 from fantwin.scoring.model.priors import Priors
-from tests.pipeline.cli.test_calibrate_command import changed
-from tests.pipeline.learning.test_healthy_evidence import with_alarm
 from tests.support.fantwin_command import fantwin
-from tests.support.healthy_site import FANS, FAULT_S, OTHER_S, PER_DAY
+from tests.support.healthy_site import FANS, FAULT_S, OTHER_S, PER_DAY, changed, with_alarm
 
 
 def calibrated(folder: Path, action: Action, place: Path) -> tuple[dict[str, Any], list[str]]:

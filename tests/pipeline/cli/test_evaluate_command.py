@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 from fantwin.twin.export.onnx_twin import OnnxTwin
-from tests.pipeline.cli.conftest import MadeOnce
 from tests.support import fan_data
 from tests.support.fantwin_command import fantwin
+from tests.support.made_once import MadeOnce
 from tests.support.written_recordings import write_run
 
 

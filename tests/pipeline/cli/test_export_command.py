@@ -17,11 +17,11 @@ from fantwin.pipeline.recordings.writing import RecordingWriter
 from fantwin.schemas.codec import proto_type
 from fantwin.schemas.enums import FanState
 from fantwin.schemas.messages import ModelCard, Raw
-from tests.pipeline.recordings.test_arrays import alarm, raw, write
 from tests.support.failing_writers import disk_of
 from tests.support.fantwin_command import error_of, fantwin
 from tests.support.made_messages import MESSAGE_TYPES
 from tests.support.score_data import START_NS, made_up_tray
+from tests.support.small_recordings import alarm, raw, write
 
 READING = Path(__file__).parents[3] / "docs" / "how-to" / "read-recordings.md"
 FORMS = ("csv", "parquet")

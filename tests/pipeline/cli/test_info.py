@@ -17,10 +17,9 @@ from fantwin.schemas.header import Header
 from fantwin.schemas.health import Counter, Health, Input, Note
 from fantwin.schemas.messages import ModelCard
 from fantwin.schemas.topics import health_key, tray_key
-from tests.pipeline.recordings.test_parts import part, parts_in
 from tests.support import made_messages
 from tests.support.fantwin_command import error_of, fantwin
-from tests.support.written_recordings import ALARM_KEY, RAW_KEY, alarm, raw, write
+from tests.support.written_recordings import ALARM_KEY, RAW_KEY, alarm, part, parts_in, raw, write
 
 METADATA = {"site": "plant", "trays": "tray1", "fans.tray1": "2", "speed_unit.tray1": "rpm", "made_by": "fantwin"}
 SECOND_NS = 1_000_000_000

@@ -11,8 +11,8 @@ import pytest
 from mcap.opcode import Opcode
 
 from fantwin.pipeline.recordings.records import RecordReader
-from tests.pipeline.cli.conftest import MadeOnce
 from tests.support.fantwin_command import error_of, fantwin
+from tests.support.made_once import MadeOnce
 from tests.support.offline_replay import changed, recorded, recording_of, without_topics
 
 MADE = ("grid", "prediction", "score")

@@ -1,4 +1,4 @@
-"""Commands over many recordings: the same result from one process and from several, bad recordings, and the end."""
+"""Commands over many recordings: the same from one process, several and a cluster; bad recordings, and the end."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ import sys
 import threading
 from collections.abc import Sequence
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -22,15 +24,16 @@ from fantwin.pipeline.cli.in_parallel import RecordingsInParallel
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.learning.training_data import Part, read_recording_data
 from fantwin.twin.evaluation.resampling import thinned
-from tests.pipeline.cli.conftest import MadeOnce
 from tests.support.but_for_times import but_for_times, content_of
 from tests.support.fan_data import published_run
 from tests.support.fantwin_command import error_of, fantwin
+from tests.support.made_once import MadeOnce
 from tests.support.running_chain import DEADLINE_S
 from tests.support.written_recordings import write_run
 
 RECORDINGS = ("a.mcap", "b.mcap", "c.mcap")
 BAD = "bad.mcap"
+needs_distributed = pytest.mark.skipif(not find_spec("distributed"), reason="the extra `remote` is not installed")
 
 
 @pytest.fixture(scope="module")
@@ -165,10 +168,11 @@ def test_in_every_process_linear_algebra_has_one_thread_and_torch_is_not_loaded(
         assert list(pool.map(found, paths, "counting")) == [({1}, False)] * 2
 
 
-def test_a_process_that_is_killed_is_an_error_of_one_line(folder: Path) -> None:
-    def end_itself(_path: Path) -> None:
-        os.kill(os.getpid(), signal.SIGKILL)
+def end_itself(_path: Path) -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
 
+
+def test_a_process_that_is_killed_is_an_error_of_one_line(folder: Path) -> None:
     paths = [folder / name for name in RECORDINGS[:2]]
     with pytest.raises(UserError, match="ended from outside, .* fewer --jobs than 2"):
         list(RecordingsInParallel(jobs=2).map(end_itself, paths, "reading"))
@@ -235,3 +239,42 @@ def test_a_command_that_is_ended_while_it_fetches_a_recording_leaves_no_copy(tmp
         server.shutdown()
     assert (command.returncode, errors) == (130, "interrupted: nothing was identified\n")
     assert [*temporary.iterdir()] == []
+
+
+def cluster_of(workers: int) -> Any:
+    distributed: Any = import_module("distributed")  # slow, and only these tests need it
+    return distributed.LocalCluster(n_workers=workers, threads_per_worker=1, host="127.0.0.1", dashboard_address=None)
+
+
+@needs_distributed
+def test_two_workers_of_a_cluster_give_what_one_process_gives(folder: Path, tmp_path: Path) -> None:
+    with cluster_of(2) as cluster:
+        scheduler = "--jobs", cluster.scheduler_address
+        result = run_all("replay", folder, RECORDINGS, tmp_path / "there", *scheduler)
+        assert is_as_of_one_process(result, tmp_path / "there", folder)
+        bad = folder / "bad.mcap"
+        assert error_of("report", bad, folder / "a.mcap", *scheduler) == error_of("report", bad, "--jobs", 1)
+        result = run_all("report", folder, ("a.mcap", "bad.mcap"), tmp_path / "skipped", *scheduler, "--skip-bad")
+        (skipped,) = json.loads(result.stdout)["skipped"]
+        assert (result.exit_code, skipped["recording"]) == (4, str(bad))
+
+
+@needs_distributed
+def test_a_worker_of_a_cluster_that_is_killed_is_an_error_of_one_line(folder: Path) -> None:
+    dask: Any = import_module("dask")
+    import_module("distributed")  # with its own settings: the end of `set` would take them away if it had made them
+    paths = [folder / name for name in RECORDINGS]
+    with (
+        dask.config.set({"distributed.scheduler.allowed-failures": 0}),
+        cluster_of(1) as cluster,
+        RecordingsInParallel(jobs=cluster.scheduler_address) as pool,
+        pytest.raises(UserError, match=f"ended from outside, .*: see {cluster.scheduler_address}"),
+    ):
+        list(pool.map(end_itself, paths, "reading"))
+
+
+@needs_distributed
+def test_no_scheduler_there_is_one_line(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("fantwin.pipeline.cli.in_parallel.CONNECT_S", 0.2)
+    error = error_of("report", folder / "a.mcap", "--jobs", "tcp://127.0.0.1:1")
+    assert error == "--jobs tcp://127.0.0.1:1: no Dask scheduler answers there"

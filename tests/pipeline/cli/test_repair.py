@@ -13,10 +13,9 @@ from fantwin.pipeline.recordings.records import RecordReader
 from fantwin.pipeline.recordings.writing import RecordingWriter
 from fantwin.schemas.health import Output
 from fantwin.schemas.topics import health_key
-from tests.pipeline.recordings.test_repair import chunk_ends, read_by_others, small
 from tests.support import made_messages
 from tests.support.fantwin_command import fantwin
-from tests.support.written_recordings import RAW_KEY, raw
+from tests.support.written_recordings import RAW_KEY, chunk_ends, raw, read_by_others, small
 
 
 @pytest.fixture

@@ -9,9 +9,9 @@ from fantwin.twin.build import train_twin
 from fantwin.twin.comparison import Contender, best
 from fantwin.twin.errors import TwinError
 from fantwin.twin.kinds import KINDS
-from tests.pipeline.cli.conftest import MadeOnce
 from tests.support.fan_data import rough_run
 from tests.support.fantwin_command import fantwin
+from tests.support.made_once import MadeOnce
 from tests.support.written_recordings import write_run
 
 FIGURES = ("rmse", "max_error", "r2", "one_step_rmse", "coverage_2_sigma")

@@ -14,8 +14,8 @@ from fantwin.pipeline.cli.watch.sweep import range_within
 from fantwin.pipeline.config.models import TrayConfig
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.sources.serial.config import SerialConfig
-from tests.pipeline.learning.test_excitation import FirstOrderFans
 from tests.support.fantwin_command import error_of
+from tests.support.first_order_fans import FirstOrderFans
 from tests.support.running_chain import DEMO
 
 

@@ -12,9 +12,9 @@ from fantwin.pipeline.learning.training_data import TrainingData
 from fantwin.schemas.tacho import INSTANTANEOUS, Tacho
 from fantwin.twin.export.onnx_twin import OnnxTwin
 from fantwin.twin.runs import Run
-from tests.pipeline.cli.conftest import MadeOnce
 from tests.support.fan_data import NOISE_RAD_S, PUBLISHED_PARAMETERS, counted_run, published_run
 from tests.support.fantwin_command import error_of, fantwin
+from tests.support.made_once import MadeOnce
 from tests.support.written_recordings import write_run
 
 RPM = 60 / (2 * np.pi)

@@ -8,8 +8,8 @@ from typing import Any
 
 from fantwin.pipeline.learning.versions import Check, TwinVersions, learning_folder
 from fantwin.schemas.units import NS_PER_S
-from tests.pipeline.learning.test_versions import DAY_NS, version
 from tests.support.fantwin_command import fantwin
+from tests.support.learned_versions import DAY_NS, version
 
 
 def printed(folder: Path) -> dict[str, Any]:

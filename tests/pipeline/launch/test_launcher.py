@@ -24,10 +24,10 @@ from fantwin.pipeline.site.site_watcher import SiteWatcher
 from fantwin.pipeline.timebase.host_clock import VARIABLE as CLOCK_VARIABLE
 from fantwin.schemas.enums import StageStatus
 from fantwin.schemas.topics import alive_key
-from tests.pipeline.site.test_site_watcher import StubBus
 from tests.support.made_messages import health
 from tests.support.running_chain import DEMO, SITE, Chain
 from tests.support.site_certificates import SiteCertificates
+from tests.support.stub_bus import StubBus
 
 
 @pytest.fixture

@@ -15,7 +15,7 @@ from fantwin.schemas.health import Note
 from fantwin.schemas.messages import Alarm
 from fantwin.schemas.units import NS_PER_S
 from fantwin.scoring.alarms.current_alarms import clock, current_alarm
-from tests.pipeline.site.test_site_state import CONSUMER, view
+from tests.support.stage_views import CONSUMER, view
 
 IDS = {"resampler": RunningProcess(11, is_at_work=True), "scorer": RunningProcess(12, is_at_work=True)}
 

@@ -16,8 +16,8 @@ from fantwin.pipeline.learning.versions import Check, TwinVersions
 from fantwin.schemas.messages import Array
 from fantwin.schemas.units import NS_PER_S
 from fantwin.twin.models.physical import PhysicalModel
-from tests.pipeline.learning.test_versions import version
 from tests.support.commanded_fans import GAIN, RATE_HZ, START_S, add_history, moving
+from tests.support.learned_versions import version
 from tests.support.twin_files import write_twin
 
 

@@ -4,44 +4,17 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from fantwin.pipeline.learning.healthy_evidence import marked_running
-from fantwin.pipeline.recordings.writing import RecordingWriter
 from fantwin.pipeline.replay.offline.healthy_runs import in_this_process
 from fantwin.pipeline.replay.offline.marked_alarms import LeftOut, alarms_in, concerning, marked_alarms
 from fantwin.pipeline.site.alarm_history import AlarmHistory
-from fantwin.schemas.enums import Action, Severity, Transition
-from fantwin.schemas.header import Header
-from fantwin.schemas.messages import Alarm
-from fantwin.schemas.topics import tray_key
+from fantwin.schemas.enums import Action
 from fantwin.schemas.units import NS_PER_S
-from fantwin.scoring.alarms.alarm_state import GIVES_FEEDBACK
-from tests.support.healthy_site import FAULT_S, start_ns
+from tests.support.healthy_site import FAULT_S, FAULTY_NS, with_alarm
 
-FAULTY_NS = start_ns(5)
 ONSET_NS = FAULTY_NS + FAULT_S[0] * NS_PER_S
 DAY_NS = 86_400 * NS_PER_S
-
-
-def with_alarm(path: Path, action: Action | None) -> Path:
-    """A recording that has nothing but the alarm of the fault, and what an operator says of it."""
-    onset_t_ns, cleared_t_ns = (FAULTY_NS + second * NS_PER_S for second in FAULT_S)
-    state: dict[str, Any] = {"fan": 1, "severity": Severity.ALARM, "onset_t_ns": onset_t_ns, "message": "slow"}
-    state |= {"residual_rad_s": 1.0, "residual_std_rad_s": 1.0}
-    alarms = [
-        Alarm(**state, active=True, t_ns=onset_t_ns + NS_PER_S, transition=Transition.RAISED),
-        Alarm(**state, active=False, t_ns=cleared_t_ns + NS_PER_S, transition=Transition.CLEARED),
-    ]
-    if action is not None:
-        said = {"transition": GIVES_FEEDBACK[action][0], "marked_onset_t_ns": onset_t_ns, "operator_name": "ann"}
-        alarms.append(Alarm(**state, **said, active=False, t_ns=cleared_t_ns + 60 * NS_PER_S, comment="door"))
-    path.unlink(missing_ok=True)
-    with RecordingWriter(path, {"site": "plant", "trays": "tray1"}) as writer:
-        for number, alarm in enumerate(alarms):
-            message = replace(alarm, header=Header("scorer-1", number, "tray1"))
-            writer.add_message(tray_key("plant", "tray1", "alarm"), message, message.t_ns)
-    return path
 
 
 def test_an_alarm_that_nobody_has_marked_leaves_nothing_out(tmp_path: Path) -> None:

@@ -18,8 +18,8 @@ from fantwin.pipeline.prediction.twin_file import TwinFile
 from fantwin.pipeline.runtime.stage import StageError
 from fantwin.schemas.twin_card import CARD_PROPERTY
 from fantwin.twin.models.physical import PhysicalModel
+from tests.support.random_models import random_narx
 from tests.support.twin_files import PARAMETERS, SIGMA_COMMAND, SIGMA_RAD_S, made_up_balance, write_twin
-from tests.twin.models.test_models import random_narx
 
 
 def _refusal(path: Path, fans: int = 2) -> str:

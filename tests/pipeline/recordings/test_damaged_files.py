@@ -20,8 +20,7 @@ from fantwin.pipeline.recordings.records import RECORD, Record, RecordReader, re
 from fantwin.pipeline.recordings.repair import recover
 from fantwin.pipeline.recordings.scan import scan
 from fantwin.pipeline.recordings.writing import RecordingWriter
-from tests.pipeline.recordings.test_repair import STREAM, read_by_others
-from tests.support.written_recordings import ALARM_KEY, RAW_KEY, alarm, raw
+from tests.support.written_recordings import ALARM_KEY, RAW_KEY, STREAM, alarm, raw, read_by_others
 
 CHUNKS, IN_CHUNK, ALARM_IN = 10, 40, 4
 """chunks of raw messages, messages of each, and the chunk that has an alarm as well"""

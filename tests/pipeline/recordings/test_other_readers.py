@@ -21,8 +21,8 @@ from fantwin.pipeline.recordings.records import ACTIVE_SUFFIX
 from fantwin.pipeline.recordings.writing import RecordingWriter
 from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Alarm, Command, Message, Raw, Score
-from tests.pipeline.recordings.test_arrays import alarm, key_of, raw
 from tests.support.score_data import made_up_tray
+from tests.support.small_recordings import alarm, key_of, raw
 
 METADATA = {"site": "plant", "trays": "tray1", "speed_unit": "rpm"}
 ATTACHMENTS = {"configuration.toml": b"site = 'plant'\n", "tray1.onnx": bytes(range(256)) * 40}

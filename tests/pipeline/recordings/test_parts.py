@@ -16,20 +16,9 @@ from fantwin.pipeline.recordings.records import RecordReader
 from fantwin.pipeline.recordings.sequence_ledger import SequenceLedger
 from fantwin.pipeline.recordings.writing import RecordingWriter
 from tests.support.failing_writers import disk_of, kill_a_recorder
-from tests.support.written_recordings import RAW_KEY, raw, sequences, write
+from tests.support.written_recordings import RAW_KEY, part, parts_in, raw, sequences, write
 
 STREAM = (RAW_KEY, "acquisition-1")
-
-
-def parts_in(folder: Path, session: str = "s1") -> RecordingParts:
-    return RecordingParts(folder / "r.mcap", {"site": "plant"}, {"configuration.toml": b"site = 'plant'"}, session)
-
-
-def part(parts_in: RecordingParts, numbers=(), ledger: SequenceLedger | None = None) -> RecordingWriter:
-    writer = parts_in.begin(5_000_000_000, ledger or SequenceLedger(parts_in.before), {})
-    for sequence in numbers:
-        writer.add_message(RAW_KEY, raw(sequence), sequence)
-    return writer
 
 
 def killed(writer: RecordingWriter) -> None:

@@ -10,9 +10,7 @@ import pytest
 from hypothesis import HealthCheck, assume, example, given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
-from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
-from mcap_protobuf.decoder import DecoderFactory
 
 from fantwin.pipeline.recordings.contents import contents_of
 from fantwin.pipeline.recordings.disk import AtomicAppendFile
@@ -25,50 +23,9 @@ from fantwin.schemas.health import Output
 from fantwin.schemas.topics import health_key
 from tests.support.failing_writers import disk_of
 from tests.support.made_messages import health
-from tests.support.written_recordings import ALARM_KEY, RAW_KEY, alarm, raw
+from tests.support.written_recordings import ALARM_KEY, RAW_KEY, STREAM, chunk_ends, raw, read_by_others, small
 
-STREAM = (RAW_KEY, "acquisition-1")
 NO_CHECK = [HealthCheck.function_scoped_fixture]
-
-
-def small(path: Path) -> Path:
-    """A recording of many small chunks, an attachment and two topics."""
-    with RecordingWriter(path, {"site": "plant"}, {"tray1.onnx": os.urandom(300)}) as writer:
-        for sequence in range(40):
-            writer.add_message(RAW_KEY, raw(sequence, samples=2), 1000 + sequence)
-            if sequence == 20:
-                writer.add_message(ALARM_KEY, alarm(0), 1000 + sequence)
-            if sequence % 5 == 4:
-                writer.flush()
-    return path
-
-
-def chunk_ends(path: Path) -> list[tuple[int, int]]:
-    """The end of each chunk, and the number of messages up to it."""
-    with path.open("rb") as file:
-        summary = make_reader(file).get_summary()
-        assert summary is not None
-        raw_only = [5 * (number + 1) + (number >= 4) for number in range(len(summary.chunk_indexes))]
-        ends = [chunk.chunk_start_offset + chunk.chunk_length for chunk in summary.chunk_indexes]
-        return list(zip(ends, raw_only, strict=True))
-
-
-def read_by_others(path: Path) -> list[tuple[str, int]]:
-    """All messages, read by the reader of the library, which must find an index and correct checksums."""
-    with path.open("rb") as file:
-        reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
-        summary = reader.get_summary()
-        assert summary is not None and summary.statistics is not None
-        found = [(channel.topic, message.sequence) for _, channel, message in reader.iter_messages()]
-        assert summary.statistics.message_count == len(found)
-        assert summary.statistics.chunk_count == len(summary.chunk_indexes)
-        assert summary.statistics.attachment_count == len(list(reader.iter_attachments()))
-        assert summary.statistics.metadata_count == len(list(reader.iter_metadata()))
-    with path.open("rb") as file:  # and one after the other, without the index
-        assert len([r for r in StreamReader(file, validate_crcs=True).records if type(r).__name__ == "Message"]) == len(
-            found
-        )
-    return found
 
 
 @pytest.fixture(scope="module")

@@ -26,9 +26,9 @@ from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Grid, ModelCard, NewTwin, Prediction, Raw
 from fantwin.schemas.topics import alive_key, tray_key
-from tests.pipeline.replay.test_player import FakeTime, Sent
 from tests.support.killed_site import FANS, SITE, TRAY, Site
 from tests.support.offline_replay import recorded
+from tests.support.played_messages import FakeTime, Sent
 from tests.support.replay_data import START_NS, STEP_NS, raw_of
 from tests.support.twin_files import small_hybrid, write_twin
 

@@ -20,7 +20,7 @@ from fantwin.schemas.codec import encode, type_name
 from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Grid, Raw
 from fantwin.schemas.topics import BY_NAME, health_key, tray_key
-from tests.pipeline.runtime.test_sequence_tracker import KEY, health, packet, sequences
+from tests.support.numbered_packets import KEY, health, packet, sequences
 from tests.support.running_chain import eventually
 from tests.support.toy_stage import TRAY_A, Bench, raw, toy
 

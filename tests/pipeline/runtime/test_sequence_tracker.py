@@ -9,31 +9,11 @@ from hypothesis import strategies as st
 from fantwin.pipeline.runtime.sequence_tracker import Found, SequenceTracker
 from fantwin.pipeline.runtime.sessions import Session, Sessions
 from fantwin.pipeline.runtime.tracked_streams import Request
-from fantwin.schemas.enums import Severity, StageStatus
-from fantwin.schemas.envelope import Envelope
+from fantwin.schemas.enums import StageStatus
 from fantwin.schemas.header import Header
-from fantwin.schemas.health import Health, Output
-from fantwin.schemas.messages import Alarm
-from fantwin.schemas.topics import CATCH_UP_MESSAGES, tray_key
-
-KEY = tray_key("site", "tray", "alarm")
-PRODUCER = "scorer-all-p"
-
-
-def packet(sequence: int, producer: str = PRODUCER) -> Envelope:
-    header = Header(producer, sequence, "tray")
-    alarm = Alarm(
-        header=header,
-        fan=0,
-        active=True,
-        severity=Severity.ALARM,
-        t_ns=0,
-        onset_t_ns=0,
-        residual_rad_s=0,
-        residual_std_rad_s=0,
-        message="",
-    )
-    return Envelope(KEY, "alarm", b"", 0, alarm)
+from fantwin.schemas.health import Health
+from fantwin.schemas.topics import CATCH_UP_MESSAGES
+from tests.support.numbered_packets import KEY, PRODUCER, health, packet, sequences
 
 
 class Producer:
@@ -47,22 +27,6 @@ class Producer:
         self.asked.append((request.first, request.last))
         kept = sorted(self.keeps, reverse=True)
         return Found([packet(s, request.producer) for s in kept if request.first <= s <= request.last])
-
-
-def sequences(packets: Iterable[Envelope]) -> list[int]:
-    return [p.message.header.sequence for p in packets]
-
-
-def health(published: int, producer: str = PRODUCER) -> Health:
-    return Health(
-        header=Header(producer, 0, ""),
-        stage="s",
-        instance="all",
-        status=StageStatus.OK,
-        t_ns=0,
-        uptime_s=0,
-        outputs=(Output(key=KEY, published=published),),
-    )
 
 
 def test_a_gap_is_filled_in_order_from_what_the_producer_keeps_and_the_rest_is_missing():

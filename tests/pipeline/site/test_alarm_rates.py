@@ -13,8 +13,8 @@ from fantwin.pipeline.site.alarm_rates import AlarmRates
 from fantwin.pipeline.site.judged_time import JudgedStretch, JudgedTime
 from fantwin.schemas.enums import Transition
 from fantwin.schemas.units import NS_PER_S
-from tests.stages.test_gateway import score
 from tests.support.made_messages import alarm
+from tests.support.site_messages import score
 
 HOUR_NS = 3600 * NS_PER_S
 FIRST = JudgedStretch("tray1", "twin", NS_PER_S, NS_PER_S + HOUR_NS, 8 * HOUR_NS, 0.1)

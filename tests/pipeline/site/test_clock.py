@@ -13,8 +13,8 @@ from fantwin.schemas.enums import Action
 from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.messages import Request
 from fantwin.schemas.topics import tray_key
-from tests.stages.test_gateway import score
 from tests.support.running_core import FANS, SITE, TRAY
+from tests.support.site_messages import score
 
 
 class _Clock:

@@ -21,9 +21,9 @@ from fantwin.schemas.health import Output
 from fantwin.schemas.topics import tray_key
 from fantwin.scoring.alarms.current_alarms import CurrentAlarm
 from fantwin.scoring.alarms.words_now import RETURNING
-from tests.pipeline.site.test_site_watcher import SCORER, STRANGER, StubBus, health
 from tests.support import made_messages
 from tests.support.score_data import one_sample
+from tests.support.stub_bus import SCORER, STRANGER, StubBus, health
 
 FANS = 4
 TRAYS = [TrayConfig(name="a", fans=FANS), TrayConfig(name="b", fans=FANS)]

@@ -10,27 +10,13 @@ from fantwin.pipeline.config.shards import Shard, StageProcess
 from fantwin.pipeline.site.site_state import StageState, Word, stage_states
 from fantwin.pipeline.site.site_watcher import StageView
 from fantwin.schemas.enums import StageStatus
-from fantwin.schemas.health import AwaitedInput, Health, Input, Output
+from fantwin.schemas.health import AwaitedInput
 from fantwin.schemas.units import NS_PER_S
-from tests.support.made_messages import health
+from tests.support.stage_views import CONSUMER, GRID, NOW_NS, PRODUCER, view
 
-GRID = "fantwin/s/tray1/grid"
-NOW_NS = 1_800_000_000 * NS_PER_S
-PRODUCER = health("resampler", t_ns=NOW_NS, uptime_s=100.0, outputs=(Output(key=GRID, published=900),))
-CONSUMER = health(
-    "twin_integrator",
-    t_ns=NOW_NS,
-    uptime_s=100.0,
-    inputs=(Input(key=GRID, producer="resampler-all-1", received=800, missing=0, duplicated=0, next_sequence=800),),
-)
 WAITS = replace(CONSUMER, waiting_for=(AwaitedInput(key=GRID, since_t_ns=NOW_NS - 12 * NS_PER_S),))
 WHOLE = Shard("all", ("tray1", "tray2"))
 ROWS = [StageProcess("resampler", WHOLE), StageProcess("twin_integrator", WHOLE)]
-
-
-def view(health: Health, *, alive: bool = True, age_s: float = 0.5, published_before: int = 0) -> StageView:
-    before = tuple(replace(output, published=published_before) for output in health.outputs)
-    return StageView(health, replace(health, outputs=before, t_ns=health.t_ns - NS_PER_S), alive, age_s)
 
 
 def states(*views: StageView, alive: set[tuple[str, str]] | None = None) -> dict[str, StageState]:

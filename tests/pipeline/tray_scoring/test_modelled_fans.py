@@ -9,7 +9,7 @@ import pytest
 
 from fantwin.pipeline.tray_scoring.healthy_twin import known_of
 from fantwin.schemas.tacho import INSTANTANEOUS, Tacho, tacho_of_each_fan
-from tests.stages.test_twin_integrator import physical_twin
+from tests.support.integrated_twins import physical_twin
 
 COUNTING = (Tacho(kind="count", pulses=2, window_s=1.0),)
 AVERAGING = (Tacho(kind="average", window_s=1.0),)

@@ -19,8 +19,8 @@ from fantwin.twin.finishing import TrainedTwin
 from fantwin.twin.models.hybrid import Hybrid
 from fantwin.twin.models.model import Model
 from tests.support import fan_data
-from tests.support.trained_once import TrainedOnce
-from tests.twin.models.test_models import ALL_MODELS, random_network
+from tests.support.made_once import TrainedOnce
+from tests.support.random_models import ALL_MODELS, random_network
 
 SAMPLES = 2000
 CREATED = datetime(2026, 1, 1, tzinfo=UTC)

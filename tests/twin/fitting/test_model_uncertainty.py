@@ -13,8 +13,8 @@ from fantwin.twin.models.physical import PhysicalModel
 from fantwin.twin.models.recursion import linear_recursion
 from fantwin.twin.runs import Array, Run
 from tests.support import fan_data
-from tests.support.trained_once import TrainedOnce
-from tests.twin.fitting.test_drive_fit import DRIVE, run_of
+from tests.support.driven_fan import DRIVE, run_of
+from tests.support.made_once import TrainedOnce
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ from fantwin.twin.models.hybrid import Hybrid
 from fantwin.twin.models.network import TanhNetwork
 from fantwin.twin.runs import Run
 from tests.support import fan_data
-from tests.support.trained_once import TrainedOnce
+from tests.support.made_once import TrainedOnce
 
 
 @pytest.fixture(scope="module")

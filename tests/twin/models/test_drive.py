@@ -15,7 +15,7 @@ from fantwin.twin.models.hybrid import Hybrid
 from fantwin.twin.models.physical import PhysicalModel
 from fantwin.twin.models.physics import PARAMETER_NAMES
 from tests.support import fan_data
-from tests.twin.models.test_models import random_network
+from tests.support.random_models import random_network
 
 DRIVE = Drive(turning_command=20.0, kick_s=0.6, rest_s=2.0)
 SETTINGS = np.array([[50.0, 5.0, 180.0]])

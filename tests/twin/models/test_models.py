@@ -4,26 +4,11 @@ import numpy as np
 import pytest
 
 from fantwin.twin.models.hybrid import Hybrid
-from fantwin.twin.models.narx import PARAMETER_COUNT, Narx
-from fantwin.twin.models.network import Scaling, TanhNetwork
-from fantwin.twin.models.neural_ode import NeuralOde
-from fantwin.twin.models.physical import PhysicalModel, fitted_unknowns, physical_parameters
+from fantwin.twin.models.physical import fitted_unknowns, physical_parameters
 from tests.support import fan_data
+from tests.support.random_models import random_network
 
-SCALING = Scaling(80.0, 90.0, 50.0, 50.0, 300.0)
 PARAMETERS = np.tile([*fan_data.PUBLISHED_PARAMETERS, 0.02], (2, 1))
-
-
-def random_network(units: int, inputs: tuple[str, ...] = ("speed", "command")) -> TanhNetwork:
-    network = TanhNetwork.zero(units, inputs, SCALING)
-    return network.with_theta(np.random.default_rng(units).normal(scale=0.3, size=network.parameter_count))
-
-
-def random_narx() -> Narx:
-    return Narx(np.random.default_rng(1).normal(scale=0.1, size=PARAMETER_COUNT), SCALING)
-
-
-ALL_MODELS = [PhysicalModel(), NeuralOde(random_network(20)), Hybrid(random_network(10)), random_narx()]
 
 
 @pytest.mark.parametrize("inputs", [("speed", "command"), ("speed",)])

@@ -19,8 +19,8 @@ from fantwin.schemas.enums import FanState
 from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.messages import Score
 from fantwin.schemas.topics import tray_key
-from tests.stages.test_gateway import alarm, score
 from tests.support.running_core import FANS, SITE, TRAY
+from tests.support.site_messages import alarm, score
 
 
 def texts(outbox: Outbox, most: int = 100) -> list[str]:

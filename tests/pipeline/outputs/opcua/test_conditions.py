@@ -18,7 +18,8 @@ from fantwin.schemas.enums import Severity, Transition
 from fantwin.schemas.messages import Alarm
 from fantwin.scoring.alarms.alarm_state import UNTIL_IT_CLEARS_T_NS
 from fantwin.scoring.alarms.current_alarms import current_alarm
-from tests.stages.test_gateway import NOW_NS, TRAY, alarm
+from tests.support.running_core import TRAY
+from tests.support.site_messages import NOW_NS, alarm
 
 
 def after(*alarms: Alarm, now_ns: int = NOW_NS) -> dict[str, Any]:

@@ -18,7 +18,7 @@ from asyncua.server.monitored_item_service import WhereClauseEvaluator
 from fantwin.pipeline.outputs.opcua.event_filter import as_the_library_evaluates
 from fantwin.pipeline.outputs.opcua.events import condition_event, system_event
 from fantwin.scoring.alarms.current_alarms import current_alarm
-from tests.stages.test_gateway import alarm
+from tests.support.site_messages import alarm
 
 NAMESPACE = 2
 Operator = ua.FilterOperator

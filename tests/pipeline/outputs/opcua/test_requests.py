@@ -8,7 +8,7 @@ from fantwin.pipeline.outputs.opcua.requests import FAN_METHODS, METHODS, SHELVI
 from fantwin.schemas.enums import Action, Severity, Transition
 from fantwin.schemas.messages import Alarm
 from fantwin.scoring.alarms.alarm_state import GIVES_FEEDBACK, ConditionSettings, FanCondition
-from tests.stages.test_gateway import alarm
+from tests.support.site_messages import alarm
 
 NOW_NS = 1_790_000_000_000_000_000
 

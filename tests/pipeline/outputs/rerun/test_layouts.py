@@ -10,11 +10,11 @@ import pytest
 
 from fantwin.pipeline.outputs.rerun.viewer_core import FLUSH_PERIOD_NS
 from fantwin.stages.viewer import build
-from tests.pipeline.outputs.rerun.test_recorded_view import live_view, recorded_view
-from tests.stages.test_viewer import LATER_NS, context, sent
-from tests.stages.test_viewer_fleet import context as fleet_context
-from tests.stages.test_viewer_fleet import messages_of, play
+from tests.support.drawn_fleets import context as fleet_context
+from tests.support.drawn_fleets import messages_of, play
+from tests.support.drawn_views import LATER_NS, context, sent
 from tests.support.ports import free_port
+from tests.support.recorded_views import live_view, recorded_view
 from tests.support.running_chain import eventually
 from tests.support.score_data import made_up_tray
 

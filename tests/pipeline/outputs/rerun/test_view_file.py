@@ -14,7 +14,7 @@ from fantwin.pipeline.outputs.rerun.rerun_sink import RerunSink, ViewOptions
 from fantwin.pipeline.outputs.rerun.view_file import ViewFile
 from fantwin.pipeline.outputs.rerun.viewer_core import ViewerCore
 from fantwin.schemas.units import NS_PER_S
-from tests.stages.test_viewer import sent
+from tests.support.drawn_views import sent
 from tests.support.score_data import START_NS, made_up_tray
 
 

@@ -13,7 +13,7 @@ from PIL import Image
 from fantwin.pipeline.cli.recordings.view import view
 from fantwin.pipeline.errors import UserError
 from fantwin.stages.viewer import build
-from tests.stages.test_viewer import context, play
+from tests.support.drawn_views import context, play
 from tests.support.score_data import made_up_tray
 
 rerun_picture = pytest.importorskip("fantwin.pipeline.outputs.rerun.rerun_picture", exc_type=ModuleNotFoundError)

@@ -1,0 +1,54 @@
+"""Small recordings of raw samples with random numbers, alarms, and messages of any topic."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+
+from fantwin.pipeline.recordings.writing import RecordingWriter
+from fantwin.schemas.enums import Statistic, Transition
+from fantwin.schemas.header import Header
+from fantwin.schemas.health import Health
+from fantwin.schemas.messages import Alarm, Command, Grid, Message, ModelCard, Raw
+from fantwin.schemas.topics import health_key, tray_key
+from tests.support import made_messages
+
+
+def key_of(message: Message, site: str = "plant") -> str:
+    if isinstance(message, Health):
+        return health_key(site, message.stage, message.instance)
+    topic = {Raw: "raw", Grid: "grid", Alarm: "alarm", Command: "command", ModelCard: "twin"}.get(
+        type(message), "score"
+    )
+    return tray_key(site, message.header.tray, topic)
+
+
+def write(path: Path, messages: Iterable[Message], metadata: dict[str, str] | None = None, start: int = 1) -> Path:
+    with RecordingWriter(path, metadata or {"site": "plant"}, overwrite=True) as writer:
+        for number, message in enumerate(messages, start):
+            writer.add_message(key_of(message), message, number)
+    return path
+
+
+def raw(
+    sequence: int, *, samples: int = 10, fans: int = 2, tray: str = "tray1", producer: str = "a", clock: bool = True
+) -> Raw:
+    numbers = np.random.default_rng(sequence)
+    count = np.arange(samples if clock else 0)
+    return Raw(
+        header=Header(producer, sequence, tray),
+        fans=fans,
+        host_receive_t_ns=np.arange(samples) + sequence * samples,
+        device_clock_us=count,
+        device_sequence=count,
+        command=numbers.normal(size=(samples, fans)),
+        speed_rad_s=numbers.normal(size=(samples, fans)),
+    )
+
+
+def alarm(sequence: int) -> Alarm:
+    fields = {"onset_t_ns": 50, "residual_rad_s": 3.5, "message": f"alarm {sequence}", "active": sequence % 2 == 0}
+    fields |= {"transition": Transition.RAISED, "statistic": Statistic.DEVIATION}
+    return made_messages.alarm(sequence, 70 + sequence, sequence=sequence, **fields)
