@@ -43,8 +43,8 @@ def test_what_the_ablation_leaves_out_exists_and_an_unknown_name_is_refused() ->
 
 @pytest.mark.parametrize("name", [one.name for one in importlib.import_module("bench.detection.mechanisms").MECHANISMS])
 def test_without_any_one_part_a_fan_that_loses_a_fifth_of_its_speed_has_an_alarm(name: str) -> None:
-    block = running(2, 60.0, seed=1)
-    slower = np.where(np.arange(600)[:, np.newaxis] < 300, 1.0, [0.8, 1.0]) * block.measured_speed_rad_s
+    block = running(2, 16.0, seed=1)
+    slower = np.where(np.arange(160)[:, np.newaxis] < 80, 1.0, [0.8, 1.0]) * block.measured_speed_rad_s
     fans, bin_ns = made_fans(2), bin_ns_of(block.period_ns, 0.0)
     with importlib.import_module("bench.detection.without").without(name):
         decision = Decision(fans, bin_ns, block.period_ns / NS_PER_S, 86_400.0, Priors())

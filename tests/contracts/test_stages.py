@@ -122,7 +122,7 @@ def all_valid(message: Message) -> Message:
 
 
 @pytest.mark.parametrize("name", CORES)
-@NO_SLOW_CHECK
+@settings(NO_SLOW_CHECK, max_examples=10)
 @given(data=st.data())
 def test_a_core_survives_any_message_of_its_topics_and_makes_the_same_of_the_same(
     name: str, data: st.DataObject, twin: TwinFile

@@ -15,7 +15,7 @@ from fantwin.simulation.tray import SimulatedTray, TraySample, TraySettings
 
 ALL = ("supply_voltage_v", "current_a", "temperature_c")
 STILL = TraySettings(
-    fans=2, rate_hz=20.0, duration_s=30.0, tacho=TachoSettings(noise=NoisyTacho(0.0)), fan_variation=0.0
+    fans=2, rate_hz=20.0, duration_s=12.0, tacho=TachoSettings(noise=NoisyTacho(0.0)), fan_variation=0.0
 )
 
 
@@ -45,7 +45,7 @@ def test_warm_air_drags_less_and_a_fault_of_the_supply_shows_in_its_voltage() ->
     warm = last(replace(STILL, surroundings=Surroundings(temperature_c=60.0, measured=ALL)))
     assert np.all(warm.speed_rad_s > 1.01 * cold.speed_rad_s)
     np.testing.assert_allclose(warm.auxiliary["temperature_c"], 60.0, atol=1.0)
-    sagging = replace(STILL, faults=(Fault("supply", 1, 10.0, size=0.8),), surroundings=Surroundings(measured=ALL))
+    sagging = replace(STILL, faults=(Fault("supply", 1, 5.0, size=0.8),), surroundings=Surroundings(measured=ALL))
     np.testing.assert_allclose(last(sagging).auxiliary["supply_voltage_v"], [12.0, 9.6], atol=0.2)
 
 

@@ -15,10 +15,11 @@ from tests.support.made_once import MadeOnce
 
 
 @pytest.fixture(scope="module", autouse=True)
-def _short_steady_time() -> Iterator[None]:
-    """The drops that a twin finds are asked of fans that have run steadily for seconds, not for a minute."""
+def _drops_of_seconds() -> Iterator[None]:
+    """The drops that a twin finds are asked of fans that run for seconds before and after them, not for minutes."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(drops_found, "STEADY_S", 5.0)
+        patch.setattr(drops_found, "WITHIN_S", (1.0, 2.0, 4.0))
         yield
 
 

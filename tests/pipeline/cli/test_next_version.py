@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from fantwin.pipeline.errors import UserError
-from fantwin.pipeline.learning import next_version
+from fantwin.pipeline.learning import drops_found, next_version
 from fantwin.pipeline.learning.fitting import TrainingSettings, fit_twin
 from fantwin.pipeline.learning.healthy_history import healthy_recordings
 from fantwin.pipeline.learning.history_recordings import HistoryRecording
@@ -36,6 +36,7 @@ def _in_minutes() -> Iterator[None]:
         patch.setattr("fantwin.pipeline.learning.versions.REFERENCE_S", 110.0)
         patch.setattr(next_version, "CHECKED_S", 100.0)
         patch.setattr(next_version, "LEAST_CHECKED_S", 60.0)
+        patch.setattr(drops_found, "WITHIN_S", (1.0, 10.0, 60.0))  # drops of two versions are compared
         patch.setattr(next_version, "fit_twin", partial(fit_twin, settings=TrainingSettings("physical")))
         yield
 

@@ -55,6 +55,7 @@ def test_most_fans_show_a_drop_within_the_stated_time_and_a_raised_limit_finds_l
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(module, "STEADY_S", STEADY_S)
+    monkeypatch.setattr(module, "WITHIN_S", (1.0, 10.0, 20.0))  # a third of the minute, for a third of the time
     twin = twin_with(tmp_path / "by-theory.onnx", 1.0)
     by_theory = drops_found(twin, RAD_S_PER_UNIT)
     raised = drops_found(twin_with(tmp_path / "raised.onnx", 2.0), RAD_S_PER_UNIT)

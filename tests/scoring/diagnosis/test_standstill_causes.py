@@ -9,7 +9,7 @@ from fantwin.scoring.diagnosis.standstill_causes import BEGUN, Fall, Standing, s
 
 AT_ONCE_S, RESTS = 0.03, 0.08
 """time constant of a rotor that is held; share of the speed below which a reading is of a fan at rest"""
-PHASES = np.linspace(0.0, 1.0, 20, endpoint=False)
+PHASES = np.linspace(0.0, 1.0, 8, endpoint=False)
 COASTS_S = np.array([0.8, 1.3, 2.0, 4.0])
 
 
