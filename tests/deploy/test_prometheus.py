@@ -59,7 +59,7 @@ def board_queries() -> list[tuple[str, str]]:
 
 
 def judged(second: float, *unknown: int) -> Score:
-    """Of ALL_FANS, all but these normal."""
+    """A score of ALL_FANS, all but these normal."""
     made = score(second)
     wide = {name: np.tile(getattr(made, name), ALL_FANS // made.fans) for name in columns(Score) if name != "t_ns"}
     state = np.full((len(made.t_ns), ALL_FANS), FanState.NORMAL, np.uint8)
@@ -68,7 +68,7 @@ def judged(second: float, *unknown: int) -> Score:
 
 
 def health(stage: str, messages: int, uptime_s: float, latency_s: float = 0.05, **more: Any) -> Health:
-    """Of a stage whose outputs are all of one age."""
+    """The health of a stage whose outputs are all of one age."""
     latencies = tuple(
         LatencyBucket(upper_s=upper_s, count=messages * (latency_s <= upper_s))
         for upper_s in (0.1, 1.0, 10.0, math.inf)
@@ -134,7 +134,7 @@ def test_every_query_of_the_board_and_every_rule_works_on_what_a_site_sends(gate
     shown: dict[str, list[tuple[dict[str, str], float]]] = {}
 
     def is_shown() -> bool:
-        """Of one moment: where a scrape comes late on a busy machine, nothing is there until the next."""
+        """Samples of one moment: where a scrape comes late on a busy machine, nothing is there until the next."""
         shown.update({title: prometheus.query(query) for title, query in board_queries()})
         return [title for title, found in shown.items() if not found] == EMPTY_WHILE_HEALTHY
 

@@ -68,7 +68,7 @@ def grid_of(core: ResamplerCore, *parts: Iterable[Raw]) -> Grid:
 
 
 def slopes(grid: Grid) -> np.ndarray:
-    """Of the speed between neighbouring valid samples of the grid, rad/s per second."""
+    """Slopes of the speed between neighbouring valid samples of the grid, rad/s per second."""
     both = grid.valid[1:, 0] & grid.valid[:-1, 0]
     return (np.diff(grid.speed_rad_s[:, 0]) / np.diff(grid.t_ns) * NS_PER_S)[both]
 

@@ -51,7 +51,7 @@ class Cutter:
 
 
 def clips_of(recording: Path, free: int = FREE, after_s: float = 1.0) -> AlarmClips:
-    """As a recorder has them, with short clips."""
+    """Clips as a recorder has them, but short."""
     tracker = ClipTracker(listed_clips(recording), before_s=0.5, after_s=after_s, most_bytes=0, settled_s=0.3)
     return AlarmClips(tracker, recording, ClipCutter(recording, lambda: free, min_free_bytes=1000).cut)
 

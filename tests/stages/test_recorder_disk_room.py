@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -121,3 +122,56 @@ def test_a_folder_that_cannot_be_read_is_said_and_is_not_taken_for_empty():
     disk.refuses_to_list = ""
     core.tick(NOW_NS + 10 * SECOND_NS)
     assert core.problem() == "" and core.notes()
+
+
+def test_without_enough_free_space_it_pauses_and_finishes_the_part():
+    disk = Disk()
+    core = recorder(disk, min_free_bytes=50_000_000)
+    for sequence in range(3):
+        core.step(envelope(raw(sequence), "raw", NOW_NS))
+    disk.free = 49_000_000
+    core.tick(NOW_NS + SECOND_NS)
+    assert disk.parts[0].closed == "before the next"
+    assert core.problem().startswith("NOTHING IS RECORDED: 49.0 MB are free on the disk, but 50.0 MB are required")
+    assert core.counters() == {"recorded_raw": 3, "lost_unwritten": 0, "parts": 1, "pauses": 1}
+    disk.free = 50_000_001
+    core.tick(NOW_NS + 2 * SECOND_NS)
+    assert core.problem(), "so little more would be used up at once"
+    disk.free = 60_000_000
+    core.tick(NOW_NS + 3 * SECOND_NS)
+    assert core.problem() == ""
+    assert len(disk.parts) == 2
+
+
+def day_old(disk: Disk, days: float) -> list[StoredPart]:
+    return [StoredPart(NOW_NS - round(days * 86_400) * SECOND_NS, 1, Path(f"{days:g}-days.mcap")), *disk.old]
+
+
+def test_parts_older_than_the_limit_of_days_are_deleted_and_it_is_said(caplog):
+    disk = Disk()
+    for days in (3, 14.1, 20):
+        disk.old = day_old(disk, days)
+    with caplog.at_level(logging.WARNING):
+        core = recorder(disk)
+    assert disk.old_names == ["14.1-days.mcap", "3-days.mcap"], "one at a time, because the clock may be wrong"
+    assert "20-days.mcap, the oldest part, was deleted: older than 14 days (recorder.keep_days)" in caplog.text
+    assert core.counters()["parts_deleted"] == 1
+    assert core.notes()[0] == "recordings: 0 bytes of 1.76 TB, 14.1 of 14 days"
+    for hour in range(1, 13 * 24):
+        core.tick(NOW_NS + hour * 3600 * SECOND_NS)
+    assert disk.old_names == [] and core.counters()["parts_deleted"] == 3
+    assert {round((b.t_ns - a.t_ns) / 86_400e9, 1) for a, b in pairwise(disk.parts)} == {1.0}, "a part a day"
+
+
+def test_the_oldest_parts_are_deleted_when_all_exceed_their_share_of_the_disk(caplog):
+    disk = Disk()
+    disk.disk, disk.freed_by_each, disk.old = 1_000_000_000, 30_000_000, old_parts("a.mcap", "b.mcap", "c.mcap")
+    with caplog.at_level(logging.WARNING):
+        core = recorder(disk)
+    assert disk.old_names == ["b.mcap", "c.mcap"], "with room for the next part, of an eighth"
+    assert "a.mcap, the oldest part, was deleted: recordings and clips would exceed 100 MB" in caplog.text
+    assert core.notes()[0].startswith("recordings: 60 MB of 100 MB")
+    for sequence in range(13):
+        core.step(envelope(raw(sequence, samples=25_000), "raw", NOW_NS))
+        core.tick(NOW_NS + (sequence + 1) * SECOND_NS)
+    assert disk.parts[0].closed and 12_500_000 <= disk.parts[0].size < 14_000_000

@@ -7,7 +7,6 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import accumulate, cycle, pairwise, takewhile
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,23 +14,21 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fantwin.pipeline.config.models import TrayConfig
-from fantwin.pipeline.runtime.stage import Context, StageError
-from fantwin.pipeline.tray_scoring.healthy_twin import FALSE_ALARMS_PER_DAY, ScorerConfig
 from fantwin.schemas.blocks import cut
 from fantwin.schemas.enums import Action, FanState, InvalidReason, Severity, Statistic, Transition
 from fantwin.schemas.fields import columns
 from fantwin.schemas.messages import Alarm, Prediction, Request, Score, ScorerSnapshot
-from fantwin.schemas.units import NS_PER_S, S_PER_DAY
+from fantwin.schemas.units import NS_PER_S
 from fantwin.scoring.unseen_error import UnseenError
-from fantwin.stages.scorer import NOT_CALIBRATED, STAGE, ScorerCore
+from fantwin.stages.scorer import ScorerCore
 from tests.support import scored_blocks
 from tests.support.scored_blocks import (
     EPOCH_NS,
+    SECOND,
     SIGMA,
+    STEP,
     STEP_NS,
-    TWIN_SPEED,
-    Floats,
+    TIME_CONSTANT_S,
     core_of,
     eventful_prediction,
     feed,
@@ -39,26 +36,11 @@ from tests.support.scored_blocks import (
     prediction_of,
     request_of,
     snapshot_of,
+    with_step,
 )
-from tests.support.twin_files import write_twin
 from tests.support.uncertainty_tables import by_speed
 
 NORMAL, SUSPECT, ALARM, RETURNING = FanState.NORMAL, FanState.SUSPECT, FanState.ALARM, FanState.RETURNING
-SECOND = 100
-"""samples"""
-STEP = -0.1 * TWIN_SPEED
-TIME_CONSTANT_S = 0.4
-CALIBRATION = {
-    "false_alarms_per_day": 0.1,
-    "priors": {},
-    "limit_factor": 1.2,
-    "fan_hours": 20.0,
-    "runs": 3,
-    "found": 0,
-    "interval_95": (0.0, 4.4),
-    "data": (),
-    "created": "",
-}
 
 
 learned = partial(scored_blocks.learned, seconds=10.0)
@@ -66,14 +48,6 @@ learned = partial(scored_blocks.learned, seconds=10.0)
 
 def samples(t_ns: int) -> int:
     return (t_ns - EPOCH_NS) // STEP_NS
-
-
-def with_step(seconds: float, at_s: float, fans: int = 1, fan: int = 0, size: float = STEP, seed: int = 1) -> Floats:
-    """Residuals of healthy fans of which one is slower by a step, to which its rotor goes soon."""
-    residual = noise_of(round(seconds * SECOND), fans, seed)
-    since_s = np.arange(len(residual)) / SECOND - at_s
-    residual[:, fan] += size * -np.expm1(-since_s.clip(0.0) / TIME_CONSTANT_S)
-    return residual
 
 
 def transitions(alarms: Iterable[Alarm]) -> list[Transition]:
@@ -216,55 +190,6 @@ def test_a_tacho_that_gives_no_readings_is_found_and_a_silent_line_is_none() -> 
     assert alarms[0].message.startswith("fan 0: the tacho loses readings; a tacho that drops out")
     _, alarms = feed(learned(), [prediction_of(np.zeros(4 * SECOND), nothing)])
     assert alarms == []
-
-
-# the declared rate
-
-
-def context_of(folder: Path, *, config: dict[str, Any] | None = None, **card: Any) -> Context:
-    write_twin(folder / "twin.onnx", **card)
-    tray = TrayConfig(name="tray1", fans=2, twin=Path("twin.onnx"))
-    return Context("plant", (tray,), ScorerConfig.model_validate(config or {}), folder, folder, 0)
-
-
-@pytest.mark.parametrize(
-    ("card", "config", "per_day"),
-    [
-        ({}, {}, FALSE_ALARMS_PER_DAY),
-        ({"calibration": CALIBRATION}, {}, 0.1),
-        ({"calibration": CALIBRATION}, {"false_alarms_per_day": 2.0}, 2.0),
-    ],
-    ids=["nobody says", "the card says", "the configuration says"],
-)
-def test_the_declared_rate_is_that_of_the_configuration_else_of_the_card(
-    tmp_path: Path, card: dict[str, Any], config: dict[str, Any], per_day: float
-) -> None:
-    core = STAGE.build(context_of(tmp_path, config=config, **card)).core
-    assert isinstance(core, ScorerCore)
-    assert core.tray.twin.declared_s == pytest.approx(S_PER_DAY / per_day)
-    assert core.tray.twin.limit_factor == (1.2 if card else 1.0)
-    assert (NOT_CALIBRATED in core.notes()) != bool(card)
-    _, alarms = feed(core, [prediction_of(with_step(6.5, 5.0, fans=2, fan=1, size=3.0 * STEP))])
-    assert {alarm.fan for alarm in alarms} == {1}
-
-
-@pytest.mark.parametrize(
-    ("wrong", "why"),
-    [
-        ({"limit_factor": -1.0}, "calibration cannot be used: limit_factor"),
-        ({"priors": {"wander": 0.0}}, "calibration cannot be used: priors.wander"),
-    ],
-    ids=lambda each: next(iter(each)) if isinstance(each, dict) else "",
-)
-def test_a_calibration_that_cannot_be_used_is_reported_in_one_line(
-    tmp_path: Path, wrong: dict[str, Any], why: str
-) -> None:
-    context = context_of(tmp_path, calibration=CALIBRATION | wrong)
-    with pytest.raises(StageError) as refused:
-        STAGE.build(context)
-    assert why in str(refused.value)
-    assert "fantwin calibrate" in str(refused.value) and "\n" not in str(refused.value)
-    assert STAGE.check(context) == [str(refused.value)]
 
 
 # requests

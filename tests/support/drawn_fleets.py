@@ -17,7 +17,7 @@ TRAYS = ("tray1", "tray2", "tray3")
 
 
 def messages_of(seconds: float = 20.0, **of_tray: Any) -> list[Score | Alarm]:
-    """Of three trays, in order of time; fan 2 of tray2 is in alarm from 8.5 to 14.5 s. of_tray: for `made_up_tray`."""
+    """Messages of three trays by time; fan 2 of tray2 is in alarm from 8.5 to 14.5 s. of_tray: for `made_up_tray`."""
     found: list[Score | Alarm] = []
     for tray in TRAYS:
         options = {"faulty_fan": 2 if tray == "tray2" else None, "gap_fan": None}
@@ -31,7 +31,7 @@ def last_t_ns(message: Any) -> int:
 
 
 def play(core: ViewerCore, messages: list[Score | Alarm]) -> None:
-    """With a tick after each message, at the time of its last sample."""
+    """Hand over messages, each with a tick after it, at the time of its last sample."""
     for message in messages:
         core.step(sent(message))
         core.tick(last_t_ns(message))

@@ -40,7 +40,7 @@ class Output(Protocol):
         ...
 
     def alarms(self) -> dict[int, tuple[bool, bool]]:
-        """By fan with an active alarm: whether it is acknowledged, and whether it is silenced."""
+        """Fans with an active alarm: whether it is acknowledged, and whether it is silenced."""
         ...
 
     def refused(self) -> int:
@@ -67,7 +67,7 @@ class GatewayOutput:
         self.feed, self.close = self.running.feed, self.running.close
 
     def alarms(self) -> dict[int, tuple[bool, bool]]:
-        """Of the fans that the list of alarms and the list of fans agree on."""
+        """Alarms of the fans that the list of alarms and the list of fans agree on."""
         client = Client(self.running)
         found = client.ask("GET", "/api/v1/alarms?all=1")[1]["alarms"]
         groups = [client.ask("GET", f"/api/v1/fans?state={group}")[1]["fans"] for group in ("alarm", "silenced")]

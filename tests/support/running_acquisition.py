@@ -61,7 +61,7 @@ class RunningAcquisition:
         self.healths.append(health)
 
     def counter(self, name: str) -> int:
-        """As of the last health."""
+        """Count as of the last health."""
         counters = self.healths[-1].counters if self.healths else ()
         return next((counter.value for counter in counters if counter.name == name), 0)
 

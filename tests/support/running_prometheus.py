@@ -62,7 +62,7 @@ class RunningPrometheus:
         return found[0][1] if found else None
 
     def alert_states(self) -> dict[str, str]:
-        """By the name of the alert: inactive, pending or firing. Every rule must have been evaluated without error."""
+        """States of alerts by name: inactive, pending or firing. Every rule must have been evaluated without error."""
         rules = [rule for group in self.ask("rules")["groups"] for rule in group["rules"]]
         assert all(not rule.get("lastError") for rule in rules), rules
         return {rule["name"]: rule["state"] for rule in rules if rule["type"] == "alerting" and rule["health"] == "ok"}

@@ -205,3 +205,17 @@ def eventful_prediction(seed: int, samples: int, change_s: float) -> Prediction:
         invalid_reason=np.where(valid, InvalidReason.NONE, levels(*map(float, why))).astype(np.uint8),
         torque_balance_command=np.where(rng.random(shape) < 0.02, np.nan, prediction.torque_balance_command),
     )
+
+
+SECOND = 100
+"""samples"""
+STEP = -0.1 * TWIN_SPEED
+TIME_CONSTANT_S = 0.4
+
+
+def with_step(seconds: float, at_s: float, fans: int = 1, fan: int = 0, size: float = STEP, seed: int = 1) -> Floats:
+    """Residuals of healthy fans of which one is slower by a step, to which its rotor goes soon."""
+    residual = noise_of(round(seconds * SECOND), fans, seed)
+    since_s = np.arange(len(residual)) / SECOND - at_s
+    residual[:, fan] += size * -np.expm1(-since_s.clip(0.0) / TIME_CONSTANT_S)
+    return residual

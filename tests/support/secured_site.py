@@ -64,14 +64,14 @@ class SecuredSite:
 
     @contextmanager
     def running(self) -> Iterator[SecuredSite]:
-        """With the router running; the sessions end with it."""
+        """Run the router; the sessions end with it."""
         with self._stack:
             self._stack.enter_context(open_router(self.endpoint, self.credentials("router"), self.site))
             yield self
 
     @contextmanager
     def sessions_of(self) -> Iterator[SecuredSite]:
-        """With a router that the caller runs; the sessions end with it."""
+        """Use a router that the caller runs; the sessions end with it."""
         with self._stack:
             yield self
 

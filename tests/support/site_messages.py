@@ -21,7 +21,7 @@ SCRIPT = "<script>alert(1)</script>"
 
 
 def score(seconds: float = 0.0, *, state: FanState = FanState.NORMAL, samples: int = 5) -> Score:
-    """Of fans at 1000 rpm, 10 rpm below their twins; `state` is that of fan 2, and fan 3 is not judged."""
+    """A score of fans at 1000 rpm, 10 rpm below their twins; `state` is that of fan 2, and fan 3 is not judged."""
     shape = (samples, FANS)
     states = np.full(shape, FanState.NORMAL, np.uint8)
     states[:, 2], states[:, 3] = state, FanState.UNKNOWN

@@ -69,7 +69,7 @@ class World:
 
 
 def speeds_of(number: int) -> tuple[float, float]:
-    """Of the two fans in rpm."""
+    """Speeds of the two fans in rpm."""
     return 100.0 * number, 100.0 * number + 1.0
 
 

@@ -73,7 +73,7 @@ def raw_of(channel: str) -> list[Any]:
 
 
 def all_messages(folder: Path, channel: str) -> list[Message]:
-    """Of all stages, with headers as the runner gives them."""
+    """Messages of all stages, with headers as the runner gives them."""
     twin = TwinFile.load(write_twin(folder / "twin.onnx", fans=FANS), FANS)
     raws = raw_of(channel)
     grids = through(ResamplerCore(FANS, ResamplerConfig(rate_hz=RATE_HZ)), raws)

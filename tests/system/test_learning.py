@@ -21,7 +21,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.real_time]
 
 @pytest.fixture
 def configuration(tmp_path: Path, endpoint: str) -> Path:
-    """Of a tray with some minutes of healthy history, enough for a first version."""
+    """The file of a tray with some minutes of healthy history, enough for a first version."""
     path = tmp_path / "fantwin.toml"
     path.write_text(
         f'run_folder = "runs"\n[bus]\nendpoint = "{endpoint}"\n[[tray]]\nname = "tray1"\nfans = {FANS}\n'

@@ -77,7 +77,7 @@ def test_only_what_all_runs_know_nearly_throughout_is_used(runs: tuple[Run, Run]
 
 
 def test_a_column_that_the_fans_do_not_follow_is_left_out(runs: tuple[Run, Run]) -> None:
-    """As with a fan that makes up for its supply, or a bad sensor."""
+    """A fan that makes up for its supply, or a bad sensor."""
     volts = runs[0].auxiliary["supply_voltage_v"]
     strange = replace(runs[0], auxiliary={**runs[0].auxiliary, "supply_voltage_v": volts[::-1].copy()})
     left_out = identify_at_reference([strange])

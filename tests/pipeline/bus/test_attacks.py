@@ -142,7 +142,7 @@ def test_rows_8_and_9_a_stage_with_another_role_or_one_that_the_router_does_not_
 
 
 def test_row_11_peers_refuse_one_another_what_a_router_would(tmp_path):
-    """Without a router: each peer has the rules itself."""
+    """Peers without a router have the rules themselves."""
     site = SecuredSite(tmp_path, free_endpoint())
     text = site.config.text.replace('mode = "client"', 'mode = "peer"')
     config = parse_config(text, site.config.path, stages=())

@@ -102,7 +102,7 @@ def test_a_question_to_a_site_whose_router_is_down_is_answered_soon(words, endpo
 
 
 def test_waiting_for_a_router_ends_on_stop(endpoint, started):
-    """In another process, by a signal: it must not be deaf to it."""
+    """Waiting in another process, which must not be deaf to a signal."""
     words = ["up", "--only", "scorer", "-c", DEMO / "demo.toml", "--set", "bus.mode=client", "--set"]
     stage = RunningCommand([*words, f"bus.endpoint={endpoint}"])
     started.append(stage)
@@ -161,7 +161,7 @@ def test_a_second_router_at_the_same_place_is_refused_in_one_line(endpoint):
 
 
 def test_a_router_takes_settings_of_zenoh(endpoint):
-    """As docs/how-to/security.md has it: no message of this topic is longer than 1000 bytes."""
+    """Settings as docs/how-to/security.md has them: no message of this topic is longer than 1000 bytes."""
     rule = {"flows": ["ingress"], "messages": ["put"], "key_exprs": [KEY], "size_limit": 1000}
     received: queue.Queue[bytes] = queue.Queue()
     settings = {"low_pass_filter": [rule]}

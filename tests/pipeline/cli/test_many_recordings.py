@@ -157,7 +157,7 @@ def test_a_recording_that_was_skipped_stays_so_in_all_that_follows(folder: Path)
 
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_in_every_process_linear_algebra_has_one_thread_and_torch_is_not_loaded(folder: Path, jobs: int) -> None:
-    """With more threads it rounds in another order, so results would depend on the number of cores."""
+    """More threads would round in another order, so results would depend on the number of cores."""
 
     def found(path: Path) -> tuple[set[int], bool]:
         read_recording_data(path, Part())

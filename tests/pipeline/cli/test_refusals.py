@@ -55,7 +55,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def contents(folder: Path) -> dict[Path, bytes]:
-    """Of all files but those of the run folder, where a command may leave a lock."""
+    """Contents of all files but those of the run folder, where a command may leave a lock."""
     files = [path for path in folder.rglob("*") if path.is_file()]
     return {path: path.read_bytes() for path in files if "runs" not in path.relative_to(folder).parts}
 

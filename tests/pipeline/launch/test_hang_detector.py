@@ -90,7 +90,7 @@ def test_notices_follow_the_protocol_of_systemd():
 
 
 def test_row_01_a_stage_that_is_built_for_long_says_that_it_is_at_work(monkeypatch):
-    """As when the recorder repairs a large recording, or the router is not there yet."""
+    """The recorder repairs a large recording, or the router is not there yet."""
     notices = Notices()
     monkeypatch.setenv("NOTIFY_SOCKET", notices.address)
     with starting():

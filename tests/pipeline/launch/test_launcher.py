@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from datetime import timedelta
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
@@ -338,22 +339,6 @@ def test_row_18_a_stage_has_ended_in_order_if_it_was_ready_and_its_last_health_i
     assert (outcome.exit_code, lines) == (1 if said else 0, said)
 
 
-class NoSessions:
-    """A watcher that has heard nothing."""
-
-    def stages(self) -> list[Any]:
-        return []
-
-    def losses(self, _launched: object, _reads: object) -> dict[str, int]:
-        return {}
-
-    def refused(self) -> dict[str, dict[str, int]]:
-        return {}
-
-    def unusable(self, _launched: object) -> list[str]:
-        return []
-
-
 @pytest.mark.parametrize(
     ("files", "recorded"),
     [
@@ -367,7 +352,8 @@ def test_it_says_which_files_a_run_recorded_also_one_that_failed(tmp_path, monke
     monkeypatch.setattr(
         "fantwin.pipeline.launch.launcher.join_bus", lambda *_, **__: nullcontext(LateBus("elsewhere", 0.0))
     )
-    monkeypatch.setattr("fantwin.pipeline.launch.launcher.SiteWatcher", lambda *_: NoSessions())
+    heard_nothing = SimpleNamespace(stages=list, losses=lambda *_: {}, refused=dict, unusable=lambda _: [])
+    monkeypatch.setattr("fantwin.pipeline.launch.launcher.SiteWatcher", lambda *_: heard_nothing)
     settings = [f"run_folder='{tmp_path}'", "launcher.stages=['recorder']"]
     launcher = Launcher(load_config(DEMO / "demo.toml", settings), (), lambda _line: None)
 

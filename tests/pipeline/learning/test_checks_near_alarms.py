@@ -27,7 +27,7 @@ class OfferError(Exception):
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """With a reference of two fans, and a check that found nothing."""
+    """A folder with a reference of two fans, and a check that found nothing."""
 
     def offer(_work: object, changed: str) -> None:
         raise OfferError(changed)

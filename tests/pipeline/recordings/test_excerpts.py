@@ -30,7 +30,7 @@ def times_ns() -> Array:
 
 
 def clock_us() -> Array:
-    """Of a device whose clock wraps after half the recording, and is 30 ppm slow."""
+    """A recording of a device whose clock wraps after half the recording, and is 30 ppm slow."""
     since_us = np.arange(SAMPLES) * (1e6 / RATE_HZ) * (1.0 - 30e-6)
     return (since_us.astype(np.int64) + 2**32 - 600_000_000) % 2**32
 

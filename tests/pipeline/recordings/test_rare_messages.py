@@ -22,7 +22,7 @@ AT = (0, 1500, 2999)
 
 @pytest.fixture
 def recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Of many chunks."""
+    """A recording of many chunks."""
     monkeypatch.setattr("fantwin.pipeline.recordings.writing.CHUNK_BYTES", 4096)
     with RecordingWriter(tmp_path / "r.mcap", {"trays": "tray1"}) as writer:
         for sample in range(3000):

@@ -119,7 +119,7 @@ def test_row_04_a_core_that_hangs_while_it_is_closed_is_left_behind_in_time(conf
 
 @pytest.mark.parametrize("who", ["stop", "launcher_gone"])
 def test_row_04_a_loop_that_hangs_is_left_behind_in_time(config, monkeypatch, who):
-    """As when a consumer hangs and takes no more of what is published; also where nobody is left to kill the stage."""
+    """A consumer hangs and takes no more of what is published; also where nobody is left to kill the stage."""
     monkeypatch.setattr("fantwin.pipeline.runtime.runner.PRODUCERS_END_LIMIT_S", 0.1)
     release, hanging = threading.Event(), threading.Event()
 
@@ -149,7 +149,7 @@ def test_row_04_a_loop_that_hangs_is_left_behind_in_time(config, monkeypatch, wh
 
 
 def test_row_04_a_stage_that_is_stopped_while_it_waits_for_what_it_missed_ends_in_order(config, monkeypatch):
-    """As when a producer hangs."""
+    """A producer hangs."""
     monkeypatch.setattr(Bus, "answer_timeout_s", 300.0)
     for limit in ("CAUGHT_UP", "ANSWERED"):
         monkeypatch.setattr(f"fantwin.pipeline.runtime.runner.{limit}", 0.05)

@@ -177,7 +177,7 @@ def test_a_stage_is_due_only_what_it_reads_and_nothing_that_it_leaves_out_on_pur
 
 
 def test_what_a_stage_publishes_to_one_that_stops_before_it_need_not_arrive():
-    """As a controller's commands to acquisition: the last ones are published when acquisition has stopped."""
+    """A controller's commands to acquisition: the last ones are published when acquisition has stopped."""
     for first, lost in ((0, 0), (2, 2)):
         acquisition = health("a1", "acquisition", 5, inputs=(line("r1", first, 7, key=COMMAND),))
         assert losses([acquisition, CONTROLLER], LAUNCHED)["acquisition/t"] == lost

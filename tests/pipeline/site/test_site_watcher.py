@@ -28,7 +28,7 @@ def bus() -> Any:
 
 @pytest.fixture
 def watcher(bus: Any) -> SiteWatcher:
-    """Of a site on which a scorer is at work."""
+    """A watcher of a site on which a scorer is at work."""
     watcher = SiteWatcher(bus, "s", trays=TRAYS)
     bus.show(SCORER)
     bus.say(health(SCORER, outputs=(Output(key=KEY, published=0),)))

@@ -45,7 +45,7 @@ def test_a_fan_whose_command_acts_as_it_is_gets_no_drive() -> None:
 
 
 def test_errors_of_readings_while_the_speed_changes_do_not_hide_a_drive() -> None:
-    """Of unknown age, as on a line that is slower than the fan: they exceed all that a drive explains by far."""
+    """Errors of an unknown age, as on a line that is slower than the fan, are far larger than what a drive explains."""
     runs = [of_unknown_age(run_of(DRIVE, seed), seed) for seed in (1, 2)]
     found = find_drive(runs[:1], runs[1:], identify(runs[:1]), find_standstill(runs))
     assert found is not None

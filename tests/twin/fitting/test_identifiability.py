@@ -155,14 +155,6 @@ def test_a_loop_at_one_set_point_is_reported_with_biased_and_indistinguishable_p
         assert has_line_with(lines, f"fan {fan}: alpha and C_D cannot be distinguished", "the speed keeps between 11")
 
 
-def judged(run: Run, **values_and_errors: tuple[float, float]) -> tuple[str, ...]:
-    """Warnings for the given estimates; by default the published ones with small errors."""
-    estimates = {"J": (0.15, 0.001), "alpha": (0.012, 0.001), "C_D": (0.0025, 1e-5), "lag_s": (0.0, 0.0)}
-    estimates |= values_and_errors
-    parameters, errors = np.array([estimates[name] for name in PARAMETER_NAMES]).T
-    return identifiability_warnings([run], parameters[None], np.diag(errors**2)[None])
-
-
 @pytest.mark.parametrize(
     ("name", "estimate", "words"),
     [
@@ -178,7 +170,7 @@ def judged(run: Run, **values_and_errors: tuple[float, float]) -> tuple[str, ...
 def test_each_parameter_is_judged_by_its_own_interval(
     name: str, estimate: tuple[float, float], words: tuple[str, ...]
 ) -> None:
-    """By default the estimates are the published ones with small errors."""
+    """Published estimates with small errors, but for one."""
     estimates = {"J": (0.15, 0.001), "alpha": (0.012, 0.001), "C_D": (0.0025, 1e-5), "lag_s": (0.0, 0.0)}
     parameters, errors = np.array([(estimates | {name: estimate})[each] for each in PARAMETER_NAMES]).T
     lines = identifiability_warnings([published_run(1)], parameters[None], np.diag(errors**2)[None])
@@ -198,12 +190,6 @@ def test_a_command_that_hardly_moves_is_little_excitation() -> None:
     lines = warnings_of(commanded(levels, seed=4, warm_up_s=4.0))
     for reason in ("moves by 2.0%", "2 level(s) only", "hardly more than its noise"):
         assert has_line_with(lines, "little excitation", reason, "three or more levels")
-
-
-def test_a_speed_measured_after_its_command_is_no_feedback() -> None:
-    run = commanded(open_loop_commands(2001, 20)["stairs with dither"], seed=4, noise_rad_s=0.1)
-    late = Run("late", run.t_s[:-1], run.command[:-1], run.speed_rad_s[1:])
-    assert not any(feedback_share([late], fan) > 0.0 for fan in range(run.fans))
 
 
 def rosa(folder: Path, number: int) -> Run:

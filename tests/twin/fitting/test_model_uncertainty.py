@@ -67,14 +67,14 @@ def test_what_one_fan_has_shown_is_not_all_known_of_another() -> None:
 
 
 def test_what_a_fan_passes_says_less_than_what_it_holds() -> None:
-    """If the model misses more while it moves."""
+    """A model that misses more while it moves."""
     exact, late = (ratio_passed_to_held(late_s) for late_s in (0.0, 0.3))
     assert late > 3.0 * exact
 
 
 def ratio_passed_to_held(late_s: float) -> float:
-    """Of a linear fan whose command ramps from 0.3 to 0.9 and back, between holds of 20 s: at the speed of 0.6, to that
-    of 0.3. late_s: its readings are late or early by so much, at random from ramp to ramp.
+    """Uncertainty of a linear fan whose command ramps from 0.3 to 0.9 and back, between holds of 20 s: at the speed of
+    0.6, to that of 0.3. late_s: its readings are late or early by so much, at random from ramp to ramp.
     """
     there = np.concatenate((np.full(200, 0.3), np.linspace(0.3, 0.9, 30)))
     command = np.tile(np.concatenate((there, 1.2 - there)), 10)[:, np.newaxis]
@@ -112,7 +112,7 @@ def at_levels(table: ModelUncertainty) -> tuple[Array, Array]:
 
 
 def of_physics(run: Run, parameters: Array | None = None) -> ModelUncertainty:
-    """Of the physical model of a fan without a drive. parameters: None: as identified."""
+    """Uncertainty of the physical model of a fan without a drive. parameters: None: as identified."""
     found = identify([run])
     own = found.parameters if parameters is None else parameters
     return model_uncertainty(PhysicalModel(), own, [run], [run], np.zeros(1), found)

@@ -31,8 +31,8 @@ SERVER = ua.NodeId(ua.ObjectIds.Server)
 
 @pytest.fixture
 def events(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
-    """Of fans 0 to 9 in turn, one a second, but for one request that was refused; asks for the seconds of what is
-    found and of what comes next."""
+    """Transitions of fans 0 to 9 in turn, one a second, but for one request that was refused; asks for the seconds of
+    what is found and of what comes next."""
     store = AlarmHistory(tmp_path / "alarms.sqlite")
     for number in range(40):
         refused = {"transition": Transition.REFUSED} if number == 5 else {}
