@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fantwin.schemas.blocks import can_join, cut, join, select
+from fantwin.schemas.blocks import can_join, cut, join
 from fantwin.schemas.fields import columns
 from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Command, Grid, Message, Prediction, Raw, Score
@@ -96,22 +96,3 @@ def test_messages_that_differ_in_more_than_their_samples_are_not_joined(one: Any
     assert not can_join(one, other)
     with pytest.raises(ValueError, match="message 1"):
         join([one, other])
-
-
-def test_samples_of_a_message_are_selected() -> None:
-    some = select(raw(3, clock=False), np.array([True, False, True]))
-    assert (some.host_receive_t_ns.tolist(), some.device_sequence.tolist()) == ([0, 2], [0, 2])
-    assert (some.command.shape, some.device_clock_us.tolist()) == ((2, 1), [])
-
-
-def test_joining_no_messages_is_refused() -> None:
-    with pytest.raises(ValueError, match="no messages"):
-        join([])
-
-
-@pytest.mark.parametrize(("first", "end"), [(-1, 1), (0, 3), (2, 1)])
-def test_samples_that_do_not_exist_are_refused(first: int, end: int) -> None:
-    with pytest.raises(ValueError, match="Grid without samples"):
-        cut(grid(2), first, end)
-    with pytest.raises(ValueError, match="Command without samples"):
-        cut(Command(fans=1, t_ns=0), 0, 0)

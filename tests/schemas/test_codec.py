@@ -22,7 +22,7 @@ from fantwin.schemas.codec import CodecError, decode, encode, proto_type, type_n
 from fantwin.schemas.fields import OpenEnum, columns, other_fields, time_column
 from fantwin.schemas.header import Header, InputPosition
 from fantwin.schemas.health import Counter, Input, Output
-from fantwin.schemas.messages import Alarm, Command, Diagnosis, Grid, Message, Prediction, Raw, Score
+from fantwin.schemas.messages import Command, Diagnosis, Grid, Message, Prediction, Raw, Score
 from tests.support.made_messages import MESSAGE_TYPES
 from tests.support.message_strategies import any_message, same
 
@@ -145,16 +145,6 @@ def test_unknown_values_of_a_newer_producer_survive_in_columns(samples):
     back = decode(Grid, proto.SerializeToString())
     assert back.invalid_reason.ravel()[samples // 2] == 99
     assert fan_pb2.Grid.FromString(encode(back)) == proto
-
-
-def test_unknown_values_of_a_newer_producer_survive_in_scalars():
-    newer: dict[str, Any] = {"severity": 77, "transition": 88, "statistic": 99}
-    proto = fan_pb2.Alarm(fan=2, message="from a newer scorer", **newer)
-    back = decode(Alarm, proto.SerializeToString())
-    assert (back.severity, back.transition, back.statistic) == (77, 88, 99)
-    assert (back.transition.name, back.message) == ("UNKNOWN (88)", "from a newer scorer")
-    again = fan_pb2.Alarm.FromString(encode(back))
-    assert (again.severity, again.transition, again.statistic) == (77, 88, 99)
 
 
 @pytest.mark.parametrize("value", [128, 300, -1])

@@ -13,7 +13,6 @@ from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.fast_decode import decode_together
 from fantwin.schemas.header import Header, InputPosition
 from fantwin.schemas.messages import Raw, StatedTacho
-from tests.support.message_strategies import same
 
 KEY = "fantwin/plant/tray1/raw"
 
@@ -43,20 +42,6 @@ def test_a_header_of_any_length_is_read_without_the_rest(length):
 def test_bytes_that_are_not_a_message_raise_a_codec_error(payload):
     with pytest.raises(CodecError):
         _ = Envelope(KEY, "raw", payload, 0).header
-
-
-def test_many_messages_are_decoded_as_one_block():
-    messages = [raw(k) for k in range(100)]
-    (block,) = decode_together(Raw, [encode(message) for message in messages])
-    assert block.header.sequence == 99
-    for name in ("host_receive_t_ns", "command", "speed_rad_s"):
-        assert same(getattr(block, name), np.concatenate([getattr(message, name) for message in messages]))
-
-
-def test_messages_that_do_not_fit_together_are_decoded_one_by_one():
-    blocks = decode_together(Raw, [encode(raw(0, fans=2)), encode(raw(1, fans=3))])
-    assert [block.fans for block in blocks] == [2, 3]
-    assert decode_together(Raw, []) == []
 
 
 def test_what_every_message_of_a_block_states_is_stated_once_and_other_statements_are_kept_apart():

@@ -5,10 +5,8 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fantwin.schemas.enums import StageStatus
-from fantwin.schemas.header import Header
-from fantwin.schemas.health import Health, Input, Output
-from fantwin.schemas.streams import StreamState, input_streams, output_streams, stage_losses
+from fantwin.schemas.health import Input
+from fantwin.schemas.streams import StreamState, stage_losses
 
 
 def test_skipping_counts_published_messages_that_never_came():
@@ -27,24 +25,6 @@ def test_received_and_missing_add_up_to_the_numbers_from_the_first_to_the_last(s
     assert (state.first_sequence, state.next_sequence) == (accepted[0], accepted[-1] + 1)
     assert state.received == len(accepted)
     assert state.duplicated == len(sequences) - len(accepted)
-
-
-def test_health_carries_the_states_of_inputs_and_the_counts_of_outputs():
-    state = StreamState()
-    for sequence in (2, 4, 4):
-        state.accept(sequence)
-    health = Health(
-        header=Header("p", 0, ""),
-        stage="resampler",
-        instance="all",
-        status=StageStatus.OK,
-        t_ns=0,
-        uptime_s=0.0,
-        inputs=(state.as_input(("in", "q")),),
-        outputs=(Output(key="out", published=7),),
-    )
-    assert input_streams(health) == {("in", "q"): state}
-    assert output_streams(health) == {("out", "p"): 7}
 
 
 def test_a_stage_that_may_drop_loses_only_what_its_loss_counters_say():

@@ -15,15 +15,10 @@ from fantwin.pipeline.recordings.reading import read_recording
 from fantwin.schemas.messages import ModelCard
 from fantwin.schemas.twin_card import CARD_PROPERTY, CardError, TwinCard
 from fantwin.twin.models.physical import PhysicalModel
-from tests.support.twin_files import made_up_card, small_hybrid
+from tests.support.twin_files import made_up_card
 
 DEMO_TWIN = Path(pipeline.__file__).parent / "demo" / "twin.onnx"
 GOLDEN = Path(__file__).parents[1] / "support" / "data" / "golden.mcap"
-
-
-def test_a_card_survives_conversion_to_json_and_back() -> None:
-    card = made_up_card(small_hybrid(), 3)
-    assert TwinCard.from_json(card.to_json()) == card
 
 
 def test_fields_of_a_later_card_are_ignored_and_its_kind_needs_not_be_known() -> None:

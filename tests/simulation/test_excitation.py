@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from fantwin.simulation.errors import SimulationError
-from fantwin.simulation.excitation import PROFILES, Multisine, Prbs, Staircase, excitation
+from fantwin.simulation.excitation import PROFILES, Staircase, excitation
 
 TIMES_S = np.arange(0.0, 130.0, 0.05)
 
@@ -35,27 +35,6 @@ def test_a_staircase_holds_each_level_and_changes_by_one_step() -> None:
     assert np.allclose(np.abs(np.diff(levels)), 0.1)
     assert set(np.round(levels, 6)) == set(np.round(np.linspace(0.0, 0.8, 9), 6))
     assert stairs.command(3.01)[0] == stairs.command(3.99)[0]
-
-
-def test_a_prbs_has_maximum_length() -> None:
-    source = Prbs(1, seed=0, low=0.0, high=1.0, bit_s=1.0)
-    bits = np.array([source.command(t + 0.5)[0] for t in range(1023)])
-    assert bits.sum() == 512
-    signs = 2.0 * bits - 1.0
-    spectrum = np.abs(np.fft.fft(signs)) ** 2
-    assert np.allclose(spectrum[1:], 1024.0)  # flat: what the maximum length is wanted for
-
-
-def test_a_multisine_holds_its_harmonics_and_nothing_else() -> None:
-    source = Multisine(1, seed=3, low=0.0, high=1.0, period_s=50.0)
-    signal = np.array([source.command(t)[0] for t in np.arange(0.0, 50.0, 0.05)])
-    power = np.abs(np.fft.rfft(signal - signal.mean()))
-    assert set(np.argsort(power)[-10:]) == set(Multisine.HARMONICS)
-
-
-def test_an_unknown_profile_names_the_nearest() -> None:
-    with pytest.raises(SimulationError, match="unknown profile 'chrip'; did you mean 'chirp'"):
-        excitation("chrip", 1, 0)
 
 
 def test_an_empty_range_is_refused() -> None:

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from fantwin.simulation.errors import SimulationError
-from fantwin.simulation.faults import Fault, check_schedule, disturbance, parse_fault, tacho_faults
+from fantwin.simulation.faults import Fault, check_schedule, parse_fault
 from fantwin.simulation.tacho import NoisyTacho, TachoSettings
 from fantwin.simulation.tray import SimulatedTray, TraySettings
 
@@ -66,14 +66,6 @@ def test_a_dropping_tacho_gives_no_reading_for_its_share_of_samples() -> None:
     assert not missing[:, 1].any()
     there = ~missing[:, 0]
     assert np.array_equal(run[there, 0], run[there, 1])  # the fan itself is well
-
-
-def test_several_faults_of_one_fan_add_up() -> None:
-    faults = [parse_fault(t) for t in ("inlet:fan=0,size=2", "inlet:fan=0,size=3", "rotor:fan=0,size=1")]
-    felt = disturbance([*faults, parse_fault("rotor:fan=0,size=0.5")], 2, 1.0)
-    assert np.array_equal(np.asarray(felt.drag_factor), [6.0, 1.0])
-    assert np.array_equal(np.asarray(felt.brake_v), [1.5, 0.0])
-    assert not tacho_faults(faults, 2, 1.0).stuck.any()
 
 
 def test_the_tray_reports_when_a_fault_really_began_and_ended() -> None:

@@ -91,7 +91,7 @@ def test_the_supply_gives_way_to_the_load_of_the_fans_that_share_it_and_the_spee
 def test_a_fan_that_holds_its_speed_needs_no_more_supply_until_it_does_not_suffice(
     duty: float, held: float, share: float
 ) -> None:
-    """At 80 % of the nominal supply, with a reserve of 10 %."""
+    """A fan at 80 % of the nominal supply, with a reserve of 10 %."""
     steady = replace(four_pin_tray(1, 0, 0.0), sag=np.zeros(1), wander=np.zeros(1), air=np.zeros(1))
     speeds = []
     for supply_factor in (1.0, 0.8):

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import pytest
 
 from fantwin.pipeline.acquisition.sample_blocks import BlockEvent, ReadingBlock, SampleBlocks
-from fantwin.pipeline.sources.source import LinkDown, LinkUp, Reading, ReadingBatch, Rejected, SourceEvent
+from fantwin.pipeline.sources.source import LinkDown, LinkUp, Reading, ReadingBatch, SourceEvent
 
 MS = 1_000_000
 BLOCK_MS = 50
@@ -64,19 +64,9 @@ def test_a_block_is_due_with_the_last_reading_that_is_expected_in_it(blocks: Sam
     ]
 
 
-def test_frames_that_come_in_pieces_make_blocks_of_as_many_readings(blocks: SampleBlocks) -> None:
-    pieces = [batch(t_ms, readings=t_ms // 5 % 2) for t_ms in range(1010, 1110, 5)]
-    assert [(t_ms, len(block)) for t_ms, block in add_all(blocks, pieces)] == [(1055, 10), (1105, 10)]
-
-
 def test_readings_of_a_slow_line_wait_for_nothing_also_in_pieces(blocks: SampleBlocks) -> None:
     pieces = [batch(t_ms, readings=t_ms % 2) for t_ms in (1100, 1105, 1200, 1205, 1300, 1305)]
     assert add_all(blocks, pieces) == [(1105, [1100, 1105]), (1205, [1200, 1205]), (1305, [1300, 1305])]
-
-
-def test_input_without_readings_is_handed_over_after_the_time_of_a_block(blocks: SampleBlocks) -> None:
-    noise = [ReadingBatch(t_ms * MS, (Rejected("bad_checksum", ""),)) for t_ms in range(1010, 1130, 10)]
-    assert [t_ms for t_ms, _ in add_all(blocks, noise)] == [1060, 1120]
 
 
 def test_the_stage_takes_what_waits_only_after_the_time_of_a_block(blocks: SampleBlocks) -> None:

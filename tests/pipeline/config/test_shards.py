@@ -8,7 +8,6 @@ import pytest
 
 from fantwin.pipeline.config.loading import parse_config
 from fantwin.pipeline.config.models import Config, ConfigError
-from fantwin.pipeline.config.registry import STAGES
 from fantwin.pipeline.config.shards import (
     MOST_NAME_CHARACTERS,
     Shard,
@@ -28,14 +27,6 @@ WHOLE = Shard("all", NAMES)
 def site(*overrides: str, names: tuple[str, ...] = NAMES) -> Config:
     trays = "".join(f'[[tray]]\nname = "{name}"\nfans = 2\ntwin = "x.onnx"\n' for name in names)
     return parse_config(trays, Path("site.toml"), overrides, stages=())
-
-
-def test_without_shards_every_process_is_called_as_it_always_was():
-    for stage, row in STAGES.items():
-        expected = [Shard(name, (name,), ("--trays", name)) for name in NAMES] if row.scope == "tray" else [WHOLE]
-        assert shards_of(stage, site()) == expected
-        of_one = shards_of(stage, site(names=("a",)))
-        assert [shard.name for shard in of_one] == ["a" if row.scope == "tray" else "all"]
 
 
 @pytest.mark.parametrize("number", range(1, len(NAMES) + 1))

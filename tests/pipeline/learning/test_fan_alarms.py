@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 
 from fantwin.pipeline.learning.fan_alarms import LONGEST_UNKNOWN_NS, FanAlarms
 from fantwin.schemas.enums import FanState
@@ -11,7 +10,6 @@ from fantwin.schemas.messages import Score
 from fantwin.schemas.units import NS_PER_S
 
 N, S, A, R = FanState.NORMAL, FanState.SUSPECT, FanState.ALARM, FanState.RETURNING
-SAY_NOTHING = [FanState.UNKNOWN, FanState.STOPPED, FanState.STARTING]
 
 
 def score(*rows: list[FanState], first_s: int = 0) -> Score:
@@ -30,20 +28,6 @@ def score(*rows: list[FanState], first_s: int = 0) -> Score:
     )
 
 
-@pytest.mark.parametrize("state", SAY_NOTHING)
-def test_an_alarm_lasts_through_samples_that_say_nothing(state: FanState) -> None:
-    alarms = FanAlarms(2)
-    alarms.update(score([N, A]))
-    seen = alarms.update(score([N, state]))
-    assert alarms.fans == [1]
-    assert seen.had_alarm
-    assert seen.began_t_ns == []
-    alarms.update(score([N, R]))
-    assert alarms.fans == [1]
-    alarms.update(score([N, S]))
-    assert alarms.fans == []
-
-
 def test_the_last_row_that_says_something_decides_and_alarms_that_end_in_the_same_score_are_seen() -> None:
     alarms = FanAlarms(3)
     seen = alarms.update(
@@ -56,12 +40,6 @@ def test_the_last_row_that_says_something_decides_and_alarms_that_end_in_the_sam
     assert alarms.fans == []
     assert seen.had_alarm
     assert seen.began_t_ns == [NS_PER_S, 3 * NS_PER_S]
-
-
-def test_fans_are_judged_where_one_has_a_known_state_or_is_idle() -> None:
-    unknown, stopped = FanState.UNKNOWN, FanState.STOPPED
-    seen = FanAlarms(2).update(score([unknown, unknown], [unknown, N], [unknown, unknown], [stopped, unknown], [A, N]))
-    assert seen.judged_t_ns.tolist() == [1 * NS_PER_S, 3 * NS_PER_S, 4 * NS_PER_S]
 
 
 def test_alarms_are_known_when_each_fan_was_judged_or_some_for_long() -> None:

@@ -48,22 +48,9 @@ def test_an_unknown_residual_is_null_and_not_zero() -> None:
     assert (document["residual"], document["torque_balance"]) == (-1e-9, None)
 
 
-def test_an_alarm_that_a_recording_begins_with_continues_from_before_the_restart() -> None:
-    words = "fan 0: the alarm continues from before the restart"
-    episode = one(alarm(10, Transition.REPUBLISHED, message=words), alarm(30, Transition.CLEARED))
-    assert episode.message == words
-
-
 def test_an_alarm_raised_again_by_a_scorer_without_a_snapshot_continues_its_episode() -> None:
     episode = one(alarm(10), alarm(15, onset_t_ns=14), alarm(30, Transition.CLEARED, onset_t_ns=14))
     assert (episode.raised_ns, episode.onset_ns, episode.cleared_ns) == (10, 5, 30)
-
-
-def test_messages_of_an_alarm_that_is_not_active_begin_no_episode() -> None:
-    inactive = {"active": False, "severity": Severity.NONE}
-    assert episodes([alarm(1, Transition.SHELVED, **inactive), alarm(2, Transition.REFUSED, **inactive)]) == []
-    found = episodes([alarm(10), alarm(20, Transition.CLEARED), alarm(25, Transition.ACKNOWLEDGED, active=False)])
-    assert len(found) == 1
 
 
 def test_episodes_are_per_fan_and_tray_in_order_of_time() -> None:
@@ -106,12 +93,6 @@ def test_feedback_belongs_to_the_alarm_that_it_names_and_the_last_word_counts() 
     assert (first.feedback, first.feedback_by, first.feedback_reason) == (Feedback.FALSE_ALARM, "ann", "a door")
     assert (second.feedback, second.feedback_reason) == (Feedback.FALSE_ALARM, "first")
     assert (first.raised_ns, first.cleared_ns, second.raised_ns) == (10, 20, 40), "feedback is no part of an alarm"
-
-
-def test_later_messages_about_an_alarm_bring_feedback_whose_own_message_is_missing() -> None:
-    given = {"feedback": Feedback.TRUE_ALARM, "feedback_by": "bob", "feedback_reason": "worn"}
-    episode = one(alarm(10), alarm(20, Transition.CLEARED, **given))
-    assert (episode.feedback, episode.feedback_by, episode.feedback_reason) == (Feedback.TRUE_ALARM, "bob", "worn")
 
 
 def test_an_episode_of_two_alarms_of_which_one_was_true_is_not_learned_from() -> None:

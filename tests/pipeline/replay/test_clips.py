@@ -33,7 +33,7 @@ def first_raised(path: Path) -> Alarm:
 
 
 def cutter(recording: Path, **more: Any) -> ClipCutter:
-    """On a disk with room."""
+    """A cutter of clips on a disk with room."""
     return ClipCutter(recording, **{"free_bytes": lambda: 1 << 40, **more})
 
 
@@ -56,7 +56,7 @@ def again(path: Path) -> RescoredTray:
 
 @pytest.fixture(scope="module")
 def clip(undisturbed: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Of the first alarm of the undisturbed recording."""
+    """The clip of the first alarm of the undisturbed recording."""
     return cut(undisturbed, tmp_path_factory.mktemp("clip"))
 
 
@@ -100,7 +100,7 @@ def test_the_same_alarm_comes_out_of_a_clip_with_raw_samples_only(undisturbed, t
 
 
 def test_a_clip_of_the_time_before_the_clock_was_set_back_is_cut_from_the_part_of_that_time(undisturbed, tmp_path):
-    """As after a power cut on a board whose clock begins in the past: the next part has earlier times."""
+    """What a power cut does on a board whose clock begins in the past: the next part has earlier times."""
     recording = tmp_path / "recording.mcap"
     record(undisturbed, recording).close()
     head = read_metadata(recording)

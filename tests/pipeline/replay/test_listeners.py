@@ -174,11 +174,3 @@ def test_messages_before_the_first_received_one_count_as_lost_for_listeners_pres
     recorder.say(line(GRID, "replay-1", 50, first=50))
     eventually(lambda: len(listeners._views()) == 2, "both are known")
     eventually(lambda: listeners.lost("replay-1", {GRID: 100}) == {"twin_integrator": 10}, "7 early, 3 missing")
-
-
-def test_another_replay_is_seen(sites):
-    bus, listeners = sites
-    assert not listeners.is_replaying()
-    bus.declare_alive(alive_key("s", "replay", "all"))
-    eventually(listeners.is_replaying, "it is seen")
-    assert listeners.present() == []

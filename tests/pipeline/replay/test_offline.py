@@ -179,7 +179,7 @@ def test_the_golden_recording_is_decided_as_it_was():
 
 
 def test_a_recorded_snapshot_is_restored_and_its_replay_is_equal():
-    """In golden-restart.mcap an active alarm was acknowledged, a fan shelved and another one out of service when their
+    """An active alarm was acknowledged, a fan shelved and another one out of service in golden-restart.mcap when their
     scorer was killed and restored from its snapshot."""
     tray = verified(DATA / "golden-restart.mcap")
     assert [session.snapshot is not None for session in tray.plan.last] == [False, True] and tray.plan.restarts == 1

@@ -47,7 +47,7 @@ class Learned:
         return [(card.twin, card.t_ns) for card in self.cards]
 
     def seconds_until(self, t_ns: int) -> float:
-        """Of the recording, from its first message on."""
+        """Seconds of the recording, from its first message on."""
         return (t_ns - RecordingPlayback([self.path], ("raw",)).first.received_t_ns) / 1e9
 
     def stage(self, name: str) -> Any:
@@ -100,7 +100,7 @@ class Stages(Sent):
         self._integrate(self._resampler.step(message) if isinstance(message, Raw) else [message])
 
     def close(self) -> None:
-        """As stages do that stop."""
+        """Hand over the rest, as stages do that stop."""
         self._integrate(self._resampler.close())
 
     def _integrate(self, messages: Iterable[Any]) -> None:

@@ -13,7 +13,6 @@ from fantwin.pipeline.runtime.consumed import PERIOD_NS, ConsumedReports
 from fantwin.schemas.header import Header, InputPosition
 from fantwin.schemas.messages import Consumed, Grid
 from fantwin.schemas.streams import continues
-from tests.support.made_messages import alarm
 
 STEP_NS = 1_000_000_000
 
@@ -82,8 +81,3 @@ def test_a_run_without_a_break_is_reported_each_two_minutes():
     assert [report.header.sequence for report in stage.reported] == [0, 120, 240]
     assert [report.header.sequence for report in stage.reports.last()] == [249]
     assert stage.reports.last() == [], "the end is reported once"
-
-
-def test_outputs_that_are_no_samples_are_not_reported():
-    header = Header("scorer-1", 0, "tray1", InputPosition("prediction", "p", 0, 1, 0))
-    assert ConsumedReports().after("alarm", replace(alarm(), header=header)) == []

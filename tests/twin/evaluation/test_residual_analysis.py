@@ -136,15 +136,6 @@ def test_the_error_of_the_start_is_not_held_against_the_model() -> None:
     assert np.isnan(analyse_residual(residual, [run])[0].ljung_box_p)
 
 
-def test_runs_are_not_joined_across_their_ends() -> None:
-    rng = np.random.default_rng(8)
-    residual, lag = white(rng), 7
-    analysis = analysed(residual, white(rng), [1000, 1000, 1000, 1000])
-    centred = residual - residual.mean()
-    expected = np.sum([part[lag:] @ part[:-lag] for part in np.split(centred, 4)]) / (4 * (1000 - lag)) / centred.var()
-    assert analysis.autocorrelation[lag - 1] == pytest.approx(expected, rel=1e-9)
-
-
 def test_the_count_of_independent_samples_gives_the_scatter_of_the_mean_and_the_autocorrelation_time_is_found() -> None:
     """Also where half of the samples are missing."""
     rng = np.random.default_rng(10)
@@ -166,20 +157,3 @@ def test_the_card_holds_the_tails_of_the_healthy_residual() -> None:
     assert card.max_sigma[1] == pytest.approx(np.abs(residual[:, 1]).max() / sigma_rad_s[1])
     assert card.autocorrelation_time_s == pytest.approx((STEP_S / 2, STEP_S / 2), rel=0.2)
     assert card.independent_samples[1] == pytest.approx(100_000, rel=0.2)
-
-
-def test_undefined_figures_are_nan() -> None:
-    diverged = np.r_[np.zeros(SAMPLES - 1), np.inf]
-    never_measured = np.full(SAMPLES, np.nan)
-    for residual in (diverged, never_measured, np.ones(SAMPLES)):
-        analysis = analysed(residual, np.zeros(SAMPLES))
-        assert np.isnan(analysis.ljung_box_p)
-        assert analysis.white is None
-        assert np.isnan(analysis.autocorrelation).all()
-        assert np.isnan(analysis.cross_over_bound)
-    still = analysed(white(np.random.default_rng(13)), np.ones(SAMPLES))
-    assert np.isnan(still.cross_bound_95)
-    assert np.isnan(still.cross_peak_lag_s)
-    assert still.white
-    _, card = healthy_residual(never_measured[:, np.newaxis], pieces_of(np.zeros(SAMPLES)))
-    assert card.max_sigma == (None,)
