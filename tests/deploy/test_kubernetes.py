@@ -56,7 +56,6 @@ def container(stateful_set: dict[str, Any]) -> dict[str, Any]:
     [
         {},
         {"stages": MANY, "files": {"configMap": {"name": "twins"}}, "image": {"pullSecrets": [{"name": "registry"}]}},
-        {"router": {"enabled": False}},
         OPEN,
     ],
     ids=str,

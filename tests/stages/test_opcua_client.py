@@ -19,6 +19,7 @@ from tests.support.running_opcua import RunningOpcua
 from tests.support.site_messages import NOW_NS, alarm, score
 from tests.support.site_users import OPERATOR, PASSWORD, VIEWER
 
+pytestmark = pytest.mark.usefixtures("quickly_hashed")
 FAN = f"ns=2;s={TRAY}/2"
 ALARM = f"{FAN}/Alarm"
 SERVER = "ns=0;i=2253"

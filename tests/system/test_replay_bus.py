@@ -19,13 +19,11 @@ import pytest
 from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.config.models import BusConfig
 from fantwin.pipeline.recordings.reading import read_recording
-from fantwin.pipeline.recordings.writing import RecordingWriter
 from fantwin.pipeline.site.site_watcher import SiteWatcher
 from fantwin.schemas.codec import decode
 from fantwin.schemas.enums import StageStatus
-from fantwin.schemas.header import Header
 from fantwin.schemas.health import Health
-from fantwin.schemas.messages import Clock, Grid, Message, ModelCard, Raw
+from fantwin.schemas.messages import Clock, Grid, Message, Raw
 from fantwin.schemas.topics import health_key, tray_key
 from fantwin.stages.resampler import ResamplerConfig, ResamplerCore
 from tests.support.fantwin_command import as_typed
@@ -42,7 +40,6 @@ from tests.support.running_chain import (
     fantwin,
     view_of,
 )
-from tests.support.score_data import made_up_tray
 from tests.support.twin_files import small_hybrid, write_twin
 
 pytestmark = pytest.mark.real_time
@@ -252,27 +249,6 @@ def test_at_a_terminal_it_steps_and_quits_and_gives_the_terminal_back(site, tmp_
     report = json.loads(out)
     assert report["stopped"]
     assert report["messages"] == {"raw": 3}
-
-
-def test_the_viewer_draws_every_score_of_a_replay(site, tmp_path):
-    pytest.importorskip("rerun")
-    scores, alarms = made_up_tray(seconds=20, fans=8)
-    with RecordingWriter(tmp_path / "source.mcap", {"trays": TRAY}) as writer:
-        card = ModelCard(header=Header("t", 0, TRAY), t_ns=0, twin="f40", kind="hybrid", sha256="")
-        writer.add_message(tray_key("elsewhere", TRAY, "twin"), card, int(scores[0].t_ns[0]))
-        for topic, messages in (("score", scores), ("alarm", alarms)):
-            for sequence, message in enumerate(messages):
-                stamped = type(message)(**{**vars(message), "header": Header("scorer-1", sequence, TRAY)})
-                t_ns = message.t_ns if isinstance(message.t_ns, int) else int(message.t_ns[-1])
-                writer.add_message(tray_key("elsewhere", TRAY, topic), stamped, t_ns)
-    viewer = site.start("viewer")
-    done = site.replay(tmp_path / "source.mcap", "--rate", 50, "--json")
-    assert done.returncode == 0, done.stderr
-    assert json.loads(done.stdout)["listeners"] == ["viewer"]
-    assert viewer.end() == 0
-    counters = viewer.output()["counters"]
-    assert counters["samples_drawn"] == sum(len(score.t_ns) for score in scores)
-    assert "dropped" not in counters
 
 
 def test_a_stage_that_writes_what_a_replay_writes_ends_it_and_keeps_the_next_from_starting(site, tmp_path):

@@ -9,7 +9,6 @@ import pytest
 
 from fantwin.schemas.messages import Array
 from fantwin.scoring.model.bins import Bin
-from fantwin.scoring.model.decision import FORGETS_S
 from fantwin.scoring.model.faults import DRAG, SCALE
 from tests.support.made_bins import MadeFans, plays, with_balance, with_reading
 from tests.support.scored_blocks import TWIN_SPEED, twin_of
@@ -93,7 +92,7 @@ def test_speed_and_torque_balance_add_up() -> None:
     assert np.median(both) < 0.9 * min(np.median(speed), np.median(balance))
 
 
-@pytest.mark.parametrize("gap_s", [3.0, 2.0 * FORGETS_S, 7200.0])
+@pytest.mark.parametrize("gap_s", [3.0, 7200.0])
 def test_after_a_gap_a_healthy_fan_raises_nothing_and_a_fault_of_the_gap_is_found_at_once(gap_s: float) -> None:
     made = MadeFans(twin_of(FANS).fans, 0.1, steady, seed=8)
     decision = made.decision()
@@ -108,7 +107,7 @@ def test_after_a_gap_a_healthy_fan_raises_nothing_and_a_fault_of_the_gap_is_foun
     assert sorted(fan for *_, fan, _ in raised) == list(range(FANS))
 
 
-@pytest.mark.parametrize("gap_s", [3.0, 2.0 * FORGETS_S, 7200.0])
+@pytest.mark.parametrize("gap_s", [3.0, 7200.0])
 def test_a_gap_ends_no_alarm_and_what_is_healthy_after_it_ends_it_once(gap_s: float) -> None:
     made = MadeFans(twin_of(FANS).fans, 0.1, steady, seed=8)
     decision = made.decision()
