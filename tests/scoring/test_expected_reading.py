@@ -54,23 +54,6 @@ def test_a_counting_tacho_shows_nothing_beyond_the_expected_readings_whatever_it
     assert not half_range[:, 2].any()
 
 
-@pytest.mark.parametrize("block", [1, 7])
-def test_blocks_do_not_matter(block: int) -> None:
-    _, speed = speeds(60.0, PERIOD_S)
-    command = np.where(np.arange(len(speed))[:, np.newaxis] == 200, np.nan, speed / 300.0)
-
-    def run(size: int) -> Array:
-        expected, averaged = ExpectedReading(TACHOS, PERIOD_S), AveragedCommand(TACHOS, PERIOD_S)
-        expected.start(ALL, speed[0])
-        parts = []
-        for first in range(0, len(speed), size):
-            rows = slice(first, first + size)
-            parts.append(np.hstack((*expected.update(speed[rows]), averaged.update(command[rows]))))
-        return np.concatenate(parts)
-
-    np.testing.assert_array_equal(run(block), run(len(speed)))
-
-
 def test_the_averaged_command_is_the_mean_over_window_and_age_and_unknown_after_an_unknown_command() -> None:
     tacho = Tacho(kind="count", window_s=1.0)
     command = np.zeros((60, 1))

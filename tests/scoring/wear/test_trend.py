@@ -44,18 +44,6 @@ def test_the_interval_holds_the_true_slope() -> None:
     assert 0.88 <= np.mean([trend.low <= 0.004 <= trend.high for trend in trends]) <= 1.0
 
 
-def test_wear_over_thirty_days_is_found_and_its_limit_forecast() -> None:
-    points = series(30, 48, 0.002, 1, 0.5)
-    trend = trend_of(points)
-    assert trend.significant and trend.slope_per_day == pytest.approx(0.002, rel=0.1)
-    now_ns = START_NS + 30 * NS_PER_DAY
-    forecast = forecast_limit(trend, 0.1, now_ns)
-    days = [(t_ns - START_NS) / NS_PER_DAY for t_ns in times_of(forecast)]
-    assert days == sorted(days)
-    assert days[0] < 50.0 < days[2]
-    assert days[1] == pytest.approx(50.0, abs=4.0)
-
-
 def test_the_forecast_interval_contains_the_day_on_which_the_limit_is_reached() -> None:
     held = []
     for seed in range(60):

@@ -66,30 +66,6 @@ def test_what_one_fan_has_shown_is_not_all_known_of_another() -> None:
     assert 5.0 * shown < not_shown < 0.7 * alone[0, 0]
 
 
-def test_what_a_fan_passes_says_less_than_what_it_holds() -> None:
-    """A model that misses more while it moves."""
-    exact, late = (ratio_passed_to_held(late_s) for late_s in (0.0, 0.3))
-    assert late > 3.0 * exact
-
-
-def ratio_passed_to_held(late_s: float) -> float:
-    """Uncertainty of a linear fan whose command ramps from 0.3 to 0.9 and back, between holds of 20 s: at the speed of
-    0.6, to that of 0.3. late_s: its readings are late or early by so much, at random from ramp to ramp.
-    """
-    there = np.concatenate((np.full(200, 0.3), np.linspace(0.3, 0.9, 30)))
-    command = np.tile(np.concatenate((there, 1.2 - there)), 10)[:, np.newaxis]
-    kept = np.full((len(command) - 1, 1), 0.5)
-    speed_rad_s = linear_recursion(kept, np.vstack((np.full(1, 30.0), 50.0 * command[:-1])))
-    rng = np.random.default_rng(1)
-    of_ramps_s = late_s * np.repeat(rng.choice([-1.0, 1.0], 20), len(there))[:, np.newaxis]
-    late_rad_s = of_ramps_s * np.gradient(speed_rad_s, 0.1, axis=0)
-    readings = speed_rad_s - late_rad_s + 0.1 * rng.normal(size=command.shape)
-    run = Run("ramps", np.arange(len(command)) / 10.0, command, readings)
-    parameters = np.array([[1.0 / (100.0 * 10.0 * np.log(2.0)), 1.0 / 100.0, 0.0, 0.0]])
-    held, passed = of_physics(run, parameters).std_at(np.array([[30.0], [60.0]]), np.array([[0.3], [0.6]]))[:, 0]
-    return float(passed / held)
-
-
 LEVELS = (0.2, 0.35, 0.5, 0.65, 0.8, 1.0)
 
 
@@ -111,11 +87,10 @@ def at_levels(table: ModelUncertainty) -> tuple[Array, Array]:
     return table.std_at(*pairs)[:, 0], table.unseen_std_at(*pairs)[:, 0]
 
 
-def of_physics(run: Run, parameters: Array | None = None) -> ModelUncertainty:
-    """Uncertainty of the physical model of a fan without a drive. parameters: None: as identified."""
+def of_physics(run: Run) -> ModelUncertainty:
+    """Uncertainty of the physical model of a fan without a drive."""
     found = identify([run])
-    own = found.parameters if parameters is None else parameters
-    return model_uncertainty(PhysicalModel(), own, [run], [run], np.zeros(1), found)
+    return model_uncertainty(PhysicalModel(), found.parameters, [run], [run], np.zeros(1), found)
 
 
 def test_what_is_held_is_known_however_long_a_fan_stands() -> None:
