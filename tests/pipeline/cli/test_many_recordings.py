@@ -168,11 +168,10 @@ def test_in_every_process_linear_algebra_has_one_thread_and_torch_is_not_loaded(
         assert list(pool.map(found, paths, "counting")) == [({1}, False)] * 2
 
 
-def end_itself(_path: Path) -> None:
-    os.kill(os.getpid(), signal.SIGKILL)
-
-
 def test_a_process_that_is_killed_is_an_error_of_one_line(folder: Path) -> None:
+    def end_itself(_path: Path) -> None:
+        os.kill(os.getpid(), signal.SIGKILL)
+
     paths = [folder / name for name in RECORDINGS[:2]]
     with pytest.raises(UserError, match="ended from outside, .* fewer --jobs than 2"):
         list(RecordingsInParallel(jobs=2).map(end_itself, paths, "reading"))
@@ -259,6 +258,10 @@ def test_two_workers_of_a_cluster_give_what_one_process_gives(folder: Path, tmp_
         assert (result.exit_code, skipped["recording"]) == (4, str(bad))
 
 
+def end_worker(_path: Path) -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
 @needs_distributed
 def test_a_worker_of_a_cluster_that_is_killed_is_an_error_of_one_line(folder: Path) -> None:
     dask: Any = import_module("dask")
@@ -270,7 +273,7 @@ def test_a_worker_of_a_cluster_that_is_killed_is_an_error_of_one_line(folder: Pa
         RecordingsInParallel(jobs=cluster.scheduler_address) as pool,
         pytest.raises(UserError, match=f"ended from outside, .*: see {cluster.scheduler_address}"),
     ):
-        list(pool.map(end_itself, paths, "reading"))
+        list(pool.map(end_worker, paths, "reading"))
 
 
 @needs_distributed
