@@ -75,7 +75,7 @@ def resampled(
 def test_counts_of_which_some_are_not_seen_or_which_overlap_are_no_alarm(
     window_s: float, update_s: float, line_hz: int, lost: float
 ) -> None:
-    counts, fans, lines = Tacho(kind="count", window_s=window_s, update_s=update_s), 8, 400
+    counts, fans, lines = Tacho(kind="count", window_s=window_s, update_s=update_s), 8, 200
     rng = np.random.default_rng(8)
     time_s = np.arange(lines)[:, np.newaxis] / line_hz
     per_s, phase = (TWIN_SPEED + np.arange(fans)) / (counts.resolution_rad_s * window_s), rng.random(fans)
@@ -90,7 +90,7 @@ def test_counts_of_which_some_are_not_seen_or_which_overlap_are_no_alarm(
 
 
 def test_a_loose_wire_is_one_alarm_though_the_grid_bridges_its_missing_readings() -> None:
-    time_s = np.arange(80 * SECOND) / SECOND
+    time_s = np.arange(66 * SECOND) / SECOND
     item = on_the_grid(np.where(time_s < 20, 0.002, np.where(time_s < 50, 0.35, 0.002)))
     _, alarms = feed(core_that_knows_its_fan(), [item])
     found = [alarm for alarm in alarms if alarm.transition in CHANGES]
@@ -115,7 +115,7 @@ def test_a_fault_of_the_fan_within_an_alarm_of_missing_readings_is_said_with_its
 
 
 def test_a_constant_fault_is_one_alarm_in_which_nothing_is_learned_and_no_diagnosis_repeats_another() -> None:
-    at = np.arange(50 * SECOND)[:, np.newaxis]
+    at = np.arange(35 * SECOND)[:, np.newaxis]
     lost = prediction(noise(len(at)) - np.where(at >= 10 * SECOND, 0.2 * TWIN_SPEED, 0.0))
     (score,), alarms = feed(core_that_knows_its_fan(), [lost])
     (raised,) = [alarm for alarm in alarms if alarm.transition in CHANGES]
