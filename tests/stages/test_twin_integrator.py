@@ -15,7 +15,7 @@ from fantwin.pipeline.runtime.stage import Context
 from fantwin.schemas.blocks import cut
 from fantwin.schemas.enums import InvalidReason
 from fantwin.schemas.header import Header
-from fantwin.schemas.messages import Grid, ModelCard, Prediction
+from fantwin.schemas.messages import Grid, Prediction
 from fantwin.schemas.model_uncertainty import ModelUncertainty
 from fantwin.schemas.tacho import INSTANTANEOUS, Tacho
 from fantwin.stages.twin_integrator import STAGE, TwinIntegratorConfig
@@ -175,16 +175,6 @@ def test_on_a_grid_slower_than_its_training_the_twin_takes_steps_as_long_as_thos
     fine = grid_of(np.repeat(seconds, per_second), period_ns=10**9 // per_second)
     found, expected = (feed(core_of(twin), [grid]).predicted_speed_rad_s for grid in (slow, fine))
     np.testing.assert_array_equal(found, expected[::per_second])
-
-
-def test_the_card_is_published_once() -> None:
-    core = core_of()
-    first = [*core.tick(0), *core.step(grid_of(stairs(5))), *core.tick(1)]
-    assert [type(m) for m in first] == [ModelCard, Prediction]
-    assert isinstance(first[0], ModelCard)
-    assert (first[0].twin, first[0].t_ns) == ("fake", EPOCH_NS)
-    replayed = core_of().step(grid_of(stairs(5)))
-    assert [type(m) for m in replayed] == [ModelCard, Prediction]
 
 
 def _context(folder: Path, twin: Path | None, *tacho: Tacho) -> Context:

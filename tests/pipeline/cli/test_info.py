@@ -134,16 +134,6 @@ def test_row_13_the_last_health_of_a_session_is_found_after_the_host_clock_was_s
     assert shown(path)["lost"] == {"resampler": 2}
 
 
-def test_a_file_without_an_index_is_read_in_full_with_the_same_result(tmp_path):
-    whole = recording(tmp_path / "r.mcap")
-    truncated = tmp_path / "truncated.mcap"
-    truncated.write_bytes(whole.read_bytes()[:-50])
-    (of_whole,), (of_truncated,) = (shown(path, exit_code=3)["files"] for path in (whole, truncated))
-    assert of_truncated["damage"] == ["it has no index"]
-    different = {name for name in of_whole if of_whole[name] != of_truncated[name]}
-    assert different == {"file", "size_bytes", "damage"}
-
-
 def test_a_file_that_is_still_being_written_is_shown_up_to_what_is_on_disk(tmp_path):
     with RecordingWriter(tmp_path / "r.mcap", METADATA) as writer:
         writer.add_message(RAW_KEY, raw(0), 1)

@@ -63,17 +63,16 @@ def words_of(command: str, folder: Path, recordings: Sequence[Path | str], outpu
     return [command, *words[command], "--json"]
 
 
-def outcome_of(printed: str, output: Path, place: Path | str) -> tuple[str, dict[str, bytes]]:
-    """What a command printed and what it wrote, but for times and the folders of recordings and output."""
-    said = json.dumps(but_for_times(json.loads(printed))).replace(str(output), "OUTPUT").replace(str(place), "PLACE")
+def outcome_of(printed: str, output: Path) -> tuple[str, dict[str, bytes]]:
+    """What a command printed and what it wrote, but for times and the folder of its output."""
+    said = json.dumps(but_for_times(json.loads(printed))).replace(str(output), "OUTPUT")
     return said, {path.name: content_of(path).replace(str(output).encode(), b"OUTPUT") for path in output.iterdir()}
 
 
-def is_as_of_one_process(result: Result, output: Path, folder: Path, place: Path | str = "") -> bool:
-    """Whether a replay of the three recordings has printed and written what one process does. place: of them."""
+def is_as_of_one_process(result: Result, output: Path, folder: Path) -> bool:
+    """Whether a replay of the three recordings has printed and written what one process does."""
     assert result.exit_code == 0, result.output
-    alone = outcome_of((folder / "alone.json").read_text(), folder / "alone", folder)
-    return outcome_of(result.stdout, output, place or folder) == alone
+    return outcome_of(result.stdout, output) == outcome_of((folder / "alone.json").read_text(), folder / "alone")
 
 
 def run_all(command: str, folder: Path, names: tuple[str, ...], output: Path, *options: object) -> Result:
@@ -95,19 +94,8 @@ def test_networks_that_are_trained_two_at_a_time_give_the_same_twin(folder: Path
         result = fantwin("train", folder / RECORDINGS[0], *options, "-o", output / "trained.onnx")
         assert result.exit_code == 0, result.output
         assert ("training, 2 networks at a time" in result.stderr) == (jobs == 2)
-        outcomes.append(outcome_of(result.stdout, output, folder))
+        outcomes.append(outcome_of(result.stdout, output))
     assert outcomes[0] == outcomes[1]
-
-
-def test_recordings_at_urls_give_what_files_give(folder: Path, tmp_path: Path) -> None:
-    memory = pytest.importorskip("fsspec", reason="the extra `remote` is not installed").filesystem("memory")
-    for name in RECORDINGS:
-        memory.pipe_file(f"/many/{name}", (folder / name).read_bytes())
-    output, place = tmp_path / "urls", "memory://many"
-    output.mkdir()
-    result = fantwin(*words_of("replay", folder, [f"{place}/{name}" for name in RECORDINGS], output), "--jobs", 1)
-    memory.store.clear()
-    assert is_as_of_one_process(result, output, folder, place)
 
 
 def test_a_bad_recording_stops_all_before_anything_is_written_or_is_skipped_and_named(
@@ -127,7 +115,7 @@ def test_a_bad_recording_stops_all_before_anything_is_written_or_is_skipped_and_
     document = json.loads(result.stdout)
     assert document.pop("skipped") == [{"recording": str(folder / BAD), "reason": error}]
     good = run_all("train", folder, RECORDINGS[:2], without, "--jobs", 1)
-    assert outcome_of(json.dumps(document), skipping, folder) == outcome_of(good.stdout, without, folder)
+    assert outcome_of(json.dumps(document), skipping) == outcome_of(good.stdout, without)
 
 
 def test_the_error_of_another_process_is_that_of_one_and_of_several_the_first_argument_s(folder: Path) -> None:

@@ -40,18 +40,6 @@ def test_a_truncated_file_is_repaired_under_its_name_and_the_loss_reported(tmp_p
     assert (tmp_path / "r.mcap.original").exists()
 
 
-def test_an_intact_file_is_not_changed_and_one_that_lacks_only_its_index_has_lost_nothing(whole):
-    before = whole.read_bytes()
-    done = fantwin("info", "--repair", whole)
-    assert done.exit_code == 0
-    assert "intact, with 41 messages; nothing to recover" in done.stdout and "nothing was lost" in done.stdout
-    assert whole.read_bytes() == before
-    whole.write_bytes(before[:-100])
-    done = fantwin("info", "--repair", whole)
-    assert done.exit_code == 0 and "nothing was lost" in done.stdout
-    assert len(read_by_others(whole)) == 41
-
-
 @pytest.mark.parametrize("number", [0, 2])
 def test_info_reports_the_losses_of_a_repaired_file(tmp_path, number):
     """Whichever chunk is damaged: the ledger of the file still has its messages."""

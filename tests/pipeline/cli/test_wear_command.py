@@ -21,7 +21,7 @@ from fantwin.schemas.topics import tray_key
 from fantwin.scoring.wear.recorded_wear import shown
 from fantwin.scoring.wear.trend import NS_PER_DAY, WearSeries
 from tests.support.fantwin_command import error_of, fantwin
-from tests.support.running_chain import DEMO, SITE, TRAY
+from tests.support.running_chain import SITE, TRAY
 from tests.support.running_scorer import RunningScorer
 from tests.support.wear_data import LOSS, START_NS, worn_snapshot
 
@@ -136,9 +136,3 @@ def test_a_running_site_reports_the_same_and_one_whose_scorer_has_noted_nothing_
                 assert error_of("wear", *scorer.words) == expected
         finally:
             scorer.end()
-
-
-def test_without_a_scorer_one_line_says_that_nothing_is_known(endpoint, monkeypatch):
-    monkeypatch.setattr("fantwin.pipeline.cli.watch.scorers._DISCOVERY_S", 0.3)
-    error = error_of("wear", "-c", DEMO / "demo.toml", "--set", f"bus.endpoint='{endpoint}'")
-    assert f"wear unknown: no scorer of site '{SITE}' answers at {endpoint}" in error

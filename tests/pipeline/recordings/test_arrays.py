@@ -142,19 +142,6 @@ def test_an_imported_recording_is_not_a_part_of_another(tmp_path):
     assert times(read_arrays(made[0], "raw")) == list(range(10))
 
 
-def test_a_truncated_part_is_read_up_to_its_end_and_reported(tmp_path):
-    whole = write(tmp_path / "whole.mcap", (raw(n) for n in range(900)))
-    truncated = tmp_path / "truncated.mcap"
-    truncated.write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])
-    after = write(tmp_path / "after.mcap", (raw(n) for n in range(900, 910)), start=5000)
-    arrays = read_arrays([truncated, after], "raw")
-    found = times(arrays)
-    assert 0 < len(found) < 9000
-    assert found[-100:] == list(range(9000, 9100))
-    assert [line.split(":")[0] for line in arrays.damage] == [str(truncated)]
-    assert "is truncated" in arrays.damage[0]
-
-
 def test_memory_does_not_grow_with_the_file(tmp_path):
     def peak(messages: int) -> int:
         """Peak memory in bytes while all blocks of a recording are read, one at a time."""

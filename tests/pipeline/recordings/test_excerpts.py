@@ -120,16 +120,6 @@ def test_with_a_device_clock_times_are_within_a_tenth_of_a_millisecond_and_steps
         assert np.diff(run.t_s) == pytest.approx(np.diff(expected_s), rel=1e-5)
 
 
-def test_a_truncated_recording_is_read_whole_and_says_so(tmp_path: Path, without_clock: Path) -> None:
-    path, content = tmp_path / "r.mcap", without_clock.read_bytes()
-    path.write_bytes(content[: len(content) * 3 // 4])
-    found = ExcerptReader(path).read(300.0, 360.0)
-    assert len(found.runs[0].t_s) == pytest.approx(60 * RATE_HZ, abs=1)
-    assert "it is truncated, as after a crash" in found.damage
-    t_s, command = ExcerptReader(path).commands(1.0)
-    assert len(t_s) == len(command) < SECONDS
-
-
 def test_a_damaged_chunk_is_left_out_and_said(tmp_path: Path, without_clock: Path) -> None:
     path, content = tmp_path / "r.mcap", bytearray(without_clock.read_bytes())
     content[len(content) // 2] ^= 0xFF

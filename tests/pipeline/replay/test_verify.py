@@ -21,13 +21,6 @@ def alarm(transition: Transition, message: str) -> Alarm:
     return made_messages.alarm(active=False, onset_t_ns=5, residual_rad_s=3.0, message=message, transition=transition)
 
 
-@pytest.mark.parametrize("transition", [Transition.RAISED, Transition.REPUBLISHED])
-def test_the_line_of_an_alarm_is_compared(transition: Transition) -> None:
-    found = Comparison("tray1")
-    compare_alarms([alarm(transition, "fan 0: some words")], [alarm(transition, "fan 0: other words")], 100, found)
-    assert (found.alarms_equal, found.alarms_different) == (0, 1)
-
-
 def drag_up(change: float) -> Diagnosis:
     return Diagnosis(cause="drag_up", probability=0.7, parameter="drag", change=change)
 

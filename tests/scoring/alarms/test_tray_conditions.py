@@ -12,7 +12,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fantwin.schemas.enums import Action, Severity, Transition
-from fantwin.schemas.units import NS_PER_S
 from fantwin.scoring.alarms.alarm_flags import is_retained, is_silenced
 from fantwin.scoring.alarms.alarm_state import UNTIL_IT_CLEARS_T_NS, ConditionSettings
 from fantwin.scoring.alarms.tray_conditions import AlarmEvent, Decided, TrayConditions
@@ -221,15 +220,6 @@ def test_commissioning_is_granted_and_does_not_change_the_alarm():
     before = conditions.alarm_state(0)
     assert conditions.request(Action.COMMISSION, [0], 0) == [(0, Transition.COMMISSIONING, "")]
     assert conditions.alarm_state(0) == before
-
-
-def test_only_the_last_alarms_of_a_fan_can_still_be_marked() -> None:
-    conditions, onsets = conditions_of(earlier_alarms=2), [NS_PER_S * second for second in (10, 20, 30, 40)]
-    for onset_t_ns in onsets:
-        for is_active in (True, False):
-            active = np.array([is_active])
-            conditions.update(Decided(onset_t_ns, active | True, active, 1 * active, np.array([onset_t_ns]), STEP_NS))
-    assert [conditions.onset_meant(0, onset_t_ns) for onset_t_ns in onsets] == [0, *onsets[1:]]
 
 
 # any history: decisions on two fans with requests between them, by the number of the one before which each is asked
