@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bench.detection.plant import START_NS
-from fantwin.pipeline.config.models import Config
+from fantwin.pipeline.config.settings import Config
 from fantwin.pipeline.runtime.stage import Context
 
 

@@ -26,7 +26,7 @@ from fantwin.pipeline.acquisition.input_quality import InputQuality
 from fantwin.pipeline.acquisition.plausibility import Plausibility
 from fantwin.pipeline.acquisition.raw_messages import ReceivedReading, raw_message
 from fantwin.pipeline.acquisition.sample_blocks import BlockEvent, ReadingBlock, SampleBlocks
-from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageConfig, StageError
 from fantwin.pipeline.sources.kinds import build_source

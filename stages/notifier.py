@@ -11,7 +11,7 @@ import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
 
-from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.outputs.notify.alertmanager import AlertSender
 from fantwin.pipeline.outputs.notify.config import NotifierConfig
 from fantwin.pipeline.outputs.notify.notification_flow import Changes, Notifications

@@ -20,7 +20,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from fantwin.pipeline.config.models import TrayConfig, nearest
+from fantwin.pipeline.config.settings import TrayConfig, nearest
 from fantwin.pipeline.errors import refusals
 from fantwin.pipeline.extras import missing_extra, require
 from fantwin.pipeline.outputs.rerun.fleet_view import is_fleet

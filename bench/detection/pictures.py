@@ -27,7 +27,8 @@ from fantwin.pipeline.outputs.rerun.band_plot import BESIDE, FAULT, MEASURED, OU
 from fantwin.pipeline.prediction.tray_integrator import TrayIntegrator, TwinIntegratorConfig
 from fantwin.pipeline.prediction.tray_twin import load_tray_twin
 from fantwin.pipeline.prediction.twin_file import TwinFile
-from fantwin.pipeline.tray_scoring.healthy_twin import ScorerConfig, known_of
+from fantwin.pipeline.tray_scoring.healthy_twin import known_of
+from fantwin.pipeline.tray_scoring.scorer_config import ScorerConfig
 from fantwin.pipeline.tray_scoring.tray_scorer import TrayScorer
 from fantwin.schemas.enums import Transition
 from fantwin.schemas.messages import Array, Grid

@@ -22,7 +22,7 @@ from bench.detection.rack_scoring import Episode, episodes
 from bench.detection.racks import DAY_S, RACK_FANS, TACHOS
 from bench.stage_context import stage_context
 from fantwin.pipeline.config.loading import parse_config
-from fantwin.pipeline.config.models import Config
+from fantwin.pipeline.config.settings import Config
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.learning.healthy_history import HealthyHistory
 from fantwin.pipeline.learning.learning_process import LearningProcess

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bench.detection.plant import START_NS
-from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.site.fleet import Fan
 from fantwin.schemas.enums import FanState, Severity, Statistic, Transition
 from fantwin.schemas.envelope import Envelope

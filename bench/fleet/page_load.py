@@ -36,7 +36,7 @@ from bench.printing import JsonOption, progress, show
 from bench.runtime.stage_memory import free_endpoint
 from fantwin.pipeline.bus.publisher import Publisher
 from fantwin.pipeline.bus.session import Bus
-from fantwin.pipeline.config.models import BusConfig
+from fantwin.pipeline.config.settings import BusConfig
 from fantwin.pipeline.selftest.scratch_site import FANTWIN
 from fantwin.schemas.codec import encode, type_name
 from fantwin.schemas.enums import Severity, Transition

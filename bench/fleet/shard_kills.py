@@ -30,7 +30,7 @@ from bench.fleet.fed_outcome import RECORDS_SCORES, Outcome, outcome_of
 from bench.fleet.fed_trays import BUSY, FREE_RUN_BEGINS_AGAIN_S, SITE, Feed, Load, NewestScores
 from bench.printing import JsonOption, progress, show
 from fantwin.pipeline.bus.session import Bus
-from fantwin.pipeline.config.models import BusConfig
+from fantwin.pipeline.config.settings import BusConfig
 from fantwin.pipeline.site.site_watcher import SiteWatcher
 
 sys.path.insert(0, str(Path(__file__).parents[2]))

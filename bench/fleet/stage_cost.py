@@ -31,7 +31,7 @@ from bench.stage_context import stage_context
 from bench.training.published_fan import RATE_HZ, rough_run
 from fantwin.pipeline.cli.twins.calibrate import calibrate
 from fantwin.pipeline.config.loading import parse_config
-from fantwin.pipeline.config.models import Config
+from fantwin.pipeline.config.settings import Config
 from fantwin.pipeline.recordings.writing import RecordingWriter
 from fantwin.pipeline.runtime.building import build_parts
 from fantwin.pipeline.runtime.stage import Core, load_stage

@@ -28,7 +28,7 @@ from bench.fleet.fed_trays import BUSY, SITE, Feed, Load, NewestScores
 from bench.fleet.network_hosts import ALONE, Host, Process, bridge
 from bench.printing import JsonOption, progress, show
 from fantwin.pipeline.bus.session import Bus
-from fantwin.pipeline.config.models import BusConfig
+from fantwin.pipeline.config.settings import BusConfig
 from fantwin.pipeline.site.site_watcher import SiteWatcher
 from fantwin.schemas.messages import Raw
 

@@ -28,7 +28,7 @@ from bench.runtime.stage_memory import free_endpoint
 from fantwin.pipeline.bus.publisher import Publisher
 from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.config.loading import parse_config
-from fantwin.pipeline.config.models import BusConfig, Config
+from fantwin.pipeline.config.settings import BusConfig, Config
 from fantwin.pipeline.runtime.runner import Runner
 from fantwin.schemas.codec import encode, type_name
 from fantwin.schemas.enums import StageStatus

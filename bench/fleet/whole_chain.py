@@ -30,7 +30,7 @@ from bench.runtime.stage_memory import free_endpoint, memory_mb
 from bench.training.published_fan import RATE_HZ
 from fantwin.pipeline.bus.recovery import ALL_PRODUCERS, recovery_key
 from fantwin.pipeline.bus.session import Bus
-from fantwin.pipeline.config.models import BusConfig
+from fantwin.pipeline.config.settings import BusConfig
 from fantwin.pipeline.site.site_watcher import SiteWatcher
 from fantwin.schemas.codec import decode, encode, type_name
 from fantwin.schemas.enums import Transition

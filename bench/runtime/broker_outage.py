@@ -29,7 +29,7 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from bench.printing import JsonOption, progress, show
 from fantwin.pipeline.bus.session import Bus
-from fantwin.pipeline.config.models import BusConfig
+from fantwin.pipeline.config.settings import BusConfig
 from fantwin.pipeline.site.site_watcher import SiteWatcher
 from fantwin.schemas.codec import CodecError, decode, encode, type_name
 from fantwin.schemas.enums import Action

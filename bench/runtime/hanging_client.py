@@ -33,7 +33,7 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from bench.printing import JsonOption, progress, show
 from fantwin.pipeline.bus.session import Bus
-from fantwin.pipeline.config.models import BusConfig
+from fantwin.pipeline.config.settings import BusConfig
 from fantwin.schemas.codec import encode, type_name
 from fantwin.schemas.enums import FanState
 from fantwin.schemas.header import Header

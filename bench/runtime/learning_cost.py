@@ -27,7 +27,7 @@ from bench.printing import progress
 from bench.runtime.stage_memory import free_endpoint, memory_mb
 from bench.training.published_fan import RATE_HZ, ROUGH_RANGE, published_fan, random_stairs
 from fantwin.pipeline.bus.session import Bus
-from fantwin.pipeline.config.models import BusConfig
+from fantwin.pipeline.config.settings import BusConfig
 from fantwin.pipeline.learning.healthy_history import HealthyHistory
 from fantwin.pipeline.learning.learning_process import VARIABLE
 from fantwin.pipeline.learning.versions import TwinVersions, learning_folder

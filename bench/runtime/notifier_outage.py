@@ -23,7 +23,7 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from bench.printing import JsonOption, progress, show
 from fantwin.pipeline.bus.session import Bus
-from fantwin.pipeline.config.models import BusConfig
+from fantwin.pipeline.config.settings import BusConfig
 from fantwin.pipeline.outputs.notify.sending import MAY_BE_REPEATED
 from fantwin.pipeline.site.alarm_history import FILE
 from fantwin.schemas.codec import encode, type_name

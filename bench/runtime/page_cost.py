@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 from playwright.sync_api import sync_playwright
 
-from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.outputs.web.config import GatewayConfig
 from fantwin.pipeline.runtime.stage import Context, Core
 from fantwin.pipeline.selftest.scratch_site import free_port

@@ -12,8 +12,8 @@ from fantwin.client.errors import NotAllowedError, NotReceivedError, SendError
 from fantwin.client.tray import READING, Tray
 from fantwin.pipeline.bus.errors import BusError
 from fantwin.pipeline.bus.session import Bus
-from fantwin.pipeline.config.models import BusConfig
 from fantwin.pipeline.config.roles import SOURCE
+from fantwin.pipeline.config.settings import BusConfig
 from fantwin.schemas.topics import tray_key
 from fantwin.schemas.units import SpeedUnit
 

@@ -14,7 +14,7 @@ import numpy as np
 from fantwin.pipeline.acquisition.acquisition_watch import TrayAcquisition
 from fantwin.pipeline.acquisition.device_commands import not_sent, reason_in
 from fantwin.pipeline.bus.session import Bus
-from fantwin.pipeline.config.models import Config, TrayConfig
+from fantwin.pipeline.config.settings import Config, TrayConfig
 from fantwin.pipeline.errors import UsageError, UserError
 from fantwin.schemas.codec import encode, type_name
 from fantwin.schemas.header import Header

@@ -7,7 +7,7 @@ import re
 from collections import Counter
 from collections.abc import Mapping
 
-from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.sources.source import SampleSource, within
 from fantwin.schemas.messages import Command
 from fantwin.schemas.units import RAD_S_PER_UNIT

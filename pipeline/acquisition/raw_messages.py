@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.sources.source import Reading
 from fantwin.pipeline.timebase.device_clock import UINT32
 from fantwin.schemas.channels import CHANNELS

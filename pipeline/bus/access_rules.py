@@ -14,8 +14,8 @@ from typing import Any
 import zenoh
 
 from fantwin.pipeline.bus.recovery import ALL_PRODUCERS, recovery_key
-from fantwin.pipeline.config.models import Config
 from fantwin.pipeline.config.roles import Role, roles_of
+from fantwin.pipeline.config.settings import Config
 from fantwin.schemas.topics import (
     HEALTH,
     ROOT,

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from fantwin.pipeline.bus.errors import BusError
 from fantwin.pipeline.certificates import Certificate, check_pair, read_certificate, require_valid
-from fantwin.pipeline.config.models import ROLE_PLACE, SecurityConfig
+from fantwin.pipeline.config.settings import ROLE_PLACE, SecurityConfig
 from fantwin.pipeline.errors import UserError
 
 

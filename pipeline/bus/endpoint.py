@@ -7,7 +7,7 @@ import re
 import socket
 
 from fantwin.pipeline.bus.errors import BusError
-from fantwin.pipeline.config.models import BETWEEN_ENDPOINTS, BusConfig
+from fantwin.pipeline.config.settings import BETWEEN_ENDPOINTS, BusConfig
 
 _ADDRESS = re.compile(r"(tcp|tls|ws|udp|quic)/(\[[^\]]*\]|[^:/?#]*):(\d+)(?:[?#].*)?")
 _CONNECTING = ("tcp", "tls", "ws")

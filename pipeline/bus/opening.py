@@ -25,7 +25,7 @@ from fantwin.pipeline.bus.endpoint import accepts_connections, foreign_program, 
 from fantwin.pipeline.bus.errors import BusError, reason
 from fantwin.pipeline.bus.link import LEASE_MS, OPEN_TIMEOUT_MS, PEER_WAIT_US, RETRY
 from fantwin.pipeline.bus.settings import Settings
-from fantwin.pipeline.config.models import BusConfig
+from fantwin.pipeline.config.settings import BusConfig
 
 if TYPE_CHECKING:
     from fantwin.pipeline.bus.credentials import Credentials

@@ -32,8 +32,8 @@ from fantwin.pipeline.bus.opening import (
 from fantwin.pipeline.bus.publisher import KeptBytes, Publisher
 from fantwin.pipeline.bus.recovery import ALL_PRODUCERS, LAST_SEQUENCE, Answer, OnAnswer, RecoveryRequest, recovery_key
 from fantwin.pipeline.bus.rights import awaited_rights, claims_of, granted_rights, refused_by_router, refused_in_words
-from fantwin.pipeline.config.models import BusConfig, Config
 from fantwin.pipeline.config.roles import READERS
+from fantwin.pipeline.config.settings import BusConfig, Config
 from fantwin.schemas.topics import Topic, key_in_words, largest_bytes
 
 SAID_AFTER_S = 3.0

@@ -10,7 +10,7 @@ from typing import Annotated, TypeAlias
 import typer
 
 from fantwin.pipeline.bus.endpoint import is_beyond_loopback
-from fantwin.pipeline.config.models import BusConfig
+from fantwin.pipeline.config.settings import BusConfig
 from fantwin.pipeline.errors import UsageError
 
 AGAIN_S = 60.0

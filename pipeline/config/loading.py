@@ -17,7 +17,8 @@ from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
 from pydantic import BaseModel, Field, ValidationError
 from pydantic_core import ErrorDetails
 
-from fantwin.pipeline.config.models import (
+from fantwin.pipeline.config.registry import STAGES
+from fantwin.pipeline.config.settings import (
     BusConfig,
     Config,
     ConfigError,
@@ -28,7 +29,6 @@ from fantwin.pipeline.config.models import (
     TrayConfig,
     nearest,
 )
-from fantwin.pipeline.config.registry import STAGES
 from fantwin.pipeline.plugins import LEFT_OUT
 from fantwin.pipeline.sources.kinds import SOURCE_KINDS, source_config
 from fantwin.pipeline.sources.source import SourceConfig

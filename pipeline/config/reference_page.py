@@ -16,8 +16,8 @@ from typing import Any
 from pydantic import BaseModel
 
 from fantwin.pipeline.config.loading import LARGEST_FILE_BYTES, top_level
-from fantwin.pipeline.config.models import BusConfig, LauncherConfig, SecurityConfig, TrayConfig
 from fantwin.pipeline.config.registry import STAGES
+from fantwin.pipeline.config.settings import BusConfig, LauncherConfig, SecurityConfig, TrayConfig
 from fantwin.pipeline.sources.kinds import SOURCE_KINDS
 from fantwin.pipeline.sources.source import SourceConfig
 from fantwin.schemas.tacho import Tacho

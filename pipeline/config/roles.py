@@ -11,8 +11,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
-from fantwin.pipeline.config.models import OWN_ROLES, Config
 from fantwin.pipeline.config.registry import STAGES
+from fantwin.pipeline.config.settings import OWN_ROLES, Config
 from fantwin.pipeline.config.shards import Shard, shard_of, shards_of
 from fantwin.schemas.topics import ALL_TRAYS, BY_NAME, TOPICS, makes_samples_of_samples
 

@@ -13,8 +13,8 @@ from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from fantwin.pipeline.config.models import Config
 from fantwin.pipeline.config.registry import STAGES
+from fantwin.pipeline.config.settings import Config
 from fantwin.pipeline.errors import UsageError
 from fantwin.schemas.topics import ALL_TRAYS, stage_label
 

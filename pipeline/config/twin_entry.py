@@ -8,7 +8,7 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
-from fantwin.pipeline.config.models import Config, ConfigError
+from fantwin.pipeline.config.settings import Config, ConfigError
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.files import replace_file
 

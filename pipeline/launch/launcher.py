@@ -13,9 +13,9 @@ from typing import Any
 from fantwin.pipeline.bus.errors import NoAnswerError
 from fantwin.pipeline.bus.opening import credentials_of
 from fantwin.pipeline.bus.session import Bus, join_bus
-from fantwin.pipeline.config.models import Config
 from fantwin.pipeline.config.registry import LEARNER, RECORDER, STAGES
 from fantwin.pipeline.config.roles import role_names, roles_of
+from fantwin.pipeline.config.settings import Config
 from fantwin.pipeline.config.shards import StageProcess, own_file, process_list
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.launch.hang_detector import HangDetector

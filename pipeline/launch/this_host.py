@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from fantwin.pipeline.config.loading import load_config
-from fantwin.pipeline.config.models import Config
 from fantwin.pipeline.config.registry import GATEWAY, STAGES
+from fantwin.pipeline.config.settings import Config
 from fantwin.pipeline.config.shards import Shard, process_list
 from fantwin.pipeline.extras import missing_extra
 from fantwin.pipeline.http_server import listening_socket

@@ -13,7 +13,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.prediction.new_samples import BEGINNING_NS, NewSamples, are_newer
 from fantwin.pipeline.prediction.twin_file import TwinFile, learned_twin
 from fantwin.pipeline.runtime.stage import Core, StageError

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.prediction.onnx_metadata import read_onnx_metadata
 from fantwin.pipeline.runtime.stage import StageError
 from fantwin.schemas.messages import Array

@@ -17,7 +17,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.prediction.tray_twin import TrayTwin, for_fans, read_file, tray_twin, twin_path
 from fantwin.pipeline.runtime.stage import Context, StageError
 from fantwin.schemas.messages import Array

@@ -18,16 +18,13 @@ from typing import NamedTuple
 from fantwin.pipeline.recordings.clips.alarm_clips import AlarmClips
 from fantwin.pipeline.recordings.clips.clip import Clip
 from fantwin.pipeline.recordings.disk import Disk, DiskError
-from fantwin.pipeline.recordings.parts import RecordingParts
+from fantwin.pipeline.recordings.parts import LEAST_PART_S, PART_BYTES, PART_S, RecordingParts
 from fantwin.pipeline.recordings.recorder_config import CLIPS_SHARE, PARTS_WITHIN_LIMITS, RecorderConfig
 from fantwin.pipeline.recordings.records import RecordingError
 from fantwin.pipeline.recordings.stored_recordings import Stored, StoredPart, StoredRecordings
 from fantwin.schemas.units import NS_PER_S
 
 DAY_NS = 86_400 * NS_PER_S
-PART_BYTES, PART_S = 100_000_000, 86_400.0
-"""a new part begins at this size and after this time, and earlier where the limits are small"""
-LEAST_PART_S = 1.0
 AGED_S = 3600.0
 """between two parts that are deleted by age alone, unless a part has ended: the clock may be wrong"""
 _LOG = logging.getLogger(__name__)

@@ -30,6 +30,9 @@ from fantwin.pipeline.recordings.sequence_ledger import SequenceLedger
 from fantwin.pipeline.recordings.stored_recordings import Stored, StoredPart, StoredRecordings
 from fantwin.pipeline.recordings.writing import RecordingWriter
 
+PART_BYTES, PART_S = 100_000_000, 86_400.0
+"""a new part begins at this size and after this time, and earlier where the limits on the disk are small"""
+LEAST_PART_S = 1.0
 PARTS_SEARCHED = 3
 """for the last messages of a topic"""
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from pydantic import Field, field_validator
 
-from fantwin.pipeline.config.models import TrayConfig, nearest
+from fantwin.pipeline.config.settings import TrayConfig, nearest
 from fantwin.pipeline.runtime.stage import StageConfig
 from fantwin.schemas.topics import BY_NAME, TOPICS
 

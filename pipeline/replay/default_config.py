@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from fantwin.pipeline.config.loading import parse_config
-from fantwin.pipeline.config.models import Config
+from fantwin.pipeline.config.settings import Config
 from fantwin.pipeline.prediction.tray_twin import load_tray_twin
 from fantwin.pipeline.recordings.left_out import left_out_hint
 from fantwin.pipeline.recordings.reading import RecordingError, RecordingMetadata, read_recording

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from fantwin.pipeline.config.loading import load_config, parse_config
-from fantwin.pipeline.config.models import Config
+from fantwin.pipeline.config.settings import Config
 from fantwin.pipeline.recordings.metadata import CONFIGURATION
 from fantwin.pipeline.recordings.reading import RecordingError, RecordingMetadata, read_metadata
 from fantwin.schemas.envelope import Envelope

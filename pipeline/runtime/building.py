@@ -7,8 +7,8 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from fantwin.pipeline.bus.session import Bus, join_bus
-from fantwin.pipeline.config.models import Config
 from fantwin.pipeline.config.roles import role_names
+from fantwin.pipeline.config.settings import Config
 from fantwin.pipeline.config.shards import Shard
 from fantwin.pipeline.runtime.kept_snapshots import KeptSnapshots, keeps_snapshots
 from fantwin.pipeline.runtime.second_owner import refuse_second

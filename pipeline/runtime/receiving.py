@@ -10,8 +10,8 @@ from collections import Counter
 from collections.abc import Sequence
 
 from fantwin.pipeline.bus.session import Bus
-from fantwin.pipeline.config.models import Config
 from fantwin.pipeline.config.roles import roles_of
+from fantwin.pipeline.config.settings import Config
 from fantwin.pipeline.config.shards import Shard
 from fantwin.pipeline.runtime.believed_outputs import BelievedOutputs
 from fantwin.pipeline.runtime.due_messages import DueMessages

@@ -17,8 +17,8 @@ from itertools import chain
 
 from fantwin.pipeline.bus.identity import new_session_id
 from fantwin.pipeline.bus.kept_messages import KeptQuery
-from fantwin.pipeline.config.models import Config
 from fantwin.pipeline.config.registry import STAGES
+from fantwin.pipeline.config.settings import Config
 from fantwin.pipeline.config.shards import Shard, chosen_shard
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.runtime.building import abort, build_and_join

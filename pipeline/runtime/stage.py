@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
-from fantwin.pipeline.config.models import Config, Section, TrayConfig
 from fantwin.pipeline.config.registry import STAGES
+from fantwin.pipeline.config.settings import Config, Section, TrayConfig
 from fantwin.pipeline.config.shards import own_file
 from fantwin.pipeline.errors import UserError
 from fantwin.schemas.envelope import Envelope

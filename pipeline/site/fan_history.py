@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.schemas.channels import CHANNELS
 from fantwin.schemas.messages import Array, Score
 from fantwin.schemas.units import NS_PER_S

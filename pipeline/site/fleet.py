@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.site.trace import SILENT, state_codes, state_name
 from fantwin.schemas.enums import FanState, InvalidReason, Transition
 from fantwin.schemas.fields import LARGEST_ENUM_VALUE

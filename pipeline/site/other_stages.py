@@ -7,8 +7,8 @@ from pathlib import Path
 from urllib.parse import quote
 
 from fantwin.pipeline.config.loading import parse_config
-from fantwin.pipeline.config.models import Config
 from fantwin.pipeline.config.registry import RECORDER
+from fantwin.pipeline.config.settings import Config
 from fantwin.pipeline.config.shards import own_file, shards_of
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.runtime.stage import Context

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.recordings.clips.clip import Clip
 from fantwin.pipeline.site.fan_history import Curves
 from fantwin.pipeline.site.fleet import SHOWN_CLASSES, Fan, FanGroup, FanNow

@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from fantwin.pipeline.config.models import TrayConfig
 from fantwin.pipeline.config.registry import STAGES
+from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.site.alarm_book import AlarmBook
 from fantwin.pipeline.site.alarm_history import AlarmHistory
 from fantwin.pipeline.site.alarm_rates import AlarmRates

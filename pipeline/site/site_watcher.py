@@ -8,8 +8,8 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from itertools import chain
 
 from fantwin.pipeline.bus.session import Bus
-from fantwin.pipeline.config.models import TrayConfig
 from fantwin.pipeline.config.roles import Role, roles_of_stages
+from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.config.shards import StageProcess
 from fantwin.pipeline.runtime.believed_outputs import BelievedOutputs
 from fantwin.pipeline.runtime.lost_sessions import LostSessions

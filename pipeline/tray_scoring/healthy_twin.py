@@ -1,17 +1,17 @@
-"""Configuration of the scorer, and what it knows about the twin of its tray."""
+"""Facts about the twin of a tray that its scorer uses."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
 
-from pydantic import Field, ValidationError
+from pydantic import ValidationError
 
 from fantwin.pipeline.prediction.tray_twin import TrayTwin
-from fantwin.pipeline.runtime.stage import Context, StageConfig, StageError
+from fantwin.pipeline.runtime.stage import Context, StageError
 from fantwin.pipeline.tray_scoring.modelled_fans import modelled_fans
+from fantwin.pipeline.tray_scoring.scorer_config import FALSE_ALARMS_PER_DAY
 from fantwin.schemas.standstill import Standstill
 from fantwin.schemas.tacho import Tacho
 from fantwin.schemas.units import S_PER_DAY
@@ -21,35 +21,6 @@ from fantwin.scoring.diagnosis.what_would_tell import Advice
 from fantwin.scoring.model.operation import Fans
 from fantwin.scoring.model.priors import Priors
 from fantwin.scoring.unseen_error import UnseenError
-
-FALSE_ALARMS_PER_DAY = 0.03
-"""declared, of a fan, where nobody says otherwise: about one a month"""
-
-
-class ScorerConfig(StageConfig):
-    """Section `[scorer]`."""
-
-    false_alarms_per_day: float | None = Field(
-        default=None,
-        gt=0,
-        le=8640,
-        description="declared rate of false alarms of a fan; default: that of the twin's calibration, else 0.03, "
-        "about one a month",
-    )
-    alarm_share: float = Field(
-        default=0.1, gt=0, description="share of the speed that a fault takes, from which a warning is an alarm"
-    )
-    alarms_need: tuple[Literal["confirm", "reset"], ...] = Field(
-        default=(),
-        description="what operators must do, besides acknowledging an alarm: confirm it, too, or reset it once it has "
-        "cleared",
-    )
-    asks_for_snapshots: bool | None = Field(
-        default=None,
-        description="whether it continues from the snapshot that a recorder keeps, where that is newer than its own "
-        "file, as on another host; with false and without the file, everything starts from the beginning; default: if "
-        "it is one of several shards",
-    )
 
 
 @dataclass(frozen=True, eq=False)

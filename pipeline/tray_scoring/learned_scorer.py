@@ -16,7 +16,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Protocol
 
-from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.prediction.new_samples import BEGINNING_NS, are_newer
 from fantwin.pipeline.prediction.onnx_metadata import without_metadata
 from fantwin.pipeline.prediction.tray_twin import TrayTwin, tray_twin

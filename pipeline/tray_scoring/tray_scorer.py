@@ -14,7 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from fantwin.pipeline.tray_scoring.healthy_twin import HealthyTwin, ScorerConfig
+from fantwin.pipeline.tray_scoring.healthy_twin import HealthyTwin
+from fantwin.pipeline.tray_scoring.scorer_config import ScorerConfig
 from fantwin.schemas.enums import Severity, Statistic
 from fantwin.schemas.messages import Alarm, Array, Diagnosis, Prediction, Score
 from fantwin.schemas.units import NS_PER_S

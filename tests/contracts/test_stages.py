@@ -18,8 +18,8 @@ import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
-from fantwin.pipeline.config.models import TrayConfig
 from fantwin.pipeline.config.registry import STAGES
+from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.outputs.mqtt.config import MqttConfig
 from fantwin.pipeline.outputs.mqtt.link import Received
 from fantwin.pipeline.outputs.mqtt.outbox import Outgoing

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from fantwin.pipeline.config.loading import top_level
-from fantwin.pipeline.config.models import OWN_ROLES
 from fantwin.pipeline.config.registry import RESERVED, why_no_output
+from fantwin.pipeline.config.settings import OWN_ROLES
 from fantwin.pipeline.plugins import StageRow
 from tests.support.built_wheel import unpacked_wheel
 from tests.support.running_chain import RunningCommand, eventually

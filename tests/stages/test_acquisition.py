@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from cobs import cobs
 
-from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.sources.serial.port import ReceivedBytes
 from fantwin.pipeline.sources.source import LinkDown, LinkUp
 from fantwin.pipeline.timebase.host_clock import HostClock

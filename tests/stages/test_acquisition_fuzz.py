@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.sources.serial.config import SerialConfig
 from fantwin.pipeline.sources.serial.port import ReceivedBytes
 from fantwin.pipeline.sources.source import LinkDown, LinkUp

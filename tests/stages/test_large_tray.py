@@ -10,7 +10,7 @@ import pytest
 
 from fantwin.pipeline.acquisition.sample_blocks import ReadingBlock
 from fantwin.pipeline.config.loading import parse_config
-from fantwin.pipeline.config.models import Config, ConfigError
+from fantwin.pipeline.config.settings import Config, ConfigError
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.prediction.twin_file import TwinFile
 from fantwin.pipeline.runtime.stage import Context, Core, load_stage

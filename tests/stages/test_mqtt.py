@@ -14,7 +14,7 @@ import pytest
 import trustme
 from paho.mqtt.enums import CallbackAPIVersion
 
-from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.outputs.mqtt.config import MqttConfig
 from fantwin.pipeline.runtime.stage import Context, StageError
 from fantwin.pipeline.sources.mqtt.config import MqttConfig as SourceConfig

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fantwin.pipeline.config.loading import parse_config
-from fantwin.pipeline.config.models import ConfigError, TrayConfig
+from fantwin.pipeline.config.settings import ConfigError, TrayConfig
 from fantwin.pipeline.recordings import disk_room
 from fantwin.pipeline.recordings.contents import contents_of
 from fantwin.pipeline.recordings.reading import read_metadata, read_recording

@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
-from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.runtime.stage import Context, StageError
-from fantwin.pipeline.tray_scoring.healthy_twin import FALSE_ALARMS_PER_DAY, ScorerConfig
+from fantwin.pipeline.tray_scoring.scorer_config import FALSE_ALARMS_PER_DAY, ScorerConfig
 from fantwin.schemas.units import S_PER_DAY
 from fantwin.stages.scorer import NOT_CALIBRATED, STAGE, ScorerCore
 from tests.support.scored_blocks import STEP, feed, prediction_of, with_step

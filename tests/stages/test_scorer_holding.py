@@ -14,7 +14,7 @@ import pytest
 from numpy.typing import NDArray
 
 from fantwin.pipeline.tray_scoring import tray_scorer
-from fantwin.pipeline.tray_scoring.healthy_twin import ScorerConfig
+from fantwin.pipeline.tray_scoring.scorer_config import ScorerConfig
 from fantwin.schemas.blocks import join
 from fantwin.schemas.enums import Severity, Statistic, Transition
 from fantwin.schemas.messages import Prediction, Raw

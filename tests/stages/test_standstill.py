@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from fantwin.pipeline.tray_scoring.healthy_twin import ScorerConfig, known_of
+from fantwin.pipeline.tray_scoring.healthy_twin import known_of
+from fantwin.pipeline.tray_scoring.scorer_config import ScorerConfig
 from fantwin.schemas.blocks import cut
 from fantwin.schemas.enums import FanState, InvalidReason, Transition
 from fantwin.schemas.messages import Alarm, Grid, Prediction, Score

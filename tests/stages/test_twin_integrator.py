@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.prediction import free_run
 from fantwin.pipeline.prediction.twin_file import TwinFile
 from fantwin.pipeline.runtime.stage import Context

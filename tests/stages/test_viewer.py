@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.outputs.rerun.viewer_core import (
     FLUSH_PERIOD_NS,
     REPEAT_STATES_NS,

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.outputs.rerun.fleet_view import FleetView
 from fantwin.pipeline.outputs.rerun.viewer_core import FLUSH_PERIOD_NS, ViewerCore
 from fantwin.pipeline.runtime.stage import StageError

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.outputs.rerun.viewer_core import ViewerCore
 from fantwin.pipeline.runtime.stage import Context
 from fantwin.schemas.messages import Alarm, Score

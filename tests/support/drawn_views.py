@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.outputs.rerun.alarm_log import LogLine
 from fantwin.pipeline.outputs.rerun.rerun_sink import RerunSink
 from fantwin.pipeline.outputs.rerun.wear_points import WearPoints

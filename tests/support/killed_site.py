@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from fantwin.pipeline.config.loading import load_config
-from fantwin.pipeline.config.models import Config
+from fantwin.pipeline.config.settings import Config
 from fantwin.pipeline.prediction.twin_file import TwinFile
 from fantwin.pipeline.recordings.writing import RecordingWriter
 from fantwin.pipeline.runtime.consumed import ConsumedReports

@@ -6,7 +6,7 @@ import stat
 from pathlib import Path
 from typing import Any
 
-from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.outputs.notify.config import NotifierConfig
 from fantwin.pipeline.runtime.stage import Context
 from fantwin.schemas.enums import Severity, Transition

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.learning.healthy_history import HealthyHistory, healthy_recordings, recordings_near_alarms
 from fantwin.pipeline.learning.learning_process import LearningProcess
 from fantwin.pipeline.learning.ordinary_operation import OrdinaryOperation

@@ -12,7 +12,7 @@ from typing import Any, ClassVar, Protocol
 from asyncua.client.client import Client as OpcuaClient
 from prometheus_client.parser import text_string_to_metric_families
 
-from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.outputs.notify.config import NotifierConfig
 from fantwin.pipeline.outputs.rerun.viewer_core import FLUSH_PERIOD_NS, ViewerCore
 from fantwin.schemas.envelope import Envelope

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from fantwin.pipeline.bus.session import Bus
-from fantwin.pipeline.config.models import BusConfig
+from fantwin.pipeline.config.settings import BusConfig
 from fantwin.schemas.codec import encode, type_name
 from fantwin.schemas.enums import StageStatus
 from fantwin.schemas.header import Header

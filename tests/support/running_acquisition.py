@@ -11,7 +11,7 @@ import numpy as np
 
 from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.config.loading import parse_config
-from fantwin.pipeline.config.models import BusConfig, Config
+from fantwin.pipeline.config.settings import BusConfig, Config
 from fantwin.pipeline.config.shards import chosen_shard
 from fantwin.pipeline.runtime.runner import Runner
 from fantwin.schemas.codec import decode

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from fantwin.pipeline.bus.session import Bus
-from fantwin.pipeline.config.models import BusConfig, TrayConfig
+from fantwin.pipeline.config.settings import BusConfig, TrayConfig
 from fantwin.pipeline.selftest.scratch_site import FANTWIN
 from fantwin.pipeline.site.site_state import StageView
 from fantwin.pipeline.site.site_watcher import SiteWatcher

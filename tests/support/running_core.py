@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
-from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.runtime.stage import Context, Stage
 from fantwin.pipeline.site.site_core import SiteCore
 from fantwin.schemas.envelope import Envelope

@@ -8,7 +8,7 @@ from typing import Any
 from fantwin.pipeline.config.loading import load_config
 from fantwin.pipeline.runtime.runner import Runner
 from fantwin.pipeline.runtime.stage import BuiltStage, Core, Stage
-from fantwin.pipeline.tray_scoring.healthy_twin import ScorerConfig
+from fantwin.pipeline.tray_scoring.scorer_config import ScorerConfig
 from tests.support.running_chain import DEMO
 
 

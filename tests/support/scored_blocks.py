@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fantwin.pipeline.tray_scoring.healthy_twin import HealthyTwin, ScorerConfig
+from fantwin.pipeline.tray_scoring.healthy_twin import HealthyTwin
+from fantwin.pipeline.tray_scoring.scorer_config import ScorerConfig
 from fantwin.pipeline.tray_scoring.snapshot_store import SnapshotStore
 from fantwin.schemas.enums import Action, InvalidReason
 from fantwin.schemas.header import Header

@@ -14,7 +14,7 @@ from fantwin.pipeline.bus.credentials import Credentials, checked_credentials
 from fantwin.pipeline.bus.router import open_router
 from fantwin.pipeline.bus.settings import Settings
 from fantwin.pipeline.config.loading import parse_config
-from fantwin.pipeline.config.models import Config
+from fantwin.pipeline.config.settings import Config
 from fantwin.schemas.topics import alive_key, rights_key
 from tests.support.ports import free_port
 from tests.support.running_chain import eventually

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from fantwin.pipeline.acquisition.sample_blocks import SampleBlocks
-from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.sources.serial.config import SerialConfig
 from fantwin.pipeline.sources.serial.port import ReceivedBytes
 from fantwin.pipeline.sources.serial.source import ByteLink, SerialSource

@@ -8,7 +8,7 @@ from pathlib import Path
 from cryptography.hazmat.primitives.serialization import Encoding
 
 from fantwin.pipeline.certificates import Authority, write_file, write_pair
-from fantwin.pipeline.config.models import SecurityConfig
+from fantwin.pipeline.config.settings import SecurityConfig
 
 HOSTS = ("localhost", "127.0.0.1")
 DAY = timedelta(days=1)

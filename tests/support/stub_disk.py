@@ -9,7 +9,7 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.recordings.disk import DiskError
 from fantwin.pipeline.recordings.indexed import PartIndex
 from fantwin.pipeline.recordings.parts import RecordingParts

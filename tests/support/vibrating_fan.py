@@ -17,7 +17,7 @@ import numpy as np
 import pandas as pd
 from prometheus_client.parser import text_string_to_metric_families
 
-from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.prediction.twin_file import TwinFile
 from fantwin.pipeline.recordings import read_arrays
 from fantwin.pipeline.recordings.writing import RecordingWriter

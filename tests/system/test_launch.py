@@ -16,7 +16,7 @@ import pytest
 from mcap.reader import make_reader
 
 from fantwin.pipeline.bus.session import Bus
-from fantwin.pipeline.config.models import BusConfig
+from fantwin.pipeline.config.settings import BusConfig
 from fantwin.pipeline.recordings.reading import read_recording
 from fantwin.pipeline.site.loss_accounting import label
 from fantwin.schemas.codec import decode

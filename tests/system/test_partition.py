@@ -15,7 +15,7 @@ import pytest
 
 from fantwin.pipeline.bus.link import LEASE_MS
 from fantwin.pipeline.bus.session import Bus
-from fantwin.pipeline.config.models import BusConfig
+from fantwin.pipeline.config.settings import BusConfig
 from fantwin.pipeline.recordings.reading import read_recording
 from fantwin.pipeline.site.site_watcher import SiteWatcher
 from fantwin.schemas.codec import decode

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from fantwin.pipeline.bus.session import Bus
-from fantwin.pipeline.config.models import BusConfig
+from fantwin.pipeline.config.settings import BusConfig
 from fantwin.pipeline.recordings.reading import read_recording
 from fantwin.pipeline.site.site_watcher import SiteWatcher
 from fantwin.schemas.codec import decode

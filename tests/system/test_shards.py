@@ -18,7 +18,7 @@ import pytest
 
 from fantwin.pipeline.bus.publisher import Publisher
 from fantwin.pipeline.bus.session import Bus
-from fantwin.pipeline.config.models import BusConfig
+from fantwin.pipeline.config.settings import BusConfig
 from fantwin.pipeline.recordings.reading import read_recording
 from fantwin.pipeline.site.site_watcher import SiteWatcher
 from fantwin.schemas.codec import decode, encode, type_name

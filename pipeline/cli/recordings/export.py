@@ -20,12 +20,12 @@ from fantwin.pipeline.errors import UsageError, UserError
 from fantwin.pipeline.extras import require
 from fantwin.pipeline.files import make_folder
 from fantwin.pipeline.recordings.arrays import Block, read_topics
+from fantwin.pipeline.recordings.export_tables import Form, TableFile, open_table
 from fantwin.pipeline.recordings.left_out import left_out_hint
 from fantwin.pipeline.recordings.order import in_order
 from fantwin.pipeline.recordings.reading import read_recording
 from fantwin.pipeline.recordings.records import ACTIVE_SUFFIX
 from fantwin.pipeline.recordings.run_recordings import run_metadata
-from fantwin.pipeline.recordings.tables import Form, TableFile, open_table
 
 _PART = ".part"
 

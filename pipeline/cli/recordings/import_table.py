@@ -16,7 +16,7 @@ from pydantic import ValidationError
 
 from fantwin.pipeline.cli.options import JsonOption
 from fantwin.pipeline.cli.printing import show
-from fantwin.pipeline.config.models import NAME_PATTERN
+from fantwin.pipeline.config.settings import NAME_PATTERN
 from fantwin.pipeline.errors import UsageError, UserError
 from fantwin.pipeline.recordings.reading import TACHO_KEY
 from fantwin.pipeline.recordings.writing import RecordingWriter

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from pydantic import Field
 
 from fantwin.pipeline.config.loading import checked_section, set_key
-from fantwin.pipeline.config.models import Section
+from fantwin.pipeline.config.settings import Section
 from fantwin.pipeline.errors import UsageError, UserError
 from fantwin.pipeline.sources.simulated.table import TableDevice
 from fantwin.pipeline.sources.tables.measured_table import read_table

@@ -11,7 +11,7 @@ from rich.text import Text
 
 from fantwin.pipeline.cli.printing import duration_text, show
 from fantwin.pipeline.cli.progress import working
-from fantwin.pipeline.config.models import Config
+from fantwin.pipeline.config.settings import Config
 from fantwin.pipeline.config.shards import own_file, shards_of
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.recordings.clips.clip import require_no_clip

@@ -15,8 +15,8 @@ from rich.text import Text
 from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.cli.printing import duration_text, show
 from fantwin.pipeline.cli.watch.scorers import wait_for_stages
-from fantwin.pipeline.config.models import Config
 from fantwin.pipeline.config.roles import roles_of
+from fantwin.pipeline.config.settings import Config
 from fantwin.pipeline.config.shards import process_list
 from fantwin.pipeline.site.fleet import Fan
 from fantwin.pipeline.site.judging import JudgedChanges, Unjudged, as_judged, at_rest, unjudged

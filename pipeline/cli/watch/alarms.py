@@ -21,8 +21,8 @@ from fantwin.pipeline.cli.watch.alarm_history import show_history
 from fantwin.pipeline.cli.watch.alarm_list import show_list, word
 from fantwin.pipeline.cli.watch.scorers import ask, wait_for_stages
 from fantwin.pipeline.config.loading import load_config
-from fantwin.pipeline.config.models import Config
 from fantwin.pipeline.config.roles import OPERATOR, roles_of
+from fantwin.pipeline.config.settings import Config
 from fantwin.pipeline.errors import UsageError, UserError
 from fantwin.pipeline.recordings.remote import matching, recording_path
 from fantwin.pipeline.runtime.signals import stop_on_signals

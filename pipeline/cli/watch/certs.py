@@ -29,8 +29,8 @@ from fantwin.pipeline.certificates import (
 from fantwin.pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
 from fantwin.pipeline.cli.printing import show, table_of
 from fantwin.pipeline.config.loading import load_config
-from fantwin.pipeline.config.models import ROLE_PLACE, Config, SecurityConfig, nearest
 from fantwin.pipeline.config.roles import default_roles, roles_of
+from fantwin.pipeline.config.settings import ROLE_PLACE, Config, SecurityConfig, nearest
 from fantwin.pipeline.errors import UsageError, UserError
 
 _AUTHORITY_DAYS, _DAYS = 3653, 397

@@ -18,8 +18,8 @@ from typing import Any, Self
 import typer
 
 from fantwin.pipeline.bus.session import join_bus
-from fantwin.pipeline.config.models import Config, TrayConfig
 from fantwin.pipeline.config.registry import RECORDER
+from fantwin.pipeline.config.settings import Config, TrayConfig
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.selftest.scratch_site import lines_of, started
 from fantwin.schemas.codec import CodecError, decode

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from fantwin.pipeline.cli.watch.child_commands import RECORDING_ONLY, Commands, RecordingSite, Stopped
-from fantwin.pipeline.config.models import Config, TrayConfig
+from fantwin.pipeline.config.settings import Config, TrayConfig
 from fantwin.pipeline.config.twin_entry import write_twin
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.learning.ordinary_operation import OrdinaryOperation

@@ -27,8 +27,8 @@ from fantwin.pipeline.cli.printing import table_of
 from fantwin.pipeline.cli.progress import working
 from fantwin.pipeline.cli.watch.demo_report import Summary, summarise
 from fantwin.pipeline.cli.watch.status import stage_table
-from fantwin.pipeline.config.models import Config, TrayConfig
 from fantwin.pipeline.config.roles import roles_of
+from fantwin.pipeline.config.settings import Config, TrayConfig
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.extras import missing_extra
 from fantwin.pipeline.launch.this_host import load_for_this_host, page_addresses

@@ -28,9 +28,9 @@ from fantwin.pipeline.cli.options import DEFAULT_CONFIG, JsonOption, SetOption
 from fantwin.pipeline.cli.printing import show
 from fantwin.pipeline.cli.watch.line_check import check_line
 from fantwin.pipeline.cli.watch.other_checks import find_fans, send_test_messages
-from fantwin.pipeline.config.models import Config, ConfigError
 from fantwin.pipeline.config.registry import RECORDER, STAGES
 from fantwin.pipeline.config.roles import READERS, role_names
+from fantwin.pipeline.config.settings import Config, ConfigError
 from fantwin.pipeline.config.shards import process_list
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.extras import how_to_install

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from fantwin.pipeline.bus.session import join_bus
-from fantwin.pipeline.config.models import Config, TrayConfig
+from fantwin.pipeline.config.settings import Config, TrayConfig
 from fantwin.pipeline.prediction.tray_twin import TrayTwin, load_tray_twin, twin_path
 from fantwin.pipeline.runtime.stage import Context, StageError, load_stage
 from fantwin.pipeline.sources.tacho_evidence import find_tacho, tacho_hints

@@ -12,7 +12,7 @@ import typer
 
 from fantwin.pipeline.bus.errors import NoAnswerError
 from fantwin.pipeline.cli.exposure import checked_exposure
-from fantwin.pipeline.config.models import Config
+from fantwin.pipeline.config.settings import Config
 from fantwin.pipeline.config.shards import Shard
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.launch.processes import EXIT_CANNOT_START

@@ -15,8 +15,8 @@ from fantwin.pipeline.cli.exposure import InsecureOption, checked_exposure
 from fantwin.pipeline.cli.options import DEFAULT_CONFIG, JsonOption, SetOption
 from fantwin.pipeline.cli.printing import show
 from fantwin.pipeline.config.loading import load_config
-from fantwin.pipeline.config.models import BusConfig, Config
 from fantwin.pipeline.config.roles import ROUTER
+from fantwin.pipeline.config.settings import BusConfig, Config
 from fantwin.pipeline.errors import UsageError
 from fantwin.pipeline.runtime.signals import stop_on_signals
 

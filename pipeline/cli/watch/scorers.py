@@ -9,7 +9,7 @@ import time
 from dataclasses import replace
 
 from fantwin.pipeline.bus.session import Bus
-from fantwin.pipeline.config.models import Config
+from fantwin.pipeline.config.settings import Config
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.site.one_line import readable_alarm
 from fantwin.pipeline.site.site_watcher import SiteWatcher

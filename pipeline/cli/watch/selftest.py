@@ -16,7 +16,7 @@ from fantwin.pipeline.cli.options import JsonOption
 from fantwin.pipeline.cli.printing import show, table_of
 from fantwin.pipeline.cli.progress import working
 from fantwin.pipeline.cli.simulation.scenario import Scenario as Simulated
-from fantwin.pipeline.config.models import nearest
+from fantwin.pipeline.config.settings import nearest
 from fantwin.pipeline.errors import UsageError, UserError
 from fantwin.pipeline.selftest.scenarios import SCENARIOS, Scenario
 from fantwin.pipeline.selftest.scratch_site import FANS

@@ -16,9 +16,9 @@ from rich.text import Text
 from fantwin.pipeline.bus.session import Bus, join_bus
 from fantwin.pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
 from fantwin.pipeline.cli.printing import duration_text, show, table_of
-from fantwin.pipeline.config.models import Config
 from fantwin.pipeline.config.registry import STAGES
 from fantwin.pipeline.config.roles import READERS, role_names, roles_of
+from fantwin.pipeline.config.settings import Config
 from fantwin.pipeline.config.shards import StageProcess, chosen_shard, process_list
 from fantwin.pipeline.errors import UsageError, UserError
 from fantwin.pipeline.launch.this_host import load_for_any_host

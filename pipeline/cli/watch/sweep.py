@@ -20,8 +20,8 @@ from fantwin.pipeline.acquisition.commanding import (
 )
 from fantwin.pipeline.bus.session import Bus, join_bus
 from fantwin.pipeline.cli.printing import show
-from fantwin.pipeline.config.models import Config, TrayConfig
 from fantwin.pipeline.config.roles import OPERATOR
+from fantwin.pipeline.config.settings import Config, TrayConfig
 from fantwin.pipeline.errors import UsageError, UserError
 from fantwin.pipeline.learning.excitation import Excitation, Observed, StoppedError
 from fantwin.pipeline.runtime.signals import stop_on_signals

@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from fantwin.pipeline.config.models import Name
+from fantwin.pipeline.config.settings import Name
 from fantwin.pipeline.runtime.stage import StageConfig
 from fantwin.pipeline.site.request_form import OperatorAction
 from fantwin.pipeline.sources.mqtt.settings import BrokerSettings

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from typing import Any
 
-from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.outputs.mqtt.config import MqttConfig
 from fantwin.pipeline.outputs.mqtt.outbox import text_of
 from fantwin.pipeline.outputs.mqtt.topics import Topics

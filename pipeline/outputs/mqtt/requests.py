@@ -12,7 +12,7 @@ from typing import Annotated, Any
 
 from pydantic import Field, ValidationError
 
-from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.outputs.mqtt.outbox import text_of
 from fantwin.pipeline.outputs.mqtt.topics import ALL_FANS, ANSWER, REQUEST, Topics
 from fantwin.pipeline.site.request_desk import ANSWERED_WITHIN_S, RequestDesk

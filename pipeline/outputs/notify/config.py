@@ -9,7 +9,7 @@ from typing import Any, Literal, Self
 
 from pydantic import Field, field_validator, model_validator
 
-from fantwin.pipeline.config.models import Name, Section
+from fantwin.pipeline.config.settings import Name, Section
 from fantwin.pipeline.runtime.stage import StageConfig
 from fantwin.schemas.enums import Severity
 

@@ -12,7 +12,7 @@ from typing import Any
 from asyncua import Node, Server, ua
 from asyncua.server.address_space import AddressSpace
 
-from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.outputs.opcua.conditions import OWN_FIELDS, condition_fields
 from fantwin.pipeline.outputs.opcua.encoding import STATUS, standard
 from fantwin.pipeline.outputs.opcua.fan_values import VARIABLES

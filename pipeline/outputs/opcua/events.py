@@ -14,7 +14,7 @@ from typing import Any
 from asyncua import ua
 from asyncua.server.subscription_service import SubscriptionService
 
-from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.outputs.opcua.conditions import condition_fields
 from fantwin.pipeline.outputs.opcua.encoding import localized, standard, string, value_of
 from fantwin.pipeline.outputs.opcua.event_filter import CONDITION_ID, path_of

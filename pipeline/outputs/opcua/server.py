@@ -16,7 +16,7 @@ from pathlib import Path
 
 from asyncua import Server, ua
 
-from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.outputs.opcua.address_space import SiteAddressSpace, build_address_space
 from fantwin.pipeline.outputs.opcua.events import EventDelivery
 from fantwin.pipeline.outputs.opcua.history import EventHistory

@@ -10,7 +10,7 @@ import math
 from collections import deque
 from collections.abc import Sequence
 
-from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.site.fleet import Fan, last_sample
 from fantwin.pipeline.site.trace import MEASURED_COLUMNS
 from fantwin.schemas.messages import Score

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.outputs.rerun.rerun_sink import ViewOptions
 from fantwin.pipeline.outputs.rerun.view_of_site import view_of_site

@@ -17,7 +17,7 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.outputs.rerun.alarm_log import LogLine
 from fantwin.pipeline.outputs.rerun.fleet_view import is_fleet
 from fantwin.pipeline.outputs.rerun.rerun_bands import RerunBands

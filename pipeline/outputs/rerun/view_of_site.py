@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.outputs.rerun import fleet_view
 from fantwin.pipeline.outputs.rerun.fleet_view import FLEET_ABOVE, FleetView, is_fleet
 from fantwin.pipeline.outputs.rerun.rerun_sink import RerunSink, ViewOptions

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.outputs.rerun.alarm_log import LogLine, log_line
 from fantwin.pipeline.outputs.rerun.alarm_table import alarm_table
 from fantwin.pipeline.outputs.rerun.fleet_view import FleetView

@@ -8,8 +8,8 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 
 from fantwin.pipeline.bus.session import join_bus
-from fantwin.pipeline.config.models import Config
 from fantwin.pipeline.config.roles import REPLAY
+from fantwin.pipeline.config.settings import Config
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.replay.live.keyboard import Key
 from fantwin.pipeline.replay.live.listeners import Listeners, conflict, made_by_stages

@@ -12,7 +12,7 @@ from itertools import chain
 from pathlib import Path
 from typing import Protocol, TypeVar
 
-from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.prediction.tray_twin import load_tray_twin
 from fantwin.pipeline.recordings.checksum import sha256_of

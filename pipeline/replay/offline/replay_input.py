@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from fantwin.pipeline.config.loading import load_config
-from fantwin.pipeline.config.models import Config, TrayConfig
+from fantwin.pipeline.config.settings import Config, TrayConfig
 from fantwin.pipeline.recordings.clips.clip import CLIP_SNAPSHOT_KEY
 from fantwin.pipeline.recordings.grouping import deciding_overrides
 from fantwin.pipeline.recordings.metadata import CONFIGURATION

@@ -13,7 +13,7 @@ from fantwin.pipeline.acquisition.commanding import CommandSender, command_of, s
 from fantwin.pipeline.acquisition.device_commands import DeviceCommands
 from fantwin.pipeline.bus.publisher import Publisher
 from fantwin.pipeline.bus.session import Bus
-from fantwin.pipeline.config.models import BusConfig, TrayConfig
+from fantwin.pipeline.config.settings import BusConfig, TrayConfig
 from fantwin.pipeline.runtime.sessions import Session
 from fantwin.pipeline.sources.kinds import build_source
 from fantwin.pipeline.sources.serial.config import SerialConfig

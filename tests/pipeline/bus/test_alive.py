@@ -11,7 +11,7 @@ import pytest
 from fantwin.pipeline.bus.errors import BusError
 from fantwin.pipeline.bus.router import open_router
 from fantwin.pipeline.bus.session import Bus
-from fantwin.pipeline.config.models import BusConfig
+from fantwin.pipeline.config.settings import BusConfig
 from tests.support.running_chain import eventually
 from tests.support.tcp_relay import TcpRelay
 

@@ -11,7 +11,7 @@ import zenoh
 from fantwin.pipeline.bus.publisher import KEPT_BYTES
 from fantwin.pipeline.bus.recovery import recovery_key
 from fantwin.pipeline.bus.session import Bus
-from fantwin.pipeline.config.models import BusConfig
+from fantwin.pipeline.config.settings import BusConfig
 from fantwin.schemas.codec import type_name
 from fantwin.schemas.messages import Alarm
 from fantwin.schemas.topics import BY_NAME, alive_key, tray_key
@@ -22,7 +22,7 @@ COUNT = 400
 HOLDS_THE_ENDPOINT = """
 import sys
 from fantwin.pipeline.bus.session import Bus
-from fantwin.pipeline.config.models import BusConfig
+from fantwin.pipeline.config.settings import BusConfig
 with Bus(BusConfig(endpoint=sys.argv[1])):
     print("ready", flush=True)
     sys.stdin.read()

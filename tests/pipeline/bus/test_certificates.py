@@ -12,7 +12,7 @@ from fantwin.pipeline.bus.errors import BusError
 from fantwin.pipeline.bus.opening import zenoh_config
 from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.certificates import CLOCK_SKEW, Authority, read_certificate
-from fantwin.pipeline.config.models import BusConfig
+from fantwin.pipeline.config.settings import BusConfig
 from tests.support.site_certificates import DAY, SiteCertificates
 
 

@@ -14,7 +14,7 @@ from fantwin.pipeline.bus.link import LEASE_MS
 from fantwin.pipeline.bus.opening import zenoh_config
 from fantwin.pipeline.bus.router import open_router
 from fantwin.pipeline.bus.session import Bus
-from fantwin.pipeline.config.models import BusConfig
+from fantwin.pipeline.config.settings import BusConfig
 from tests.support.running_chain import eventually
 
 pytestmark = pytest.mark.skipif(not hasattr(socket, "TCP_USER_TIMEOUT"), reason="this system has no such limit")

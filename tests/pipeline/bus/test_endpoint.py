@@ -13,7 +13,7 @@ from fantwin.pipeline.bus.endpoint import accepts_connections, endpoint_problem,
 from fantwin.pipeline.bus.errors import BusError
 from fantwin.pipeline.bus.router import open_router
 from fantwin.pipeline.bus.session import Bus, join_bus
-from fantwin.pipeline.config.models import BusConfig
+from fantwin.pipeline.config.settings import BusConfig
 from tests.support.secured_site import SecuredSite, free_endpoint
 from tests.support.tcp_relay import TcpRelay
 

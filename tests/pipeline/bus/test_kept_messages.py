@@ -8,7 +8,7 @@ from fantwin.pipeline.bus import publisher as publisher_module
 from fantwin.pipeline.bus.kept_messages import KeptQuery, answer_for_kept, ask_for_kept
 from fantwin.pipeline.bus.recovery import Answer
 from fantwin.pipeline.bus.session import Bus
-from fantwin.pipeline.config.models import BusConfig
+from fantwin.pipeline.config.settings import BusConfig
 from fantwin.schemas.topics import BY_NAME, CATCH_UP_MESSAGES, tray_key
 from tests.support.running_chain import eventually
 

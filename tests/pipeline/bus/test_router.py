@@ -18,7 +18,7 @@ from fantwin.pipeline.bus.errors import BusError
 from fantwin.pipeline.bus.router import open_router
 from fantwin.pipeline.bus.session import Bus, join_bus
 from fantwin.pipeline.config.loading import load_config
-from fantwin.pipeline.config.models import BusConfig
+from fantwin.pipeline.config.settings import BusConfig
 from fantwin.schemas.topics import BY_NAME, tray_key
 from tests.support.fantwin_command import error_of
 from tests.support.running_chain import DEMO, RunningCommand, eventually
@@ -120,7 +120,7 @@ def catches_interrupts(process_id: int) -> bool:
 LISTENS = """
 import sys, threading
 from fantwin.pipeline.bus.session import Bus
-from fantwin.pipeline.config.models import BusConfig
+from fantwin.pipeline.config.settings import BusConfig
 bus = Bus(BusConfig(mode="client", endpoint=sys.argv[1]), threading.Event())
 bus.subscribe(sys.argv[2], lambda _key, payload: print("heard", flush=True))
 sys.stdin.read()

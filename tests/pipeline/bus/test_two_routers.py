@@ -14,7 +14,7 @@ from fantwin.pipeline.bus.access_rules import SiteRoles
 from fantwin.pipeline.bus.errors import BusError
 from fantwin.pipeline.bus.router import open_router
 from fantwin.pipeline.bus.session import Bus, join_bus
-from fantwin.pipeline.config.models import BusConfig
+from fantwin.pipeline.config.settings import BusConfig
 from fantwin.schemas.topics import BY_NAME, alive_key, tray_key
 from tests.support.ports import free_port
 from tests.support.running_chain import RunningCommand, eventually

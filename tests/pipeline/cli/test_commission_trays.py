@@ -20,7 +20,7 @@ from typer.testing import Result
 
 from fantwin.pipeline.cli.watch import commission, commissioning
 from fantwin.pipeline.cli.watch.child_commands import Commands, Stopped
-from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.learning.training_data import Part
 from fantwin.pipeline.recordings.writing import RecordingWriter

@@ -14,7 +14,7 @@ from rich.console import Console
 
 from fantwin.pipeline.cli.watch.demo import DEMO_FOLDER, _clear, _run, demo
 from fantwin.pipeline.config.loading import load_config
-from fantwin.pipeline.config.models import Config
+from fantwin.pipeline.config.settings import Config
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.sources.serial.config import SerialConfig
 from tests.support.running_chain import DEADLINE_S, fantwin, is_running

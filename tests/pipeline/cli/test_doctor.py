@@ -18,7 +18,7 @@ import typer
 from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.cli.watch import doctor as module
 from fantwin.pipeline.cli.watch.doctor import doctor
-from fantwin.pipeline.config.models import BusConfig
+from fantwin.pipeline.config.settings import BusConfig
 from fantwin.pipeline.config.shards import Shard
 from fantwin.pipeline.extras import how_to_install
 from fantwin.pipeline.runtime.sessions import Session

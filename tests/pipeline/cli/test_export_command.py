@@ -12,7 +12,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from fantwin.pipeline.recordings import read_arrays
-from fantwin.pipeline.recordings.tables import table_columns
+from fantwin.pipeline.recordings.export_tables import table_columns
 from fantwin.pipeline.recordings.writing import RecordingWriter
 from fantwin.schemas.codec import proto_type
 from fantwin.schemas.enums import FanState

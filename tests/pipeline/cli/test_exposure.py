@@ -7,7 +7,7 @@ import threading
 import pytest
 
 from fantwin.pipeline.cli.exposure import checked_exposure
-from fantwin.pipeline.config.models import BusConfig
+from fantwin.pipeline.config.settings import BusConfig
 from fantwin.pipeline.errors import UsageError
 
 OPEN, LOCAL = "tcp/0.0.0.0:7447", "tcp/127.0.0.1:7447"

@@ -15,7 +15,7 @@ import pytest
 import fantwin.client
 from fantwin.pipeline.cli.watch.line_check import _findings, check_line, refusal
 from fantwin.pipeline.config.loading import parse_config
-from fantwin.pipeline.config.models import Config
+from fantwin.pipeline.config.settings import Config
 from fantwin.pipeline.runtime.stage import Context
 from fantwin.schemas.messages import Array, Raw
 from fantwin.schemas.units import NS_PER_S

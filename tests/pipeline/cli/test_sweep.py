@@ -11,7 +11,7 @@ import pytest
 from fantwin.pipeline.acquisition.commanding import NotReceivedError
 from fantwin.pipeline.cli.watch import sweep as sweep_module
 from fantwin.pipeline.cli.watch.sweep import range_within
-from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.sources.serial.config import SerialConfig
 from tests.support.fantwin_command import error_of

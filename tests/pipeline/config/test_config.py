@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from fantwin.pipeline.config.loading import load_config, parse_config
-from fantwin.pipeline.config.models import ConfigError
+from fantwin.pipeline.config.settings import ConfigError
 from fantwin.pipeline.sources.serial.config import SerialConfig
 
 GOOD = """

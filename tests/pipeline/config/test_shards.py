@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from fantwin.pipeline.config.loading import parse_config
-from fantwin.pipeline.config.models import Config, ConfigError
+from fantwin.pipeline.config.settings import Config, ConfigError
 from fantwin.pipeline.config.shards import (
     MOST_NAME_CHARACTERS,
     Shard,

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from fantwin.pipeline.config.loading import load_config
-from fantwin.pipeline.config.models import ConfigError
+from fantwin.pipeline.config.settings import ConfigError
 from fantwin.pipeline.config.twin_entry import with_twin, write_twin
 
 PATH = Path("fantwin.toml")

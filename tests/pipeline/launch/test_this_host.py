@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from fantwin.pipeline import extras
-from fantwin.pipeline.config.models import ConfigError
+from fantwin.pipeline.config.settings import ConfigError
 from fantwin.pipeline.launch.this_host import load_for_any_host, load_for_this_host, page_addresses, with_free_port
 
 TRAYS = "".join(f'[[tray]]\nname = "{name}"\nfans = 1\nport = "x"\ntwin = "t.onnx"\n' for name in "ab")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.learning.ordinary_operation import OrdinaryOperation
 from fantwin.schemas.messages import Raw
 from fantwin.schemas.units import NS_PER_S

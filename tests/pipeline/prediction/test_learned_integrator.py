@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.prediction.learned_integrator import MOST_COMING, LearnedTwinIntegrator
 from fantwin.pipeline.prediction.twin_file import TwinFile
 from fantwin.schemas.blocks import cut

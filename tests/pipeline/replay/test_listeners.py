@@ -7,7 +7,7 @@ import threading
 import pytest
 
 from fantwin.pipeline.bus.session import Bus
-from fantwin.pipeline.config.models import BusConfig
+from fantwin.pipeline.config.settings import BusConfig
 from fantwin.pipeline.replay.live.listeners import Listeners, Present, conflict, made_by_stages
 from fantwin.pipeline.runtime.stage import load_stage
 from fantwin.schemas.codec import encode, type_name

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from fantwin.pipeline.config.models import Config, ConfigError
+from fantwin.pipeline.config.settings import Config, ConfigError
 from fantwin.pipeline.recordings.reading import read_metadata
 from fantwin.pipeline.recordings.writing import RecordingWriter
 from fantwin.pipeline.replay.live.recording_playback import RecordingPlayback

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from fantwin.pipeline.config.models import BusConfig, Config, LauncherConfig, TrayConfig
+from fantwin.pipeline.config.settings import BusConfig, Config, LauncherConfig, TrayConfig
 from tests.support.toy_stage import TRAY_A, TRAY_B, ToyConfig
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from fantwin.pipeline.bus.kept_messages import KeptQuery
 from fantwin.pipeline.bus.session import Bus
-from fantwin.pipeline.config.models import BusConfig
+from fantwin.pipeline.config.settings import BusConfig
 from fantwin.pipeline.runtime.kept_snapshots import KeptForOthers, KeptSnapshots
 from fantwin.schemas.codec import encode
 from fantwin.schemas.envelope import Envelope

@@ -11,7 +11,7 @@ import pytest
 from fantwin.pipeline.bus import recovery as bus_recovery
 from fantwin.pipeline.bus.recovery import LAST_SEQUENCE, Answer, recovery_key
 from fantwin.pipeline.bus.session import Bus
-from fantwin.pipeline.config.models import BusConfig
+from fantwin.pipeline.config.settings import BusConfig
 from fantwin.pipeline.runtime.inbox import INBOX_BYTES, FromBus, Inbox, Recovered
 from fantwin.pipeline.runtime.sequence_tracker import MOST_HELD_MESSAGES, Found, SequenceTracker
 from fantwin.pipeline.runtime.sessions import Session, Sessions

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from fantwin.pipeline.bus.session import Bus
-from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.runtime.runner import TICK_S
 from fantwin.pipeline.runtime.stage import BuiltStage, Context, Core
 from fantwin.pipeline.site.loss_accounting import losses

@@ -13,7 +13,7 @@ import pytest
 
 from fantwin.pipeline.bus.recovery import recovery_key
 from fantwin.pipeline.bus.session import Bus
-from fantwin.pipeline.config.models import LauncherConfig
+from fantwin.pipeline.config.settings import LauncherConfig
 from fantwin.pipeline.config.shards import chosen_shard
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.runtime.runner import Runner

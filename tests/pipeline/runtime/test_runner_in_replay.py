@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import pytest
 
 from fantwin.pipeline.bus.session import Bus
-from fantwin.pipeline.config.models import Config
+from fantwin.pipeline.config.settings import Config
 from fantwin.pipeline.runtime.stage import BuiltStage, Context
 from fantwin.schemas.codec import encode, type_name
 from fantwin.schemas.enums import StageStatus

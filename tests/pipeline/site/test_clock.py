@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.site.alarm_history import AlarmHistory
 from fantwin.pipeline.site.fleet import Fan
 from fantwin.pipeline.site.request_desk import ANSWERED_WITHIN_S, MOST_UNDER_WAY, RequestDesk

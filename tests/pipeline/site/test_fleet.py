@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.site.fleet import NORMAL_LEVELS, SHOWN_CLASSES, FanGroup, Fleet
 from fantwin.schemas.enums import FanState, InvalidReason, Transition
 from fantwin.schemas.header import Header

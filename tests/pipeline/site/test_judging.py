@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.site.fleet import Fan
 from fantwin.pipeline.site.judging import JudgedChanges, Unjudged, as_judged, at_rest, unjudged
 from fantwin.pipeline.site.site_model import SILENT_AFTER_S

@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from fantwin.pipeline.config.models import TrayConfig
 from fantwin.pipeline.config.roles import roles_of_stages
+from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.site.one_line import LONGEST_TEXT
 from fantwin.pipeline.site.site_watcher import MOST_UNKNOWN_SESSIONS, MOST_WATCHED_SESSIONS, SiteWatcher
 from fantwin.schemas.codec import encode

@@ -8,7 +8,7 @@ import pytest
 
 from fantwin.pipeline.acquisition.sample_blocks import BlockEvent, SampleBlocks
 from fantwin.pipeline.config.loading import parse_config
-from fantwin.pipeline.config.models import ConfigError
+from fantwin.pipeline.config.settings import ConfigError
 from fantwin.pipeline.plugins import SourceKind
 from fantwin.pipeline.runtime.stage import BuiltStage, Context
 from fantwin.pipeline.sources.kinds import SOURCE_KINDS

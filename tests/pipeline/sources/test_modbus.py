@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from fantwin.pipeline.config.loading import parse_config
-from fantwin.pipeline.config.models import ConfigError
+from fantwin.pipeline.config.settings import ConfigError
 from fantwin.pipeline.sources.modbus.config import ModbusConfig
 from fantwin.pipeline.sources.modbus.source import ModbusDevice
 from fantwin.pipeline.sources.polling import DeviceError

@@ -11,7 +11,7 @@ import pytest
 import trustme
 
 from fantwin.pipeline.config.loading import parse_config
-from fantwin.pipeline.config.models import ConfigError
+from fantwin.pipeline.config.settings import ConfigError
 from fantwin.pipeline.sources.polling import DeviceError
 from fantwin.pipeline.sources.redfish.config import RedfishConfig
 from fantwin.pipeline.sources.redfish.source import RedfishDevice

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.outputs.mqtt.config import MqttConfig
 from fantwin.pipeline.outputs.mqtt.home_assistant import HomeAssistant
 from fantwin.pipeline.outputs.mqtt.topics import Topics

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.outputs.mqtt.fan_states import FanStates
 from fantwin.pipeline.outputs.mqtt.outbox import Outbox, Outgoing
 from fantwin.pipeline.outputs.mqtt.topics import do_overlap

@@ -15,7 +15,7 @@ pytest.importorskip("asyncua")
 
 from asyncua import ua
 
-from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.outputs.opcua import history
 from fantwin.pipeline.outputs.opcua.history import EventHistory
 from fantwin.pipeline.site import alarm_history

@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.outputs.rerun.fleet_view import FleetView
 from fantwin.pipeline.site.fleet import Fan
 from fantwin.schemas.units import NS_PER_S

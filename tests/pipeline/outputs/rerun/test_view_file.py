@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fantwin.pipeline.config.models import TrayConfig
+from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.outputs.rerun import view_file
 from fantwin.pipeline.outputs.rerun.rerun_sink import RerunSink, ViewOptions
 from fantwin.pipeline.outputs.rerun.view_file import ViewFile

@@ -1,4 +1,4 @@
-"""The pipeline's own sections of the configuration, and the checked configuration as a whole.
+"""The settings of trays, bus and launcher, and the checked configuration as a whole.
 
 The section of a stage is modelled by that stage. No stage is imported here; see `pipeline.config.loading`.
 """

@@ -1,0 +1,38 @@
+"""The settings of the scorer."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from fantwin.pipeline.runtime.stage import StageConfig
+
+FALSE_ALARMS_PER_DAY = 0.03
+"""declared, of a fan, where nobody says otherwise: about one a month"""
+
+
+class ScorerConfig(StageConfig):
+    """Section `[scorer]`."""
+
+    false_alarms_per_day: float | None = Field(
+        default=None,
+        gt=0,
+        le=8640,
+        description="declared rate of false alarms of a fan; default: that of the twin's calibration, else 0.03, "
+        "about one a month",
+    )
+    alarm_share: float = Field(
+        default=0.1, gt=0, description="share of the speed that a fault takes, from which a warning is an alarm"
+    )
+    alarms_need: tuple[Literal["confirm", "reset"], ...] = Field(
+        default=(),
+        description="what operators must do, besides acknowledging an alarm: confirm it, too, or reset it once it has "
+        "cleared",
+    )
+    asks_for_snapshots: bool | None = Field(
+        default=None,
+        description="whether it continues from the snapshot that a recorder keeps, where that is newer than its own "
+        "file, as on another host; with false and without the file, everything starts from the beginning; default: if "
+        "it is one of several shards",
+    )
