@@ -6,6 +6,7 @@ A configuration is in every recording, so that it names where a secret is and ne
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import ClassVar, Self
@@ -58,10 +59,11 @@ class LogIn(BaseModel, frozen=True):
         try:
             parts = urlsplit(value)
             is_address = parts.scheme in cls.schemes and parts.hostname and parts.port != 0
+            has_path = parts.path.strip("/") and ("@" in parts.path or not parts.scheme.startswith("http"))
         except ValueError:
-            is_address = False
-        if not is_address:
-            raise ValueError(f"write the address of the server, such as {list(cls.schemes)[-1]}://USER@HOST")
+            is_address = has_path = False
+        if not is_address or has_path or re.search(r"[\s?#]", value):  # what is cut off may be of a password
+            raise ValueError(f"write the address of the server alone, such as {list(cls.schemes)[-1]}://HOST")
         if urlsplit(value).password is not None:
             raise ValueError("a configuration is recorded: give password_file, and only the user in url")
         return value

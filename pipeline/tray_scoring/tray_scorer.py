@@ -212,7 +212,8 @@ class TrayScorer:
         decision = self._decision
         assert decision.now is not None
         expected = decision.model.expected_rad_s
-        is_missing = ~decision.active & (decision.missing.score > decision.deviation_score)
+        is_likelier = decision.missing.score > decision.deviation_score
+        is_missing = ~decision.active & (decision.missing.is_active | is_likelier)
         statistic = np.where(is_missing, int(Statistic.MISSING_READINGS), int(Statistic.DEVIATION))
         statistic = np.where(is_worn & ~decision.has_alarm, int(Statistic.WEAR), statistic)
         statistic = np.where(self._stands, int(Statistic.STANDSTILL), statistic)

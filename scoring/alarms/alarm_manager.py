@@ -86,8 +86,8 @@ class AlarmManager:
         for event in self._conditions.update(now):
             fan, before = event.fan, self._next_message(event.fan)
             changed, measured = _state_fields(event.alarm_state), facts.measured(fan)
-            if event.transition == Transition.CLEARED:
-                self.cleared += 1
+            if not event.alarm_state.active:
+                self.cleared += event.transition == Transition.CLEARED
                 self._due_t_ns.pop(fan, None)
                 measured = replace(measured, statistic=before.statistic)  # nothing speaks for a fault any more
             elif event.transition == Transition.RAISED or (now.judged[fan] and _is_other(measured, before)):

@@ -104,7 +104,7 @@ class Decision(Saved):
         self._shows = np.ones(count)
         """(fans,) least part of its largest share that a fault takes at the present speed"""
         self.is_returning = np.zeros(count, np.bool_)
-        """(fans,) true where an alarm is active and a healthy fan is more probable"""
+        """(fans,) true where an alarm is active and a healthy fan is OVER_ODDS times as probable"""
         self.in_balance = np.zeros(count, np.bool_)
         """(fans,) true where the torque balance is read, and not the speed"""
         self.now: Inputs | None = None
@@ -151,7 +151,7 @@ class Decision(Saved):
     @property
     def deviation_score(self) -> Array:
         """Score of speed and torque balance, (fans,): log R over log L; in an alarm the log odds of its fault over
-        log L, below 1 while a healthy fan is more probable."""
+        log L: at least 1, or 0 while a healthy fan is OVER_ODDS times as probable."""
         before = (self.log_statistic / self.log_limit).clip(0.0, 1.0)
         odds = self._log_odds() / self.log_limit
         during = np.where(self.is_returning, odds.clip(0.0, 1.0), odds.clip(1.0, HIGHEST_SCORE))

@@ -23,8 +23,8 @@ PRIOR_LONGER = 10.0
 """spells, as if counted for the tray, that went on as often as by chance"""
 LONGEST = 4
 """wrong readings, one after the other; more are no tacho's"""
-MANY, SAID_FROM = 0.02, 20.0
-"""share of wrong readings with which a tacho is not sound, and how often they were wrong before that is said"""
+MANY, LATELY, SAID_FROM = 0.02, 2000.0, 500.0
+"""share of wrong readings with which a tacho is not sound; number of newest readings that count; and at least"""
 FEWEST, ONE_MORE = 2, 2
 """least number of readings that must agree; and samples that equal readings must last beyond their time, because one
 may show in one sample more, and the last must be seen"""
@@ -33,7 +33,7 @@ may show in one sample more, and the last must be seen"""
 class WrongReadings(Saved):
     """Follows the far readings of the fans of one tray."""
 
-    KEPT = ("_times", "_readings", "_lasted", "_side", "_long", "_different", "_std", "agree")
+    KEPT = ("_times", "_readings", "_lasted", "_side", "_long", "_different", "_std", "agree", "_lately")
 
     def __init__(self, fans: Fans, bin_s: float, period_s: float, log_limit: float) -> None:
         """Begin without a reading. bin_s: within which samples of a reading that is not held count as one; period_s: of
@@ -47,6 +47,8 @@ class WrongReadings(Saved):
         self._times, self._readings, self._std = np.zeros((3, count))
         """(fans,) number of spells; number of readings; standard deviation of the reading expected of a healthy fan,
         rad/s, during an alarm that of before it, since the fault is not known yet"""
+        self._lately = np.zeros((2, count))
+        """(2, fans) number of wrong readings, and of readings, lately"""
         self.begin_again(np.ones(count, np.bool_))
         self._lasted = np.zeros(LONGEST)
         """number of spells of the tray that lasted at least 1, 2, ... readings"""
@@ -60,8 +62,9 @@ class WrongReadings(Saved):
     @property
     def many(self) -> Array:
         """Return the share of wrong readings of a tacho that is not sound, (fans,); of others 0."""
-        times, readings = self._times - PRIOR[0], np.maximum(self._readings - PRIOR[1], 1.0)
-        return np.where((times > MANY * readings) & (times > SAID_FROM), times / readings, 0.0)
+        wrong, readings = self._lately
+        is_many = (readings > SAID_FROM) & (wrong > MANY * readings)
+        return np.divide(wrong, readings, out=np.zeros(len(wrong)), where=is_many)
 
     @property
     def waits(self) -> Array:
@@ -84,7 +87,10 @@ class WrongReadings(Saved):
         self._std = np.where(raised < 0, std_rad_s, self._std)
         with np.errstate(invalid="ignore"):
             far = np.abs(distances_rad_s) > FAR_SIGMAS * np.stack((std_rad_s, self._std))[:, np.newaxis]
-        self._readings += known.sum(axis=0) / self._held
+        readings = known.sum(axis=0) / self._held
+        self._readings += readings
+        self._lately *= np.exp(-readings / LATELY)
+        self._lately[1] += readings
         if not far.any() and not self._side.any():
             self.agree = np.zeros_like(self.agree)
             return known
@@ -107,6 +113,7 @@ class WrongReadings(Saved):
     def begin_again(self, fans: Array) -> None:
         """Forget the wrong readings of some fans, (fans,) of bool."""
         self._times[fans], self._readings[fans] = PRIOR
+        self._lately[:, fans] = 0.0
 
     def forget(self) -> None:
         """Forget far readings from before a gap."""
@@ -122,6 +129,7 @@ class WrongReadings(Saved):
         readings = np.ceil(self._long[1] / self._held)
         was_wrong = ends & (readings <= LONGEST)
         self._times += was_wrong
+        self._lately[0] += np.where(was_wrong, readings, 0.0)
         self._lasted += (readings[was_wrong] > np.arange(LONGEST)[:, np.newaxis]).sum(axis=1)
 
     def _agree_at(self) -> Array:

@@ -26,7 +26,16 @@ MAIL: dict[str, Any] = {"name": "mail", "url_file": "mail.url"}
         (OpcuaConfig, {"host": "0.0.0.0"}, "needs users"),
         (OpcuaConfig, {"certificate": "c.pem"}, "belong together"),
         (MqttConfig, {"accept": ["explode"]}, "accept"),
-        (MqttConfig, {"url": "broker:1883"}, "such as mqtts://USER@HOST"),
+        *(
+            (MqttConfig, {"url": url}, "such as mqtts://HOST")
+            for url in (
+                "broker:1883",
+                "mqtt://u:1/2@broker",
+                "mqtt://u#p@broker",
+                "mqtt://broker/topic",
+                "mqtt://broker ",
+            )
+        ),
         (MqttConfig, {"url": "mqtt://u:p@broker"}, "give password_file, and only the user"),
         (MqttConfig, {"password_file": "x"}, "needs a user in url, such as mqtt://USER@broker"),
         (MqttConfig, {"ca": "x"}, "need mqtts://"),

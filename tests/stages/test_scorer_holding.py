@@ -100,6 +100,8 @@ def test_a_loose_wire_is_one_alarm_though_the_grid_bridges_its_missing_readings(
     assert 0.0 < after_s[0] < 6.0
     assert 30.0 < after_s[1] < 45.0
     assert re.search(r"; a tacho that drops out, 100 %: \d\d % of the readings are missing", found[0].message)
+    assert {alarm.statistic for alarm in alarms} == {Statistic.MISSING_READINGS}
+    assert len(alarms) < 6, "it is about nothing else while the line recovers"
 
 
 def test_a_fault_of_the_fan_within_an_alarm_of_missing_readings_is_said_with_its_own_causes() -> None:

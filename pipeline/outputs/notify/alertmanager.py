@@ -41,11 +41,11 @@ class Alertmanager:
         Raises:
             UserError: it is none of http or https.
         """
-        parts = urlsplit(url)
         try:
+            parts = urlsplit(url)
             is_usable = parts.scheme in ("http", "https") and bool(parts.hostname) and parts.port != 0
         except ValueError:
-            is_usable = False
+            parts, is_usable = urlsplit(""), False
         if not is_usable:
             raise UserError("an Alertmanager needs a URL of http or https, such as http://127.0.0.1:9093")
         host = parts.netloc.rpartition("@")[2]

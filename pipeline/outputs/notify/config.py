@@ -76,11 +76,9 @@ class TargetConfig(Section):
     @model_validator(mode="after")
     def _check(self) -> Self:
         of_apprise = {"repeat_s", "escalation_after_s", "quiet_hours", "held_severity"}
-        if self.kind == "alertmanager" and of_apprise & self.model_fields_set:
-            raise ValueError(
-                f"target {self.name}: an Alertmanager repeats, escalates and holds by itself: take out repeat_s, "
-                "escalation_after_s and quiet_hours"
-            )
+        if self.kind == "alertmanager" and (found := sorted(of_apprise & self.model_fields_set)):
+            by_itself = "an Alertmanager repeats, escalates and holds by itself"
+            raise ValueError(f"target {self.name}: {by_itself}: take out {', '.join(found)}")
         return self
 
 

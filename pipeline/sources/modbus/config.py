@@ -71,7 +71,8 @@ class ModbusConfig(PolledConfig, frozen=True):
     def _has_a_port_if_any(cls, value: str) -> str:
         try:
             parts = urlsplit(f"//{value}")
-            is_address = parts.port != 0 and parts.netloc == value and "@" not in value
+            is_known = parts.hostname or not value
+            is_address = is_known and parts.port != 0 and parts.netloc == value and not set(value) & set("@ ")
         except ValueError:
             is_address = False
         if not is_address:

@@ -189,3 +189,10 @@ def test_row_15_a_file_that_is_too_large_is_not_read(tmp_path):
     path.write_bytes(b"#" * 2_000_000)
     with pytest.raises(ConfigError, match=r"fan\.toml: larger than 1,048,576 bytes, so no configuration"):
         load_config(path)
+
+
+def test_a_password_that_somebody_wrote_into_an_address_is_not_repeated_in_the_error() -> None:
+    for url in ("mqtt://u:s3cret@broker", "u:s3cret@broker"):
+        with pytest.raises(ConfigError, match=r"mqtt\.url: ") as refused:
+            parse_config(GOOD, Path("site.toml"), [f"mqtt.url='{url}'"])
+        assert "s3cret" not in str(refused.value)
