@@ -166,10 +166,10 @@ def losing(level: float) -> tuple[Floats, Floats]:
 
 
 def test_the_command_that_a_fan_does_not_follow_is_the_one_of_now() -> None:
-    command = commands((80.0, 20.0), (25.0, 10.0))
+    command = commands((80.0, 18.0), (25.0, 8.0))
     speed = speed_of(command)
     speed[round(12.0 / PERIOD_S) :] *= 0.8
-    speed[round(25.0 / PERIOD_S) :] = 0.0
+    speed[round(22.0 / PERIOD_S) :] = 0.0
     (*_, last) = seen(command, speed).alarms
     assert "does not turn although commanded to 25" in last.message
 
