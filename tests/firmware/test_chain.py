@@ -29,6 +29,8 @@ from tests.support.running_chain import DEADLINE_S, SITE, Chain, eventually, pub
 pytestmark = [pytest.mark.slow, pytest.mark.real_time]
 
 FAN, DUTY = 2, 0.7
+CATCHES_UP_S = 0.3
+"""behind real time, from which on its clock runs so fast afterwards that samples are behind the grid"""
 LONGEST_DELAY_S = 1.5
 
 
@@ -93,22 +95,22 @@ def test_a_blocked_rotor_on_the_pins_is_an_alarm(board: SimulatedBoard, chain: C
     raws = [message for message in messages if isinstance(message, Raw)]
     alarms = [message for message in messages if isinstance(message, Alarm)]
 
+    # By the clock of the board. A busy machine lets it fall behind the host, and the times of samples are as wrong.
+    behind = re.search(r"at most ([0-9.]+) s behind real time", pace)
+    assert behind, pace
+    behind_s = float(behind[1])
     (counted,) = outcome["refused"].values()
     assert counted["device_bad_crc"] == 1, "as the board has counted"
-    unsent = counted.keys() - {"device_bad_crc"}
-    assert unsent <= {"device_unsent_samples"}, "where a busy machine has not read the line in time"
-    assert (code, any(outcome["lost"].values())) in ((0, False), (3, bool(unsent))), outcome
+    if behind_s < CATCHES_UP_S:
+        assert (code, any(outcome["lost"].values()), len(counted)) == (0, False, 1), (outcome["lost"], counted)
     clock_s = np.concatenate([raw.device_clock_us for raw in raws]) / 1e6
     check_that_the_pins_were_recorded(trace, clock_s, raws)
     raised = [alarm for alarm in alarms if alarm.transition == Transition.RAISED]
     assert {alarm.fan for alarm in raised} == {FAN}, [alarm.message for alarm in raised]
     received_s = np.concatenate([raw.host_receive_t_ns for raw in raws]) / NS_PER_S
     blocked_s = trace.blocked_s[FAN][0]
-    # By the clock of the board. A busy machine lets it fall behind the host, and the times of samples are as wrong.
-    behind = re.search(r"at most ([0-9.]+) s behind real time", pace)
-    assert behind, pace
     delay_s = np.interp(raised[0].t_ns / NS_PER_S, received_s, clock_s) - blocked_s
-    assert -float(behind[1]) < delay_s < LONGEST_DELAY_S + float(behind[1]), pace
+    assert -behind_s < delay_s < LONGEST_DELAY_S + behind_s, pace
     print(f"blocked at {blocked_s:.3f} s of the trace, alarm {delay_s:.3f} s later; {pace}")
 
 

@@ -11,6 +11,7 @@ import pytest
 
 from fantwin.pipeline.runtime.stage import StageError
 from fantwin.pipeline.tray_scoring.snapshot_store import AHEAD_NS, RECENT_NS, SnapshotStore
+from fantwin.schemas.formats import SNAPSHOT
 from fantwin.schemas.messages import ScorerSnapshot
 
 
@@ -69,12 +70,16 @@ def test_a_file_that_is_no_whole_snapshot_is_refused_in_one_line(tmp_path: Path)
     assert str(refused.value) == f"{tmp_path}: cannot read the scorer's snapshot: Is a directory"
 
 
-@pytest.mark.parametrize(("number", "advice"), [(0, "remove it to start without one"), (3, "update fantwin")])
+@pytest.mark.parametrize(
+    ("number", "advice"), [(0, "remove it to start without one"), (SNAPSHOT.written + 1, "update fantwin")]
+)
 def test_a_snapshot_of_an_unknown_format_is_refused_in_one_line(tmp_path: Path, number: int, advice: str) -> None:
     unknown = replace(snapshot(9), format=number)
     store = SnapshotStore(tmp_path / "m.snapshot")
     store.save(unknown)
-    with pytest.raises(StageError, match=rf"m\.snapshot: a scorer's snapshot .*reads format 2: {advice}"):
+    with pytest.raises(
+        StageError, match=rf"m\.snapshot: a scorer's snapshot .*reads format {SNAPSHOT.written}: {advice}"
+    ):
         store.load()
     with pytest.raises(StageError, match=rf"m: the snapshot that the recorder keeps: .*{advice}"):
         SnapshotStore(tmp_path / "n" / "m.snapshot", lambda _is_patient: ([unknown], "")).load()
