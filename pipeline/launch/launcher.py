@@ -333,8 +333,7 @@ class Launcher:
         self._delay_start(slot, now)
 
     def _restart_those_down(self) -> None:
-        """Start a stage that is down at the end once more: it requests what it missed, so nothing is lost. One that
-        has just been restarted is waited for as well."""
+        """Start a stage that is down once more: it requests what it missed. Wait for it, and for one just restarted."""
         started = [slot for slot in self._slots if slot.child or slot.start_at_s]
         down = [slot for slot in started if slot.child is None or slot.child.exit_status() is not None]
         for slot in down:
@@ -355,8 +354,7 @@ class Launcher:
         return child is None or child.exit_status() is not None or self._watcher.is_ready(child.process_id)
 
     def _stop_all(self) -> None:
-        """Stop in the order of the data flow: each stage ends when it has processed all that was sent to it. Its
-        processes end together."""
+        """Stop in the order of the data flow: a stage ends when it has processed all input, its processes together."""
         for stage in dict.fromkeys(slot.row.stage for slot in self._slots):
             of_stage = [(slot, slot.child) for slot in self._slots if slot.row.stage == stage and slot.child]
             for _, child in of_stage:

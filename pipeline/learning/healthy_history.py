@@ -34,7 +34,7 @@ HEALTHY, NEAR_ALARMS = "healthy", "near_alarms"
 HOLD_BACK_S = 600.0
 """a fault begins before its alarm: of so long before one, nothing is learned"""
 KEPT_S = 7 * 24 * 3600.0
-"""of healthy running: what a plant does on each day of the week"""
+"""healthy running that is kept: what a plant does on each day of the week"""
 NEAR_ALARMS_KEPT_S = 24 * 3600.0
 """of running near alarms: about so much, in whole recordings"""
 LONGEST_LAG_NS = 1800 * NS_PER_S

@@ -24,7 +24,7 @@ from fantwin.schemas.units import NS_PER_S
 START_LIMIT_S = 60.0
 """silence while a stage starts: it may load large libraries and ask others for what it missed"""
 SILENT_AFTER_S = 5.0
-"""without a health message, which every stage sends once a second"""
+"""time without a health message, which every stage sends once a second"""
 STARVED_AFTER_S = 5.0
 LATE_AFTER_S = 5.0
 WHY_SILENT = "it hangs, is blocked or gets no processor time"

@@ -25,12 +25,11 @@ class LogIn(BaseModel, frozen=True):
     """
 
     schemes: ClassVar[Mapping[str, int]]
-    """of its URL, with the port of each"""
+    """schemes of its URL, with the port of each"""
 
     url: str
     password_file: Path | None = Field(
-        default=None,
-        description="file with the password in its first line; only its owner may be able to read it",
+        default=None, description="file with the password in its first line; only its owner may be able to read it"
     )
 
     @property

@@ -212,8 +212,8 @@ class TrayScorer:
         decision = self._decision
         assert decision.now is not None
         expected = decision.model.expected_rad_s
-        is_likelier = decision.missing.score > decision.deviation_score
-        is_missing = ~decision.active & (decision.missing.is_active | is_likelier)
+        missing = decision.missing
+        is_missing = ~decision.active & (missing.is_active | (missing.score > decision.deviation_score))
         statistic = np.where(is_missing, int(Statistic.MISSING_READINGS), int(Statistic.DEVIATION))
         statistic = np.where(is_worn & ~decision.has_alarm, int(Statistic.WEAR), statistic)
         statistic = np.where(self._stands, int(Statistic.STANDSTILL), statistic)

@@ -33,8 +33,8 @@ tell a small fault from none, and its alarm would never clear"""
 OVER_S, OVER_ODDS = 10.0, 100.0
 """time for which a healthy fan is likelier, by these odds, than the fault at its largest, until that is over"""
 LEFT_SIGMAS = 3.0
-"""what is left of a fault may be an error of the healthy state up to so many standard deviations: then a healthy fan is
-likelier than a smaller fault by OVER_ODDS at most"""
+"""largest remainder of a fault, in standard deviations, that may be an error of the healthy state instead: a fault of
+that size is OVER_ODDS times as probable as none"""
 PROBABLE = 0.05
 """least probability of a fault that an alarm may have"""
 SMALLEST = 0.01
