@@ -29,10 +29,6 @@ from fantwin.pipeline.recordings.recorder_config import CLIPS_SHARE, RecorderCon
 from fantwin.pipeline.runtime.stage import BuiltStage, Context, Stage, StageError
 from fantwin.schemas.topics import TOPICS, tray_key
 
-CLIP_BEFORE_S, CLIP_AFTER_S = 60.0, 60.0
-"""a clip begins so long before its alarm, and ends so long after"""
-CLIP_SETTLED_S = 2.0
-"""time after the end of a clip for what comes late; it then waits until all of that is on the disk"""
 KEEPS = STAGES[RECORDER].keeps
 """topics whose last messages it keeps for others, also from recordings of before its start"""
 _LOG = logging.getLogger(__name__)
@@ -85,7 +81,7 @@ def _clips_of(parts: RecordingParts, config: RecorderConfig) -> AlarmClips:
     with suppress(DiskError):  # it does not say its size: the health reports that
         most_bytes = round(parts.disk_bytes() * config.keep_share_of_disk * CLIPS_SHARE)
     listed = listed_clips(parts.path)
-    tracker = ClipTracker(listed, CLIP_BEFORE_S, CLIP_AFTER_S, most_bytes, CLIP_SETTLED_S)
+    tracker = ClipTracker(listed, most_bytes)
     clips = AlarmClips(tracker, parts.path, ClipCutter(parts.path, parts.free_bytes, config.min_free_bytes).cut)
     if parts.last_part:
         clips.continue_after(parts.last_part)

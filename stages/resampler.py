@@ -31,19 +31,15 @@ from typing import Self
 from pydantic import Field, model_validator
 
 from fantwin.pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageConfig
-from fantwin.pipeline.timebase.line_rate import (
-    ENOUGH_SAMPLES,
-    LONGEST_WAIT_US,
-    MIN_SAMPLES,
+from fantwin.pipeline.timebase.grid_timing import (
     RATES_HZ,
     GridTiming,
-    LineRate,
-    SampleTimes,
     grid_rate_hz,
     grid_timing,
     is_too_slow,
     leaves_gaps,
 )
+from fantwin.pipeline.timebase.line_rate import ENOUGH_SAMPLES, LONGEST_WAIT_US, MIN_SAMPLES, LineRate, SampleTimes
 from fantwin.pipeline.timebase.sample_grid import SampleGrid
 from fantwin.schemas.messages import Grid, Raw, StatedTacho
 from fantwin.schemas.tacho import INSTANTANEOUS, Tacho, tacho_of_each_fan

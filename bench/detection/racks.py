@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from bench.detection.metrics import Event
 from bench.detection.plant import START_NS
-from fantwin.pipeline.learning.excitation import LEVELS, SHORT_LEVELS, levels_of
+from fantwin.pipeline.learning.sweep_steps import LEVELS, SHORT_LEVELS, levels_of
 from fantwin.schemas.messages import Array, Raw
 from fantwin.schemas.tacho import Tacho
 from fantwin.schemas.units import NS_PER_S

@@ -33,8 +33,8 @@ from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.config.settings import BusConfig
 from fantwin.pipeline.recordings.order import in_order
 from fantwin.pipeline.replay.offline.replay_input import open_replay_input
-from fantwin.pipeline.site.site_state import StageView
 from fantwin.pipeline.site.site_watcher import SiteWatcher
+from fantwin.pipeline.site.stage_states import StageView
 from fantwin.schemas.codec import decode
 from fantwin.schemas.enums import StageStatus
 from fantwin.schemas.messages import Raw, Score

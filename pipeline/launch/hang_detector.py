@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from fantwin.pipeline.site.site_state import START_LIMIT_S
+from fantwin.pipeline.site.stage_states import START_LIMIT_S
 
 _AT_WORK_S = 2.0
 _OWN_PAUSE_S = 1.0  # the launcher itself did not run: the machine was suspended or very busy

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 from fantwin.pipeline.runtime.figures import without_figures
 from fantwin.pipeline.runtime.latencies import LATENCY_WINDOW_S
-from fantwin.pipeline.site.site_state import OFF_THE_BUS, WHY_SILENT, StageState, StageView, Word
 from fantwin.pipeline.site.stage_notes import note_lines
+from fantwin.pipeline.site.stage_states import OFF_THE_BUS, WHY_SILENT, StageState, StageView, Word
 from fantwin.schemas.enums import Severity
 from fantwin.schemas.health import Health
 from fantwin.schemas.units import NS_PER_S

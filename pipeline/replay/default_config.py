@@ -14,7 +14,7 @@ from fantwin.pipeline.config.settings import Config
 from fantwin.pipeline.prediction.tray_twin import load_tray_twin
 from fantwin.pipeline.recordings.left_out import left_out_hint
 from fantwin.pipeline.recordings.reading import RecordingError, RecordingMetadata, read_recording
-from fantwin.pipeline.timebase.line_rate import GAP_PERIODS
+from fantwin.pipeline.timebase.grid_timing import GAP_PERIODS
 from fantwin.schemas.codec import CodecError
 from fantwin.schemas.messages import Raw
 from fantwin.schemas.tacho import INSTANTANEOUS, Tacho

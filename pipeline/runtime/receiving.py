@@ -13,13 +13,13 @@ from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.config.roles import roles_of
 from fantwin.pipeline.config.settings import Config
 from fantwin.pipeline.config.shards import Shard
-from fantwin.pipeline.runtime.believed_outputs import BelievedOutputs
+from fantwin.pipeline.runtime.believed_health import BelievedHealth
 from fantwin.pipeline.runtime.due_messages import DueMessages
 from fantwin.pipeline.runtime.health import HealthBuilder
 from fantwin.pipeline.runtime.inbox import FromBus, Inbox, Liveness, Recovered
 from fantwin.pipeline.runtime.lost_sessions import LostSessions
+from fantwin.pipeline.runtime.missed_messages import Recovery
 from fantwin.pipeline.runtime.peers import Peers
-from fantwin.pipeline.runtime.recovery import Recovery
 from fantwin.pipeline.runtime.sequence_tracker import Found, SequenceTracker
 from fantwin.pipeline.runtime.sessions import Sessions, this_host
 from fantwin.pipeline.runtime.silences import Silences
@@ -70,7 +70,7 @@ class Receiver:
         what is received changes them."""
         self._stage = stage
         self._site = config.site
-        self._believed_outputs = BelievedOutputs(roles_of(config))
+        self._believed_health = BelievedHealth(roles_of(config))
         self._shard = shard
         self._trays = frozenset(shard.trays)
         self._is_patient = stage.is_patient or (stage.joint is not None and len(shard.trays) >= MANY_TRAYS)
@@ -194,7 +194,7 @@ class Receiver:
         self._recovery.finish(item)
 
     def _take_health(self, envelope: Envelope, health: Health) -> None:
-        said, health = health, self._believed_outputs.of(health)
+        said, health = health, self._believed_health.of(health)
         if health is not said:
             self.counts["refused_outputs"] += 1
         self.peers.add_health(alive_key(self._site, health.stage, health.instance), health)

@@ -27,7 +27,7 @@ from fantwin.pipeline.runtime.ending import Ending, Step
 from fantwin.pipeline.runtime.health import HealthBuilder
 from fantwin.pipeline.runtime.inbox import INBOX_SIZE, FromBus, FromSource, Inbox, Item, Liveness
 from fantwin.pipeline.runtime.kept_snapshots import KeptForOthers
-from fantwin.pipeline.runtime.outputs import Outputs
+from fantwin.pipeline.runtime.publishing import Outputs
 from fantwin.pipeline.runtime.receiving import Receiver
 from fantwin.pipeline.runtime.service_manager import Notifier
 from fantwin.pipeline.runtime.sessions import Session, Sessions, trays_in_words

@@ -10,7 +10,7 @@ from typing import Any
 from fantwin.pipeline.runtime.health import HealthBuilder
 from fantwin.pipeline.runtime.joint_step import step_together
 from fantwin.pipeline.runtime.kept_snapshots import KeptForOthers
-from fantwin.pipeline.runtime.outputs import Outputs
+from fantwin.pipeline.runtime.publishing import Outputs
 from fantwin.pipeline.runtime.receiving import Receiver
 from fantwin.pipeline.runtime.stage import BuiltStage, Stage
 from fantwin.pipeline.timebase.host_clock import HOST_CLOCK

@@ -21,8 +21,8 @@ from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.config.loading import load_config
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.selftest.stepped_clock import VARIABLE, set_offset_ns
-from fantwin.pipeline.site.site_state import StageView
 from fantwin.pipeline.site.site_watcher import SiteWatcher
+from fantwin.pipeline.site.stage_states import StageView
 from fantwin.pipeline.sources.simulated.device import Device, PseudoTerminal, play, wait_for_reader
 from fantwin.schemas.codec import decode
 from fantwin.schemas.enums import Transition

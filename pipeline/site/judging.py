@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from fantwin.pipeline.config.registry import STAGES
 from fantwin.pipeline.runtime.figures import without_figures
 from fantwin.pipeline.site.site_model import SiteModel
-from fantwin.pipeline.site.site_state import StageState, Word
+from fantwin.pipeline.site.stage_states import StageState, Word
 from fantwin.schemas.enums import InvalidReason
 from fantwin.schemas.fan_numbers import fans_in_words
 from fantwin.schemas.messages import Alarm

@@ -14,7 +14,7 @@ from fantwin.pipeline.recordings.clips.clip import Clip
 from fantwin.pipeline.site.fan_history import Curves
 from fantwin.pipeline.site.fleet import SHOWN_CLASSES, Fan, FanGroup, FanNow
 from fantwin.pipeline.site.site_model import SiteModel
-from fantwin.pipeline.site.site_state import StageState
+from fantwin.pipeline.site.stage_states import StageState
 from fantwin.schemas.channels import CHANNELS
 from fantwin.schemas.enums import Feedback, Transition
 from fantwin.schemas.messages import Alarm, Array, ModelCard

@@ -23,7 +23,7 @@ from fantwin.pipeline.site.alarm_rates import AlarmRates
 from fantwin.pipeline.site.fan_history import COLUMNS, Curves, FanHistory, channels_of, values_of
 from fantwin.pipeline.site.fleet import SHOWN_CLASSES, Fan, FanGroup, FanNow, Fleet, last_sample
 from fantwin.pipeline.site.judged_time import LEARNED, JudgedTime
-from fantwin.pipeline.site.site_state import HeardHealth, StageState, stage_states
+from fantwin.pipeline.site.stage_states import HeardHealth, StageState, stage_states
 from fantwin.schemas.codec import CodecError, decode
 from fantwin.schemas.enums import Feedback, InvalidReason, StageStatus, Transition
 from fantwin.schemas.envelope import Envelope

@@ -11,7 +11,7 @@ from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.config.roles import Role, roles_of_stages
 from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.config.shards import StageProcess
-from fantwin.pipeline.runtime.believed_outputs import BelievedOutputs
+from fantwin.pipeline.runtime.believed_health import BelievedHealth
 from fantwin.pipeline.runtime.lost_sessions import LostSessions
 from fantwin.pipeline.runtime.sessions import Session, this_host
 from fantwin.pipeline.site.known_sessions import KnownSessions
@@ -19,7 +19,7 @@ from fantwin.pipeline.site.loss_accounting import Launched, label, losses
 from fantwin.pipeline.site.one_line import readable_alarm, readable_health
 from fantwin.pipeline.site.refused_input import refused, unusable_lines
 from fantwin.pipeline.site.site_model import SiteModel
-from fantwin.pipeline.site.site_state import HeardHealth, StageState, StageView, stage_states
+from fantwin.pipeline.site.stage_states import HeardHealth, StageState, StageView, stage_states
 from fantwin.schemas.codec import CodecError, decode
 from fantwin.schemas.health import Health
 from fantwin.schemas.messages import Alarm, Score
@@ -62,7 +62,7 @@ class SiteWatcher:
             has_scores: their scores are followed, too.
             hear_alarm: is called with each alarm message of the site.
         """
-        self._believed_outputs = BelievedOutputs(roles_of_stages() if roles is None else roles)
+        self._believed_health = BelievedHealth(roles_of_stages() if roles is None else roles)
         self._bus = bus
         self._site = site
         self._hear_alarm = hear_alarm
@@ -191,7 +191,7 @@ class SiteWatcher:
     def _on_health(self, key: str, payload: bytes) -> None:
         health = _decoded(Health, payload)
         if isinstance(health, Health) and key == health_key(self._site, health.stage, health.instance):
-            health = self._believed_outputs.of(readable_health(health))
+            health = self._believed_health.of(readable_health(health))
             with self._lock:
                 self._sessions.add_health(health)
                 before = self._healths.get(health.header.producer) or self._unknown.get(health.header.producer)

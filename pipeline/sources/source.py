@@ -1,9 +1,9 @@
 """Source of samples: where the readings of one tray come from and its commands go to.
 
 A source delivers readings as the device gives them, in the units of its tray. Everything else is shared by all sources
-and lives in stages/acquisition.py: range checks, unit conversion, message blocks, losses by sequence number.
+and lives in pipeline/acquisition: range checks, unit conversion, message blocks, losses by sequence number.
 
-To add a source, write one file with a `SourceConfig` and a `SampleSource`, and add its row to
+To add a source, make a folder with a `SourceConfig` and a `SampleSource`, and add its row to
 pipeline/sources/kinds.py.
 """
 

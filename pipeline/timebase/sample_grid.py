@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from fantwin.pipeline.timebase.device_clock import LARGEST_GAP, UINT32, DeviceClock
+from fantwin.pipeline.timebase.grid_timing import GridTiming
 from fantwin.pipeline.timebase.interpolation import (
     NEVER_NS,
     LastReadings,
@@ -23,7 +24,6 @@ from fantwin.pipeline.timebase.interpolation import (
     interpolate_samples,
 )
 from fantwin.pipeline.timebase.line_guard import LineGuard
-from fantwin.pipeline.timebase.line_rate import GridTiming
 from fantwin.pipeline.timebase.stage_clock import is_of_replay
 from fantwin.schemas.blocks import cut, join
 from fantwin.schemas.channels import CHANNELS, measured_columns

@@ -22,7 +22,7 @@ from fantwin.schemas.units import NS_PER_S
 from fantwin.scoring.alarms.alarm_manager import AlarmManager, Measured
 from fantwin.scoring.alarms.alarm_state import ConditionSettings
 from fantwin.scoring.alarms.alarm_text import AlarmText
-from fantwin.scoring.alarms.tray_conditions import Decided
+from fantwin.scoring.alarms.alarms_of_tray import Decided
 from fantwin.scoring.diagnosis.causes import CANNOT_TELL, CAUSES, SENSOR_DROPOUT, SLOW_CHANGE, is_of_standstill
 from fantwin.scoring.diagnosis.ranked_causes import CauseWords, PossibleCause
 from fantwin.scoring.diagnosis.standstill_causes import Standing, standstill_causes

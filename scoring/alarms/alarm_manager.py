@@ -15,7 +15,7 @@ from fantwin.schemas.units import NS_PER_S
 from fantwin.scoring.alarms.alarm_flags import is_listed
 from fantwin.scoring.alarms.alarm_state import AlarmState, ConditionSettings
 from fantwin.scoring.alarms.alarm_text import AlarmText
-from fantwin.scoring.alarms.tray_conditions import Decided, TrayConditions
+from fantwin.scoring.alarms.alarms_of_tray import AlarmsOfTray, Decided
 from fantwin.scoring.diagnosis.causes import is_of_standstill
 from fantwin.scoring.diagnosis.ranked_causes import says_more
 
@@ -63,7 +63,7 @@ class AlarmManager:
 
     def __init__(self, fans: int, settings: ConditionSettings, alarm_text: AlarmText) -> None:
         self._fans = fans
-        self._conditions = TrayConditions(fans, settings)
+        self._conditions = AlarmsOfTray(fans, settings)
         self._alarm_text = alarm_text
         self._last_emitted: dict[int, Alarm] = {}
         """the last message about each fan"""

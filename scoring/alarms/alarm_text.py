@@ -9,7 +9,7 @@ from __future__ import annotations
 from fantwin.schemas.enums import Severity, Statistic, Transition
 from fantwin.schemas.messages import Alarm
 from fantwin.schemas.units import SpeedUnit
-from fantwin.scoring.alarms.alarm_units import AlarmUnits
+from fantwin.scoring.alarms.deviation_text import AlarmUnits
 from fantwin.scoring.diagnosis.causes import CANNOT_TELL, CAUSES, STANDSTILL_CAUSES
 
 TRANSITIONS = {

@@ -23,7 +23,7 @@ from fantwin.schemas.messages import Alarm, Prediction, Score, ScorerSnapshot
 from fantwin.schemas.standstill import Standstill
 from fantwin.schemas.tacho import Tacho
 from fantwin.scoring.alarms.alarm_state import ConditionSettings
-from fantwin.scoring.alarms.tray_conditions import Decided, TrayConditions
+from fantwin.scoring.alarms.alarms_of_tray import AlarmsOfTray, Decided
 from fantwin.scoring.model.saved import as_json, from_json
 from fantwin.scoring.standing.against_command import AgainstCommand
 from fantwin.stages.scorer import RESTORE_ERRORS, ScorerCore
@@ -157,7 +157,7 @@ class Against:
 
 PARTS = {
     "alarm conditions": Kind(
-        lambda fans: TrayConditions(fans, CONDITIONS), decisions, lambda one, item: repr(one.update(item))
+        lambda fans: AlarmsOfTray(fans, CONDITIONS), decisions, lambda one, item: repr(one.update(item))
     ),
     "fans against their command": Kind(Against, stops, Against.take, state=lambda one: None),
 }

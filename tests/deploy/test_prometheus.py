@@ -93,7 +93,7 @@ def health(stage: str, messages: int, uptime_s: float, latency_s: float = 0.05, 
 @pytest.fixture
 def gateway(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[RunningGateway]:
     """What it was last fed with does not grow old, however long Prometheus takes."""
-    for module in ("fantwin.pipeline.site.site_model", "fantwin.pipeline.site.site_state"):
+    for module in ("fantwin.pipeline.site.site_model", "fantwin.pipeline.site.stage_states"):
         monkeypatch.setattr(f"{module}.SILENT_AFTER_S", math.inf)
     running = RunningGateway(tmp_path, fans=ALL_FANS)
     try:

@@ -75,7 +75,7 @@ def started() -> Iterator[Callable[..., Notifier]]:
 def short_delays(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sending, "FIRST_DELAY_S", 0.05)
     monkeypatch.setattr(sending, "LONGEST_DELAY_S", 0.2)
-    monkeypatch.setattr("fantwin.pipeline.outputs.notify.apprise_service.MAIL_PAUSE_S", 0.0)
+    monkeypatch.setattr("fantwin.pipeline.outputs.notify.mail_and_chat.MAIL_PAUSE_S", 0.0)
 
 
 def mail_target(folder: Path, mail: MailServer, **more: Any) -> dict[str, Any]:

@@ -59,7 +59,7 @@ def clips_of(recording: Path, free: int = FREE, after_s: float = 1.0) -> AlarmCl
 def with_cutter(disk: Disk, folder: Path, **config: Any) -> tuple[Recorder, AlarmClips, Cutter]:
     """A recorder whose clips are cut by a stand-in."""
     cutter = Cutter()
-    clips = AlarmClips(ClipTracker((), 60, 60, 0), folder / "recording.mcap", cutter.cut)
+    clips = AlarmClips(ClipTracker((), 0), folder / "recording.mcap", cutter.cut)
     return Recorder(disk, RecorderConfig(**config), NOW_NS, clips=clips), clips, cutter
 
 

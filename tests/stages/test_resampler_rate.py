@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fantwin.pipeline.timebase.line_rate import grid_rate_hz
+from fantwin.pipeline.timebase.grid_timing import grid_rate_hz
 from fantwin.schemas.blocks import join
 from fantwin.schemas.enums import InvalidReason
 from fantwin.schemas.header import Header

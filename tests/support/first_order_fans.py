@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from fantwin.pipeline.learning.excitation import (
+from fantwin.pipeline.learning.sweep_steps import (
     Observed,
 )
 

@@ -18,8 +18,8 @@ from typing import Any
 from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.config.settings import BusConfig, TrayConfig
 from fantwin.pipeline.selftest.scratch_site import FANTWIN
-from fantwin.pipeline.site.site_state import StageView
 from fantwin.pipeline.site.site_watcher import SiteWatcher
+from fantwin.pipeline.site.stage_states import StageView
 
 DEMO = Path(__file__).parents[2] / "pipeline" / "demo"
 SITE, TRAY, FANS = "demo", "tray1", 8

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from fantwin.pipeline.acquisition.commanding import (
+from fantwin.pipeline.acquisition.command_sender import (
     CommandSender,
     chosen_tray,
     command_of,

@@ -13,7 +13,7 @@ from typing import Annotated, Any
 
 import typer
 
-from fantwin.pipeline.acquisition.commanding import require_commandable
+from fantwin.pipeline.acquisition.command_sender import require_commandable
 from fantwin.pipeline.bus.endpoint import accepts_connections
 from fantwin.pipeline.cli.options import (
     DEFAULT_CONFIG,

@@ -21,14 +21,8 @@ from fantwin.pipeline.prediction.tray_twin import TrayTwin, load_tray_twin, twin
 from fantwin.pipeline.runtime.stage import Context, StageError, load_stage
 from fantwin.pipeline.sources.tacho_evidence import find_tacho, tacho_hints
 from fantwin.pipeline.timebase.device_clock import UINT32
-from fantwin.pipeline.timebase.line_rate import (
-    MAX_SAMPLES,
-    GridTiming,
-    SampleTimes,
-    grid_rate_hz,
-    is_too_slow,
-    leaves_gaps,
-)
+from fantwin.pipeline.timebase.grid_timing import GridTiming, grid_rate_hz, is_too_slow, leaves_gaps
+from fantwin.pipeline.timebase.line_rate import MAX_SAMPLES, SampleTimes
 from fantwin.schemas.codec import CodecError, decode
 from fantwin.schemas.messages import Array, Raw
 from fantwin.schemas.topics import tray_key

@@ -27,9 +27,9 @@ from fantwin.pipeline.site.fleet import Fan
 from fantwin.pipeline.site.judging import Unjudged, as_judged, at_rest, unjudged
 from fantwin.pipeline.site.refused_input import refused_lines
 from fantwin.pipeline.site.site_model import SiteModel
-from fantwin.pipeline.site.site_state import AT_WORK, StageState, StageView, Word
 from fantwin.pipeline.site.site_watcher import SiteWatcher
 from fantwin.pipeline.site.stage_notes import note_lines, notes_as_json
+from fantwin.pipeline.site.stage_states import AT_WORK, StageState, StageView, Word
 from fantwin.schemas.enums import Severity
 from fantwin.schemas.streams import LOSS_PREFIX
 from fantwin.schemas.topics import ALL_TRAYS

@@ -11,7 +11,7 @@ from contextlib import suppress
 import numpy as np
 import typer
 
-from fantwin.pipeline.acquisition.commanding import (
+from fantwin.pipeline.acquisition.command_sender import (
     CommandSender,
     NotReceivedError,
     command_of,
@@ -23,7 +23,7 @@ from fantwin.pipeline.cli.printing import show
 from fantwin.pipeline.config.roles import OPERATOR
 from fantwin.pipeline.config.settings import Config, TrayConfig
 from fantwin.pipeline.errors import UsageError, UserError
-from fantwin.pipeline.learning.excitation import Excitation, Observed, StoppedError
+from fantwin.pipeline.learning.sweep_steps import Excitation, Observed, StoppedError
 from fantwin.pipeline.runtime.signals import stop_on_signals
 from fantwin.schemas.codec import CodecError, decode
 from fantwin.schemas.messages import Raw

@@ -9,8 +9,8 @@ from pathlib import Path
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.extras import require
 from fantwin.pipeline.outputs.notify.alertmanager import Alertmanager, AlertSender, test_alert
-from fantwin.pipeline.outputs.notify.apprise_service import Service
 from fantwin.pipeline.outputs.notify.config import NotifierConfig, TargetConfig
+from fantwin.pipeline.outputs.notify.mail_and_chat import Service
 from fantwin.pipeline.outputs.notify.outbox import Outbox
 from fantwin.pipeline.outputs.notify.sending import Failure, Sender, TargetThread
 from fantwin.pipeline.outputs.notify.wording import Place, test_text

@@ -23,7 +23,7 @@ from prometheus_client.utils import floatToGoString
 
 from fantwin.pipeline.site.fan_history import CURVES
 from fantwin.pipeline.site.site_model import SiteModel
-from fantwin.pipeline.site.site_state import AT_WORK, StageState, Word
+from fantwin.pipeline.site.stage_states import AT_WORK, StageState, Word
 from fantwin.schemas.channels import CHANNELS
 from fantwin.schemas.enums import Severity
 from fantwin.schemas.health import LatencyBucket

@@ -16,6 +16,10 @@ from fantwin.schemas.messages import Alarm
 from fantwin.schemas.units import NS_PER_S
 from fantwin.scoring.alarms.alarm_flags import is_silenced
 
+BEFORE_S, AFTER_S = 60.0, 60.0
+"""a clip begins so long before its alarm, and ends so long after"""
+SETTLED_S = 2.0
+"""time after the end of a clip for what comes late; it then waits until all of that is on the disk"""
 LONGEST_NS = 600 * NS_PER_S
 """of a clip that more and more alarms extend; the next alarm then begins another one"""
 LONGEST_DELAY_NS = 300 * NS_PER_S
@@ -45,11 +49,15 @@ class ClipTracker:
     """The clips of one recorder."""
 
     def __init__(
-        self, clips: Iterable[Clip], before_s: float, after_s: float, most_bytes: int, settled_s: float = 2.0
+        self,
+        clips: Iterable[Clip],
+        most_bytes: int,
+        *,
+        before_s: float = BEFORE_S,
+        after_s: float = AFTER_S,
+        settled_s: float = SETTLED_S,
     ) -> None:
-        """clips: those known from before a restart. before_s, after_s: how much a clip holds around its alarm.
-        most_bytes: of all clips together; 0: no limit. settled_s: how long after its end all of a clip is on the disk.
-        """
+        """clips: those known from before a restart. most_bytes: of all clips together; 0: no limit."""
         self._clips = {clip.name: clip for clip in clips}
         self._before_ns, self._after_ns = round(before_s * NS_PER_S), round(after_s * NS_PER_S)
         self._settled_ns = round(settled_s * NS_PER_S)

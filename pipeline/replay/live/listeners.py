@@ -14,8 +14,8 @@ from fantwin.pipeline.replay.stage_chain import replay_starts
 from fantwin.pipeline.runtime.sessions import Sessions
 from fantwin.pipeline.runtime.stage import Stage, load_stage
 from fantwin.pipeline.site.loss_accounting import label
-from fantwin.pipeline.site.site_state import StageView
 from fantwin.pipeline.site.site_watcher import SiteWatcher
+from fantwin.pipeline.site.stage_states import StageView
 from fantwin.pipeline.timebase.stage_clock import REPLAY
 from fantwin.schemas.health import Health
 from fantwin.schemas.streams import StreamId, input_streams, output_streams

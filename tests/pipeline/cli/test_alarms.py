@@ -24,8 +24,8 @@ from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Alarm, Diagnosis, Message, Request
 from fantwin.schemas.topics import BY_NAME, tray_key
 from fantwin.scoring.alarms.alarm_state import AlarmState, ConditionSettings
+from fantwin.scoring.alarms.alarms_of_tray import AlarmsOfTray, Decided
 from fantwin.scoring.alarms.current_alarms import clock
-from fantwin.scoring.alarms.tray_conditions import Decided, TrayConditions
 from tests.support.fantwin_command import error_of, fantwin
 from tests.support.running_chain import DEMO, FANTWIN, SITE, TRAY, eventually
 from tests.support.running_scorer import RunningScorer
@@ -47,7 +47,7 @@ class AlarmOnRequestScorer(Core):
     """The conditions of a tray whose fans have the alarms that a test says; answers requests as a scorer does."""
 
     def __init__(self) -> None:
-        self.conditions = TrayConditions(FANS, ConditionSettings(earlier_alarms=4))
+        self.conditions = AlarmsOfTray(FANS, ConditionSettings(earlier_alarms=4))
         self.has_alarm: set[int] = set()
         self._raised_t_ns = np.zeros(FANS, np.int64)
         self.deaf = False

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from typer.testing import Result
 
-from fantwin.pipeline.acquisition import commanding
+from fantwin.pipeline.acquisition import command_sender
 from tests.support.fantwin_command import error_of, fantwin
 from tests.support.running_chain import DEADLINE_S, Chain, RunningCommand, eventually
 
@@ -24,7 +24,7 @@ def chain(tmp_path: Path, endpoint: str) -> Iterator[Chain]:
 def test_what_the_line_did_not_take_is_one_line_that_says_why_and_a_note_names_what_was_probably_meant(
     chain, monkeypatch
 ):
-    monkeypatch.setattr(commanding, "_ANSWER_S", DEADLINE_S)  # a command waits for the acquisition, which starts
+    monkeypatch.setattr(command_sender, "_ANSWER_S", DEADLINE_S)  # a command waits for the acquisition, which starts
     acquisition = RunningCommand(["up", "--only", "acquisition", *chain.words("run")[1:]])
     try:
         error = error_of(*chain.words("command"), "--fan", 3, 0.5)  # there is no tray
@@ -44,6 +44,6 @@ def test_what_the_line_did_not_take_is_one_line_that_says_why_and_a_note_names_w
 
 
 def test_without_an_acquisition_the_command_is_reported_as_not_received(chain, monkeypatch):
-    monkeypatch.setattr(commanding, "_ANSWER_S", 0.1)
+    monkeypatch.setattr(command_sender, "_ANSWER_S", 0.1)
     expected = "no acquisition of tray tray1 received the command: is `fantwin up` running?"
     assert error_of(*chain.words("command"), "--fan", 3, 0.5) == expected

@@ -24,8 +24,8 @@ from fantwin.pipeline.cli.watch import status as status_command
 from fantwin.pipeline.cli.watch.status import as_json, loss_lines, not_judged, stage_table
 from fantwin.pipeline.config.loading import load_config
 from fantwin.pipeline.config.settings import BusConfig
-from fantwin.pipeline.site.site_state import StageState, StageView, Word
 from fantwin.pipeline.site.site_watcher import SiteWatcher
+from fantwin.pipeline.site.stage_states import StageState, StageView, Word
 from fantwin.schemas.codec import encode, type_name
 from fantwin.schemas.enums import InvalidReason, Severity, StageStatus, Transition
 from fantwin.schemas.header import Header

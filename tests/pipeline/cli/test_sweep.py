@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 import pytest
 
-from fantwin.pipeline.acquisition.commanding import NotReceivedError
+from fantwin.pipeline.acquisition.command_sender import NotReceivedError
 from fantwin.pipeline.cli.watch import sweep as sweep_module
 from fantwin.pipeline.cli.watch.sweep import range_within
 from fantwin.pipeline.config.settings import TrayConfig

@@ -7,7 +7,7 @@ import pytest
 from fantwin.pipeline.launch.hang_detector import HangDetector
 from fantwin.pipeline.launch.notices import Notices
 from fantwin.pipeline.runtime.service_manager import Notifier, starting
-from fantwin.pipeline.site.site_state import START_LIMIT_S
+from fantwin.pipeline.site.stage_states import START_LIMIT_S
 from tests.support.running_chain import eventually
 
 LIMIT_S = 10.0

@@ -7,8 +7,8 @@ from dataclasses import replace
 import pytest
 
 from fantwin.pipeline.launch.site_report import RunningProcess, SiteReport
-from fantwin.pipeline.site.site_state import StageState, Word
 from fantwin.pipeline.site.site_watcher import StageView
+from fantwin.pipeline.site.stage_states import StageState, Word
 from fantwin.schemas.enums import Severity, Transition
 from fantwin.schemas.header import Header
 from fantwin.schemas.health import Note

@@ -31,7 +31,7 @@ def alarm(fan: int = 0, at_s: float = 0.0, tray: str = "tray1", *, onset_s: floa
 
 
 def tracker(*clips: Clip, most_bytes: int = 0) -> ClipTracker:
-    return ClipTracker(clips, before_s=60, after_s=60, most_bytes=most_bytes, settled_s=2)
+    return ClipTracker(clips, most_bytes)
 
 
 def follow(tracker: ClipTracker, *alarms: Alarm) -> None:

@@ -12,8 +12,8 @@ from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.site.fleet import Fan
 from fantwin.pipeline.site.judging import JudgedChanges, Unjudged, as_judged, at_rest, unjudged
 from fantwin.pipeline.site.site_model import SILENT_AFTER_S
-from fantwin.pipeline.site.site_state import StageState, Word
 from fantwin.pipeline.site.site_watcher import SiteWatcher
+from fantwin.pipeline.site.stage_states import StageState, Word
 from fantwin.schemas.codec import encode
 from fantwin.schemas.enums import FanState, InvalidReason
 from fantwin.schemas.header import Header

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from fantwin.pipeline.outputs.notify.apprise_service import Service
+from fantwin.pipeline.outputs.notify.mail_and_chat import Service
 from fantwin.pipeline.outputs.notify.wording import Level, Text
 from fantwin.scoring.diagnosis.causes import CANNOT_TELL, CAUSES, WHAT_TO_DO
 from tests.support.message_receivers import HttpReceiver, MailServer

@@ -12,7 +12,7 @@ from fantwin.schemas.streams import MOST_PUBLISHED
 from fantwin.schemas.topics import topic_of, tray_of
 
 
-class BelievedOutputs:
+class BelievedHealth:
     """Decides by the roles of a site."""
 
     def __init__(self, roles: Mapping[str, Role]) -> None:

@@ -43,7 +43,7 @@ class Decided:
     """time between two decisions"""
 
 
-class TrayConditions:
+class AlarmsOfTray:
     """Conditions of a tray, one for each fan."""
 
     def __init__(self, fans: int, settings: ConditionSettings) -> None:

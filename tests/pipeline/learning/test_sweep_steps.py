@@ -9,7 +9,8 @@ import pytest
 
 from fantwin.pipeline.config.loading import load_config
 from fantwin.pipeline.errors import UserError
-from fantwin.pipeline.learning.excitation import (
+from fantwin.pipeline.learning.ordinary_operation import OrdinaryOperation
+from fantwin.pipeline.learning.sweep_steps import (
     LEVELS,
     SETTLING,
     SHORT_LEVELS,
@@ -17,7 +18,6 @@ from fantwin.pipeline.learning.excitation import (
     Observed,
     StoppedError,
 )
-from fantwin.pipeline.learning.ordinary_operation import OrdinaryOperation
 from tests.support.first_order_fans import PERIOD_S, FirstOrderFans
 
 

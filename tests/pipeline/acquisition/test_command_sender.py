@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fantwin.pipeline.acquisition.commanding import CommandSender, command_of, share_note, why_not_sent
+from fantwin.pipeline.acquisition.command_sender import CommandSender, command_of, share_note, why_not_sent
 from fantwin.pipeline.acquisition.device_commands import DeviceCommands
 from fantwin.pipeline.bus.publisher import Publisher
 from fantwin.pipeline.bus.session import Bus

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from fantwin.schemas.enums import Action, Severity, Transition
 from fantwin.scoring.alarms.alarm_flags import is_retained, is_silenced
 from fantwin.scoring.alarms.alarm_state import UNTIL_IT_CLEARS_T_NS, ConditionSettings
-from fantwin.scoring.alarms.tray_conditions import AlarmEvent, Decided, TrayConditions
+from fantwin.scoring.alarms.alarms_of_tray import AlarmEvent, AlarmsOfTray, Decided
 
 STEP_NS = 10
 LOST_NS = 35
@@ -24,8 +24,8 @@ UP, LOW, HIGH = 1, 0, 2
 ONSET_NS = 7
 
 
-def conditions_of(fans: int = 1, **more: Any) -> TrayConditions:
-    return TrayConditions(fans, ConditionSettings(data_lost_after_ns=LOST_NS, **more))
+def conditions_of(fans: int = 1, **more: Any) -> AlarmsOfTray:
+    return AlarmsOfTray(fans, ConditionSettings(data_lost_after_ns=LOST_NS, **more))
 
 
 def decided(number: int, active: Sequence[int], judged: Sequence[bool]) -> Decided:
@@ -37,7 +37,7 @@ def decided(number: int, active: Sequence[int], judged: Sequence[bool]) -> Decid
 
 
 def take(
-    conditions: TrayConditions, active: Sequence[int], judged: Sequence[bool] | None = None, first: int = 0
+    conditions: AlarmsOfTray, active: Sequence[int], judged: Sequence[bool] | None = None, first: int = 0
 ) -> list[tuple[int, Transition]]:
     """The transitions of one fan, each with the number of its decision."""
     judged = [True] * len(active) if judged is None else judged
@@ -48,7 +48,7 @@ def take(
 
 
 def asked(
-    conditions: TrayConditions, action: Action, now_t_ns: int = 0, duration_ns: float = 0
+    conditions: AlarmsOfTray, action: Action, now_t_ns: int = 0, duration_ns: float = 0
 ) -> tuple[Transition, str]:
     ((_, transition, why),) = conditions.request(action, [0], now_t_ns, duration_ns, "Ann", "looked at it")
     return transition, why
@@ -248,7 +248,7 @@ SETTINGS = st.builds(
 def test_raised_and_cleared_alternate_and_say_what_was_decided_last(
     history: dict[str, Any], chosen: ConditionSettings
 ) -> None:
-    conditions, found = TrayConditions(2, chosen), list[Any]()
+    conditions, found = AlarmsOfTray(2, chosen), list[Any]()
     for number, (active, judged) in enumerate(zip(history["active"], history["judged"], strict=True)):
         if number in history["requests"]:
             action, fan, duration_ns = history["requests"][number]

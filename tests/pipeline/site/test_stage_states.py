@@ -7,8 +7,8 @@ from dataclasses import replace
 import pytest
 
 from fantwin.pipeline.config.shards import Shard, StageProcess
-from fantwin.pipeline.site.site_state import StageState, Word, stage_states
 from fantwin.pipeline.site.site_watcher import StageView
+from fantwin.pipeline.site.stage_states import StageState, Word, stage_states
 from fantwin.schemas.enums import StageStatus
 from fantwin.schemas.health import AwaitedInput
 from fantwin.schemas.units import NS_PER_S
