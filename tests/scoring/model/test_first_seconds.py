@@ -13,7 +13,7 @@ from fantwin.scoring.model.faults import DRAG, SCALE
 from tests.support.made_bins import MadeFans, plays, with_balance, with_reading
 from tests.support.scored_blocks import TWIN_SPEED, twin_of
 
-FANS, MANY = 6, 20
+FANS, MANY = 6, 16
 OF_TEN_PER_CENT, OF_TWENTY_PER_CENT = 0.105, 0.21
 """sizes of a drag that takes this much of TWIN_SPEED"""
 
