@@ -111,8 +111,7 @@ def simulated() -> Seen:
         expected, std = _expected(scorer)
         measured = float(np.nanmean(score.measured_speed_rad_s[:, FAN]))
         rows.append((t_s, measured, predicted, predicted + expected, std, float(score.score[-1, FAN])))
-        in_alarm = scorer._decision.alarms.get(FAN)
-        causes.append({one.cause: one.probability for one in in_alarm.causes()} if in_alarm else {})
+        causes.append({one.cause: one.probability for one in scorer._decision.alarms.causes(FAN)})
     t_s, measured, predicted, expected, std, score = np.array(rows).T
     names = dict.fromkeys(name for one in causes for name in one)
     probabilities = {name: np.array([one.get(name, np.nan) for one in causes]) for name in names}

@@ -1,9 +1,9 @@
 """What a fan-sample costs in each stage, and the memory of a fan in the scorer.
 
-Rough fans at 100 Hz under random stairs, all healthy, watched by a calibrated twin of one such fan: trays of 8, of 64,
-and 20 trays of 500. Messages are made beforehand and taken by the cores one after the other, in this process: time of
-the processor for the cores of the stages and for the codec. Memory is by how much this process grows once there are
-scorers. Bus, recorder and viewer are not in it.
+Rough fans at 100 Hz under random stairs, healthy unless `--in-alarm` says otherwise, watched by the calibrated twin of
+one: trays of 8, of 64, and 20 trays of 500. Messages are made beforehand and taken by the cores one after the
+other, in this process: time of the processor for the cores of the stages and for the codec. Memory is by how much this
+process grows once there are scorers. Bus, recorder and viewer are not in it.
 
     python -m bench.fleet.stage_cost
 """
@@ -24,7 +24,7 @@ import numpy as np
 import typer
 
 from bench.detection.plant import START_NS
-from bench.fleet.hall import Hall
+from bench.fleet.hall import FAULT_S, Hall, HallFault
 from bench.printing import JsonOption, progress, show
 from bench.runtime.stage_memory import memory_mb
 from bench.stage_context import stage_context
@@ -74,6 +74,7 @@ def main(
     fans_of_tray: Annotated[
         list[int] | None, typer.Option(help="8, 64 or 500, which makes 10,000 fans; repeatable. Default: all three.")
     ] = None,
+    in_alarm: Annotated[float, typer.Option(help="Share of the fans that lose speed, and so have an alarm.")] = 0.0,
     json_output: JsonOption = False,
 ) -> None:
     """Print microseconds for each fan-sample, by stage, length of the messages, and fans of a tray."""
@@ -85,7 +86,7 @@ def main(
             for block_s in BLOCKS_S:
                 hall = Hall(fans * TRAYS[fans], fans, block_s)
                 progress(f"{hall.trays} trays of {fans} fans, messages of {block_s:g} s")
-                rows.append(_row(hall, block_s, cost_of(hall, seconds, twin), seconds))
+                rows.append(_row(hall, block_s, cost_of(hall, seconds, twin, in_alarm), seconds))
     show({"us of the processor for each fan-sample": rows}, ["bytes: of all four messages"], as_json=json_output)
 
 
@@ -118,12 +119,15 @@ def raws(run: Run, block_s: float) -> Iterator[Raw]:
         )
 
 
-def cost_of(hall: Hall, seconds: float, twin: Path) -> Cost:
-    """What the samples of a hall cost."""
+def cost_of(hall: Hall, seconds: float, twin: Path, in_alarm: float) -> Cost:
+    """What the samples of a hall cost. in_alarm: share of the fans that lose speed."""
     table = f'[[tray]]\nname = "{{}}"\nfans = {hall.fans_of_tray}\ntwin = "{twin}"\n'
     text = f'site = "{SITE}"\n[resampler]\nrate_hz = {RATE_HZ:g}\n' + "".join(map(table.format, hall.names))
     config = parse_config(text, twin.parent / "fantwin.toml", (), STAGES)
-    messages, cost = hall.messages(START_NS, []), Cost()
+    starts_s = np.arange(BEGINNING_S, BEGINNING_S + seconds, FAULT_S).tolist()
+    of_tray = range(round(in_alarm * hall.fans_of_tray))
+    faults = [HallFault(tray, fan, at_s) for tray in range(hall.trays) for fan in of_tray for at_s in starts_s]
+    messages, cost = hall.messages(START_NS, faults), Cost()
     before = [_cores(stage, config) for stage in STAGES[:-1]]
     for _ in range(round(BEGINNING_S * RATE_HZ / hall.block)):
         for tray, raw in enumerate(next(messages)):

@@ -5,7 +5,6 @@ The scorer itself is asked, without noise: fans run steadily, then each drops by
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -58,8 +57,7 @@ def smallest_drops(twin: TrayTwin, calibration: Calibration) -> Array:
     each = modelled_fans(twin)
     fan = int(np.argmax(np.hypot(each.noise_rad_s, each.pulse_rad_s)))
     count = len(SPEEDS) * len(DROPS)
-    arrays = {name: values for name, values in vars(each.of(fan)).items() if isinstance(values, np.ndarray)}
-    fans = replace(each, **{name: np.repeat(values, count) for name, values in arrays.items()})
+    fans = each.of(np.full(count, fan))
     period_ns = round(NS_PER_S / twin.card.rate_hz)
     bin_ns = bin_ns_of(period_ns, float(fans.held_s.min()))
     limit = FreeLimit(calibration.priors, 86400.0 / calibration.false_alarms_per_day)

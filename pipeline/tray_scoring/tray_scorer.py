@@ -162,13 +162,14 @@ class TrayScorer:
         decision, falls = self._decision, self._falls
         if falls.stands[fan]:
             return standstill_causes(Standing.CAME_TO_REST, falls.of(fan), command)
-        alarm = decision.alarms.get(fan)
-        if alarm is None:  # it is of before a gap
+        causes = decision.alarms.causes(fan)
+        if not causes:  # it is of before a gap
             return ()
+        age_s = decision.alarms.age_s(fan)
         is_new = decision.raised_s(fan) < FALLING_S
-        if alarm.age_s < NAMED_AFTER_S or (is_new and falls.is_falling[fan]):
+        if age_s < NAMED_AFTER_S or (is_new and falls.is_falling[fan]):
             return (Diagnosis(cause=CANNOT_TELL, probability=1.0, evidence=f"{CAUSES[CANNOT_TELL]}: {KNOWN_SOON}"),)
-        return self._words.of(alarm.causes(), self._seen_since(fan, alarm.age_s), self.twin.steady_fans[fan])
+        return self._words.of(causes, self._seen_since(fan, age_s), self.twin.steady_fans[fan])
 
     def _seen_since(self, fan: int, age_s: float) -> SeenSinceOnset:
         slowest, fastest, lowest, highest = self._seen[:, fan].tolist()

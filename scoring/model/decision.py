@@ -13,7 +13,7 @@ from fantwin.schemas.units import NS_PER_S
 from fantwin.scoring.model.bins import Bin
 from fantwin.scoring.model.faults import BEFORE_GROWTH, FAULTS, forces
 from fantwin.scoring.model.healthy import FAULT, SLOW, SLOWEST_RAD_S, HealthyFans
-from fantwin.scoring.model.in_alarm import FanInAlarm
+from fantwin.scoring.model.in_alarm import FansInAlarm
 from fantwin.scoring.model.missing import MissingReadings
 from fantwin.scoring.model.onsets import Evidence, Hypotheses
 from fantwin.scoring.model.operation import Fans, Inputs, Operation
@@ -89,8 +89,8 @@ class Decision(Saved):
         self.missing = MissingReadings(count, self.bin_s, math.log(bins / (1.0 - OF_RATE)) * limit_factor)
         self.log_statistic = np.full(count, -np.inf)
         self.wrong = WrongReadings(fans, self.bin_s, period_s, math.log(bins / OF_RATE))
-        self.alarms: dict[int, FanInAlarm] = {}
-        """evidence for the causes of each alarm"""
+        self.alarms = FansInAlarm(self.model, self._hypotheses)
+        """evidence for the causes of the alarms"""
         self.active = np.zeros(count, np.bool_)
         """(fans,) true where the speed or the torque balance has an alarm"""
         self._raised, self.onset = np.zeros(count, np.int64), np.zeros(count, np.int64)
@@ -199,9 +199,8 @@ class Decision(Saved):
             **within("missing", self.missing.arrays()),
             **within("wrong", self.wrong.arrays()),
             **within("evidence", self._evidence.kept(kept)),
+            **within("alarms", self.alarms.kept()),
         }
-        for fan, alarm in self.alarms.items():
-            arrays |= within(f"alarm {fan}", alarm.kept())
         return {"t_ns": self.operation.t_ns}, arrays
 
     def restore(self, stored: Mapping[str, Array], t_ns: int = 0) -> None:
@@ -217,21 +216,14 @@ class Decision(Saved):
         self.wrong.restore(part("wrong", stored))
         self._evidence.restore_kept(part("evidence", stored))
         self.operation.t_ns = t_ns
-        self.alarms = {}
-        for fan in np.flatnonzero(self.active).tolist():
-            of_alarm = part(f"alarm {fan}", stored)
-            if of_alarm:
-                alarm = FanInAlarm(fan, self._fans, self.model, self._evidence, self._hypotheses)
-                alarm.restore(of_alarm)
-                self.alarms[fan] = alarm
+        self.alarms.restore(part("alarms", stored))
 
     def _rest(self, bins: int) -> None:
         """Let a gap pass."""
         self.model.rest(bins)
         self.wrong.forget()
         self._evidence.number += bins
-        for alarm in self.alarms.values():
-            alarm.rest(bins, self.bin_s)
+        self.alarms.rest(bins, self.bin_s)
         if bins * self.bin_s > FORGETS_S:
             self._evidence.since[:] = self.number
             self.log_statistic[:] = -np.inf
@@ -260,8 +252,8 @@ class Decision(Saved):
         takes = np.divide(learned, agreed, out=np.ones(len(root)), where=agreed != 0.0)  # the filter, of a far reading
         evidence.add(pushes, model, found, gain * takes[:, np.newaxis], agreed)
         model.update(found, gain, learned)
-        for fan, alarm in self.alarms.items():
-            alarm.take(now.of(fan), self.bin_s, float(found.distance_rad_s[fan] ** 2 / found.variance[fan]))
+        if len(self.alarms.fans):
+            self.alarms.take(now, self.bin_s, (np.square(found.distance_rad_s) / found.variance)[self.alarms.fans])
         self.deviation_std_rad_s = np.where(counts, root, self.deviation_std_rad_s)
         self.log_statistic = np.where(counts, evidence.log_statistic(), self.log_statistic)
         return now, pushes
@@ -286,7 +278,7 @@ class Decision(Saved):
         """Begin an alarm: the part of the most probable fault that the filter has absorbed is taken out of its healthy
         states, and the fault becomes a state. pushes: (onsets, COLUMNS) of `forces`."""
         evidence, model = self._evidence, self.model
-        self.alarms[fan] = FanInAlarm(fan, self._fans, model, evidence, self._hypotheses)
+        self.alarms.add(fan, evidence)
         terms = evidence.log_terms(fan)
         onset, fault = (int(index) for index in np.unravel_index(int(np.argmax(terms)), terms.shape))
         columns = np.array(self._hypotheses.faults[fault].columns)
@@ -301,7 +293,7 @@ class Decision(Saved):
         self._forget(fan)
 
     def _end(self, fan: int) -> None:
-        self.alarms.pop(fan, None)
+        self.alarms.drop(fan)
         model = self.model
         model.mean[fan, FAULT] = 0.0
         model.covariance[fan, FAULT], model.covariance[fan, :, FAULT] = 0.0, 0.0
@@ -351,13 +343,14 @@ class Decision(Saved):
         self._peak = np.where(is_larger, surely, peak)
         is_largest = is_larger | (self._raised == self.number)
         self._shape = np.where(is_largest[:, np.newaxis], shares, self._shape)
-        for fan, alarm in self.alarms.items():
-            self._is_probable[fan] = alarm.probabilities.sum(axis=0) > PROBABLE
+        if len(self.alarms.fans):
+            self._is_probable[self.alarms.fans] = self.alarms.probabilities > PROBABLE
         with np.errstate(divide="ignore", invalid="ignore"):
             shows = np.where(self._is_probable, shares / self._shape, 1.0).min(axis=1, initial=1.0)
         self._shows = np.where(known, np.nan_to_num(shows).clip(0.0), self._shows)
         varies = np.zeros(len(known), np.bool_)
-        varies[[fan for fan, alarm in self.alarms.items() if alarm.varies]] = True
+        if len(self.alarms.fans):
+            varies[self.alarms.fans] = self.alarms.varies
         is_left = size * np.sign(self._peak) > LEFT_SIGMAS * np.sqrt(variance)
         is_healthy = self.active & ~varies & ~is_left & (self._log_odds() < -math.log(OVER_ODDS))
         self.is_returning = np.where(known, is_healthy, self.is_returning)

@@ -62,8 +62,8 @@ def forces(fans: Fans, now: Inputs, age_s: Array, then_rad_s: Array, columns: in
 
     A torque moves the steady speed by itself over the slope of the torque that the fan needs; a weak drive takes a
     share of that and of what turns the rotor faster. Of a fan that controls its speed by itself drag takes a share of
-    the speed. age_s: (onsets,); then_rad_s: (fans, onsets), the speed at the onset; columns: how many of them,
-    from the first.
+    the speed. age_s: (onsets,) or (fans, onsets); then_rad_s: (fans, onsets), the speed at the onset; columns: how many
+    of them, from the first.
     """
     speed, top = now.speed_rad_s, fans.top_rad_s
     steeper = fans.slope(top) / fans.slope(speed)
@@ -80,8 +80,8 @@ def forces(fans: Fans, now: Inputs, age_s: Array, then_rad_s: Array, columns: in
     of_fans[:, SCALE] = np.where(now.is_balance, 0.0, now.moved_to_rad_s)
     of_fans[:, STUCK] = -of_fans[:, SCALE]
     of_fans[:, RISES], of_fans[:, FALLS] = np.minimum(-now.moves_rad_s2, 0.0), np.maximum(-now.moves_rad_s2, 0.0)
-    over_ages = np.ones((len(age_s), columns))
-    over_ages[:, DRAG_GROWS] = over_ages[:, FRICTION_GROWS] = age_s / GROWS_S
+    over_ages = np.ones((*age_s.shape, columns))
+    over_ages[..., DRAG_GROWS] = over_ages[..., FRICTION_GROWS] = age_s / GROWS_S
     made: Array = of_fans[:, np.newaxis, :columns] * over_ages
     made[:, :, STUCK] += np.where(now.is_balance[:, np.newaxis], 0.0, then_rad_s)
     return made

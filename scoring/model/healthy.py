@@ -88,7 +88,7 @@ class HealthyFans(Saved):
 
     def __init__(self, fans: Fans, priors: Priors, bin_s: float, period_s: float) -> None:
         """Begin with the priors. period_s: of the samples."""
-        self._fans, self._priors, self._bin_s, self._period_s = fans, priors, bin_s, period_s
+        self.fans, self._priors, self._bin_s, self._period_s = fans, priors, bin_s, period_s
         count = len(fans.top_rad_s)
         self._rows = np.arange(count)
         self.mean = np.zeros((count, STATES))
@@ -119,12 +119,18 @@ class HealthyFans(Saved):
         self.steady = np.zeros((count, COUNT))
         """(fans, COUNT) factors of the states in the steady speed"""
 
-    def of(self, fan: int) -> HealthyFans:
-        """A copy for one fan."""
-        copied = HealthyFans(self._fans.of(fan), self._priors, self._bin_s, 0.0)
-        copied.mean, copied.covariance = self.mean[[fan]], self.covariance[[fan]]
-        copied._has_begun = self._has_begun[[fan]]
+    def of(self, fans: Array) -> HealthyFans:
+        """A copy for some fans, (n,) by number."""
+        copied = HealthyFans(self.fans.of(fans), self._priors, self._bin_s, 0.0)
+        copied.mean, copied.covariance = self.mean[fans], self.covariance[fans]
+        copied._has_begun = self._has_begun[fans]
         return copied
+
+    def continue_as(self, other: HealthyFans) -> None:
+        """Take the states of the first fans from another of fewer fans."""
+        first = slice(len(other.mean))
+        self.mean[first], self.covariance[first] = other.mean, other.covariance
+        self._has_begun[first] = other._has_begun
 
     def arrays(self) -> dict[str, Array]:
         """See Saved. Half of a covariance is the other half."""
@@ -139,7 +145,7 @@ class HealthyFans(Saved):
     def begin_again(self, fan: int) -> None:
         """Return a fan to the priors."""
         self.mean[fan], self._has_begun[fan] = 0.0, False
-        self.covariance[fan] = _prior(self._fans.of(fan), self._priors, self._period_s)[0]
+        self.covariance[fan] = _prior(self.fans.of(np.array([fan])), self._priors, self._period_s)[0]
 
     def rest(self, bins: int) -> None:
         """Let time pass in which nothing is known: at the next reading a rotor is at its steady speed."""
@@ -153,7 +159,7 @@ class HealthyFans(Saved):
         variance[:, AGE] += p.ageing_per_sqrt_h**2 * passed_s / 3600.0
         for state, std in ((WANDER, p.wander), (AIR, p.air)):
             variance[:, state] += std**2 * (1.0 - kept[state] ** 2)
-        variance[:, LOCAL] += np.square(p.local_rad_s / (0.5 * self._fans.top_rad_s)) * (1.0 - kept[LOCAL] ** 2)
+        variance[:, LOCAL] += np.square(p.local_rad_s / (0.5 * self.fans.top_rad_s)) * (1.0 - kept[LOCAL] ** 2)
         self._has_begun[:] = False
 
     @property
@@ -169,7 +175,7 @@ class HealthyFans(Saved):
     def predict(self, now: Inputs) -> None:
         """Go on by one bin."""
         p, covariance = self._priors, self.covariance
-        moved = np.abs(now.moves_rad_s2) * self._bin_s / self._fans.top_rad_s
+        moved = np.abs(now.moves_rad_s2) * self._bin_s / self.fans.top_rad_s
         variances = np.stack((now.of_lowest_rad_s, now.unseen_rad_s)) ** 2
         local = p.local_rad_s**2 + variances.sum(axis=0)
         is_of_lowest, is_unseen = variances / local
@@ -193,7 +199,7 @@ class HealthyFans(Saved):
         covariance[:, COUNT, COUNT] += np.where(self._adjoins, 0.0, self._missed)
         with_states = self.tends @ covariance
         own = with_states @ self.tends.swapaxes(1, 2)
-        self._of_balance = np.square(self._fans.balance_noise / self._fans.slope(now.speed_rad_s))
+        self._of_balance = np.square(self.fans.balance_noise / self.fans.slope(now.speed_rad_s))
         own[:, 1, 1] += self._of_balance * (1.0 - np.square(1.0 - self.follows[:, 1]))
         covariance[:, FOLLOWING] = with_states
         covariance[:, :, FOLLOWING] = with_states.swapaxes(1, 2)
@@ -212,7 +218,7 @@ class HealthyFans(Saved):
 
     def _follow(self, now: Inputs) -> None:
         """Set how rotor, balance and tacho follow the steady speed of the fan."""
-        fans, speed, tends, follows = self._fans, now.speed_rad_s, self.tends, self.follows
+        fans, speed, tends, follows = self.fans, now.speed_rad_s, self.tends, self.follows
         decay = np.maximum(fans.viscous + fans.drag * (now.measured_rad_s + speed), 1e-9) / fans.inertia * self._bin_s
         follows[:, 0], follows[:, 1] = -np.expm1(-decay), self._filters
         follows[:, 2] = 1.0 - follows[:, 0] / decay  # the mean over the bin
@@ -235,7 +241,7 @@ class HealthyFans(Saved):
 
     def innovation(self, now: Inputs) -> Innovation:
         """Innovation of the readings of the bin."""
-        p, fans = self._priors, self._fans
+        p, fans = self._priors, self.fans
         shown = np.where(now.is_balance, BALANCE, SHOWN)
         with_states = self.covariance[self._rows, shown]
         white = np.square(fans.noise_rad_s) / np.maximum(now.readings, 1.0)

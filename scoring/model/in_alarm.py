@@ -1,4 +1,4 @@
-"""Evidence for each cause of an alarm, from its onset on, for as long as it lasts.
+"""Evidence for each cause of the alarms of a tray, from its onset on, for as long as it lasts.
 
 A copy of the model of a healthy fan goes on as though nothing were wrong, and with it the sums of each onset that was
 possible when the alarm was raised. So what a fan does long afterwards still counts. A growing fault may stop growing:
@@ -21,124 +21,137 @@ from fantwin.scoring.diagnosis.ranked_causes import PossibleCause
 from fantwin.scoring.model.faults import BEFORE_GROWTH, GROWS_S, UNSTEADY, forces
 from fantwin.scoring.model.healthy import HealthyFans
 from fantwin.scoring.model.onsets import Evidence, Hypotheses, Sums
-from fantwin.scoring.model.operation import Fans, Inputs
+from fantwin.scoring.model.operation import Inputs
 from fantwin.scoring.model.saved import part, within
 
-ENDS_S = (15.0, 30.0, 60.0, 120.0, 240.0, 480.0, np.inf)
+ENDS_S = np.array([15.0, 30.0, 60.0, 120.0, 240.0, 480.0, np.inf])
 """times after its onset at which a fault may stop growing, equally probable"""
-FIRST = np.arange(1)
 FAR = 16.0
 """cap on the square of a distance, in standard deviations, so that one wrong reading does not decide"""
 RECENT_S, STEADY = 5.0, 1.5
 """time constant over which the scatter of a fan is averaged, and largest mean square of a steady one"""
 HOPELESS, MOST = 12.0, 24
 """log odds against an onset from which it is dropped; and largest number of onsets"""
+OF_ONSETS = {"ends_s": np.inf, "ages_s": 0.0, "then_rad_s": 0.0, "log_weight": -np.inf, "has_changed": False}
+"""what is known of each onset, and its value where there is none"""
 
 
-class FanInAlarm:
-    """Fan with an alarm."""
+class FansInAlarm:
+    """Fans of a tray that have an alarm, side by side: n of them, with m onsets each."""
 
-    def __init__(self, fan: int, fans: Fans, model: HealthyFans, evidence: Evidence, hypotheses: Hypotheses) -> None:
-        """Begin with the bin that raised the alarm; model: as it was before the alarm."""
-        self._fans, self._model, self._hypotheses = fans.of(fan), model.of(fan), hypotheses.of(fan)
+    def __init__(self, model: HealthyFans, hypotheses: Hypotheses) -> None:
+        """Begin without one. model, hypotheses: of the tray."""
+        self._of_tray, self._of_all = model, hypotheses
+        self.fans = np.zeros(0, np.int64)
+        """(n,) their numbers, in the order of their alarms"""
+        self._onsets = {name: np.full((0, 0), value) for name, value in OF_ONSETS.items()}
+        """(n, m) each"""
+        self._varies = np.zeros((2, 2, 0))
+        """(2, 2, n) from a healthy fan since the alarm, and from one with its fault lately: squares of distances, in
+        standard deviations, and their number"""
+        self._model, self._hypotheses = model.of(self.fans), hypotheses.of(self.fans)
+        self._sums = Sums(0, 0, hypotheses.columns, hypotheses.pairs)
+        self._terms = np.zeros((0, 0, len(hypotheses.faults)))
+        """(n, m, faults) log terms as in `Hypotheses`, with the weight of the onset"""
+
+    def add(self, fan: int, evidence: Evidence) -> None:
+        """Add the fan of an alarm that the present bin raises, while the model of the tray is as it was before."""
         onsets = np.flatnonzero(np.isfinite(evidence.log_terms(fan)).any(axis=1))
-        ages_s = evidence.age_s[onsets]
-        ends_s = np.array(ENDS_S)
-        which, end = np.nonzero(ends_s[np.newaxis, :] > ages_s[:, np.newaxis])
-        self._ends_s, self._ages_s = ends_s[end], ages_s[which]
-        self._then_rad_s = evidence.then_rad_s[[fan]][:, onsets[which]]
-        self._log_weight = np.log(evidence.weight[onsets] / np.bincount(which, minlength=len(onsets)))[which]
-        self._sums = evidence.sums.of(fan, onsets[which], self._hypotheses.columns)
-        self._has_changed = evidence.has_changed[[fan]][:, onsets[which]]
-        self._varies = np.zeros((2, 2))
-        """squares of distances, in standard deviations, and their number: from a healthy fan since the alarm, and from
-        one with its fault lately"""
-        self._terms = self._log_terms()
-        self._drop_hopeless()
+        which, end = np.nonzero(evidence.age_s[onsets, np.newaxis] < ENDS_S)
+        places = onsets[which]
+        weight = evidence.weight[onsets] / np.bincount(which, minlength=len(onsets))
+        own = FansInAlarm(self._of_tray, self._of_all)
+        own.fans = np.array([fan])
+        own._onsets = {
+            "ends_s": ENDS_S[np.newaxis, end],
+            "ages_s": evidence.age_s[np.newaxis, places],
+            "then_rad_s": evidence.then_rad_s[[fan]][:, places],
+            "log_weight": np.log(weight)[np.newaxis, which],
+            "has_changed": evidence.has_changed[[fan]][:, places],
+        }
+        own._varies = np.zeros((2, 2, 1))
+        own._sums = evidence.sums.of(own.fans, places[np.newaxis])
+        own._model, own._hypotheses = self._of_tray.of(own.fans), self._of_all.of(own.fans)
+        own._weigh()
+        self._join(own)
 
-    @property
-    def age_s(self) -> float:
-        """Age of the most probable onset."""
-        return float(self._ages_s[self._terms.max(axis=1).argmax()])
+    def drop(self, fan: int) -> None:
+        """Forget a fan that has no alarm any more; nothing happens if it is none of them."""
+        if fan in self.fans:
+            self._keep(np.flatnonzero(self.fans != fan))
 
-    def take(self, now: Inputs, bin_s: float, square: float) -> None:
-        """Add the reading of a bin. now: of this fan; square: of its distance, in standard deviations, from the reading
-        expected with the fault of the alarm."""
-        self._ages_s = self._ages_s + bin_s
-        self._has_changed |= now.changes[:, np.newaxis]
-        self._model.predict(now)
-        found = self._model.innovation(now)
-        gain = found.with_states * ((now.readings > 0) / found.variance)[:, np.newaxis]
-        pushes = forces(self._fans, now, self._grown_s, self._then_rad_s, self._hypotheses.columns)
-        self._sums.add(pushes, self._model, found, gain, found.distance_rad_s)
-        self._model.update(found, gain, found.distance_rad_s)
-        if gain.any():
-            self._varies[1] *= math.exp(-bin_s / RECENT_S)
-            squares = np.array([found.distance_rad_s[0] ** 2 / found.variance[0], square])
-            self._varies += np.stack((squares.clip(max=FAR), np.ones(2)), axis=1)
-            self._terms = self._log_terms()
-            self._drop_hopeless()
+    def clear(self) -> None:
+        """Forget all."""
+        self._keep(np.zeros(0, np.int64))
+
+    def take(self, now: Inputs, bin_s: float, squares: Array) -> None:
+        """Add the readings of a bin. now: of the tray; squares: (n,) of their distances, in standard deviations, from
+        the readings expected with the fault of each alarm."""
+        now, onsets, model = now.of(self.fans), self._onsets, self._model
+        onsets["ages_s"] += bin_s
+        onsets["has_changed"] |= now.changes[:, np.newaxis]
+        model.predict(now)
+        found, counts = model.innovation(now), now.readings > 0
+        gain = found.with_states * (counts / found.variance)[:, np.newaxis]
+        pushes = forces(model.fans, now, self._grown_s, onsets["then_rad_s"], self._hypotheses.columns)
+        self._sums.add(pushes, model, found, gain, found.distance_rad_s)
+        model.update(found, gain, found.distance_rad_s)
+        if counts.any():
+            self._varies[1] *= np.where(counts, math.exp(-bin_s / RECENT_S), 1.0)
+            both = np.stack((np.square(found.distance_rad_s) / found.variance, squares)).clip(max=FAR)
+            self._varies += np.stack((both, np.ones_like(both)), axis=1) * counts
+            self._weigh()
 
     def rest(self, bins: int, bin_s: float) -> None:
         """Let a gap pass."""
-        self._ages_s = self._ages_s + bins * bin_s
+        self._onsets["ages_s"] += bins * bin_s
         self._model.rest(bins)
+
+    def age_s(self, fan: int) -> float:
+        """Age of the most probable onset of a fan."""
+        row = self._row(fan)
+        return float(self._onsets["ages_s"][row, self._terms[row].max(axis=1).argmax()])
 
     @property
     def probabilities(self) -> Array:
-        """Probabilities (onsets, faults) of the posterior, of faults with a signature."""
-        weights = np.exp(self._terms - self._terms.max())
-        return np.asarray(weights / weights.sum())
+        """Probabilities of the faults with a signature, (n, faults)."""
+        return _posterior(self._terms).sum(axis=1)
 
     @property
-    def unsteady(self) -> float:
-        """Probability that the fault has no signature."""
-        _, prior, times = UNSTEADY
-        squares, number = self._varies[0]
-        logs = 0.5 * np.array([squares * r / (1.0 + r) - number * math.log1p(r) for r in times])
-        log_odds = (
-            np.logaddexp.reduce(logs) + math.log(prior / len(times)) - np.logaddexp.reduce(self._terms, axis=None)
-        )
-        return float(expit(log_odds))
-
-    @property
-    def varies(self) -> bool:
-        """Return whether the fault probably has no signature, and the fan is not steady again."""
+    def varies(self) -> Array:
+        """Return where the fault probably has no signature, and the fan is not steady again, (n,)."""
         squares, number = self._varies[1]
-        return squares > STEADY * number and self.unsteady > 0.5
+        return np.asarray((squares > STEADY * number) & (_unsteady(self._varies[0], self._terms) > 0.5))
 
-    def causes(self) -> list[PossibleCause]:
-        """All causes, the most probable first."""
-        unsteady = self.unsteady
-        weights = (1.0 - unsteady) * self.probabilities
+    def causes(self, fan: int) -> list[PossibleCause]:
+        """All causes of the alarm of a fan, the most probable first; none if it has no alarm."""
+        if fan not in self.fans:
+            return []
+        row = self._row(fan)
+        unsteady = float(_unsteady(self._varies[0, :, [row]].T, self._terms[[row]])[0])
+        weights = (1.0 - unsteady) * _posterior(self._terms[[row]])[0]
         probability: dict[str, float] = {}
         best: dict[str, tuple[float, int, int]] = {}
-        for fault, row in enumerate(self._hypotheses.faults):
+        for fault, of_table in enumerate(self._hypotheses.faults):
             onset = int(weights[:, fault].argmax())
             weight = float(weights[:, fault].sum())
-            probability[row.cause] = probability.get(row.cause, 0.0) + weight
-            best[row.cause] = max(best.get(row.cause, (-1.0, 0, 0)), (weight, onset, fault))
-        squares, number = self._varies[0]
+            probability[of_table.cause] = probability.get(of_table.cause, 0.0) + weight
+            best[of_table.cause] = max(best.get(of_table.cause, (-1.0, 0, 0)), (weight, onset, fault))
+        squares, number = self._varies[0, :, row].tolist()
         found = [PossibleCause(UNSTEADY[0], unsteady, math.sqrt(squares / max(number, 1.0)), math.nan)]
         for cause, share in probability.items():
             _, onset, fault = best[cause]
-            sizes, covariance = self._hypotheses.sizes(self._sums, 0, onset, fault)
+            sizes, covariance = self._hypotheses.sizes(self._sums, row, onset, fault)
             grows = self._hypotheses.faults[fault].columns[0] in BEFORE_GROWTH
-            times = float(self._grown_s[onset]) / GROWS_S if grows else 1.0
+            times = float(self._grown_s[row, onset]) / GROWS_S if grows else 1.0
             found.append(PossibleCause(cause, share, times * float(sizes[0]), times * float(covariance[0, 0]) ** 0.5))
         return sorted(found, key=lambda each: -each.probability)
 
     def kept(self) -> dict[str, Array]:
         """The state."""
-        own = {
-            "ends_s": self._ends_s,
-            "ages_s": self._ages_s,
-            "then_rad_s": self._then_rad_s,
-            "log_weight": self._log_weight,
-            "has_changed": self._has_changed,
-            "varies": self._varies,
-        }
-        return {**own, **within("model", self._model.arrays()), **within("sums", self._sums.kept(FIRST))}
+        own = {"fans": self.fans, "varies": self._varies, **self._onsets}
+        sums = self._sums.kept(np.arange(len(self.fans)))
+        return {**own, **within("model", self._model.arrays()), **within("sums", sums)}
 
     def restore(self, stored: Mapping[str, Array]) -> None:
         """Continue from a state.
@@ -146,35 +159,77 @@ class FanInAlarm:
         Raises:
             KeyError, ValueError: it is not such a state.
         """
-        self._ends_s, self._ages_s = stored["ends_s"], stored["ages_s"]
-        self._then_rad_s, self._log_weight = stored["then_rad_s"], stored["log_weight"]
-        self._has_changed = stored["has_changed"]
-        self._varies = stored["varies"]
+        self.fans, self._varies = stored["fans"], stored["varies"]
+        self._onsets = {name: stored[name] for name in OF_ONSETS}
+        self._model, self._hypotheses = self._of_tray.of(self.fans), self._of_all.of(self.fans)
         self._model.restore(part("model", stored))
-        self._sums = Sums(1, len(self._ages_s), self._hypotheses.columns, self._hypotheses.pairs)
-        self._sums.restore(FIRST, part("sums", stored))
+        self._sums = Sums(*self._onsets["ages_s"].shape, self._hypotheses.columns, self._hypotheses.pairs)
+        self._sums.restore(np.arange(len(self.fans)), part("sums", stored))
         self._terms = self._log_terms()
 
     @property
     def _grown_s(self) -> Array:
-        return np.minimum(self._ages_s, self._ends_s)
+        return np.minimum(self._onsets["ages_s"], self._onsets["ends_s"])
+
+    def _row(self, fan: int) -> int:
+        return self.fans.tolist().index(fan)
 
     def _log_terms(self) -> Array:
-        """Log terms (onsets, faults) as in `Hypotheses`, with the weight of the onset."""
-        hypotheses = self._hypotheses
-        terms = hypotheses.log_bayes_factors(self._sums, self._has_changed)[:, 0] + hypotheses.log_weights()
-        return np.asarray((terms + self._log_weight).T)
+        """See `_terms`."""
+        factors = self._hypotheses.log_bayes_factors(self._sums, self._onsets["has_changed"])
+        terms = factors + self._hypotheses.log_weights()[:, :, np.newaxis] + self._onsets["log_weight"]
+        return np.asarray(terms.transpose(1, 2, 0))
 
-    def _drop_hopeless(self) -> None:
-        if not len(self._terms):  # it goes on from a state
-            return
-        best = self._terms.max(axis=1)
-        kept = np.sort(np.argsort(best)[-MOST:])
-        kept = kept[best[kept] > best.max() - HOPELESS]
-        if len(kept) == len(best):
-            return
-        self._ends_s, self._ages_s, self._log_weight = (
-            each[kept] for each in (self._ends_s, self._ages_s, self._log_weight)
-        )
-        self._then_rad_s, self._has_changed = self._then_rad_s[:, kept], self._has_changed[:, kept]
-        self._sums, self._terms = self._sums.of(0, kept, self._hypotheses.columns), self._terms[kept]
+    def _weigh(self) -> None:
+        """Set the terms, and drop the onsets that are hopeless."""
+        self._terms = self._log_terms()
+        best = self._terms.max(axis=2)
+        order = np.argsort(-best, axis=1, kind="stable")
+        is_hopeless = best <= best.max(axis=1, keepdims=True) - HOPELESS
+        self._onsets["log_weight"][is_hopeless] = self._terms[is_hopeless] = -np.inf
+        most = min(int((~is_hopeless).sum(axis=1).max()), MOST)
+        if most < best.shape[1]:
+            order, rows = np.sort(order[:, :most], axis=1), np.arange(len(best))[:, np.newaxis]
+            self._onsets = {name: each[rows, order] for name, each in self._onsets.items()}
+            self._terms = self._terms[rows, order]
+            self._sums = self._sums.of(rows[:, 0], order)
+
+    def _join(self, other: FansInAlarm) -> None:
+        """Put the fans of another behind these."""
+        count, onsets = len(self.fans), max(self._terms.shape[1], other._terms.shape[1])
+        for name, empty in OF_ONSETS.items():
+            both = np.full((count + len(other.fans), onsets), empty)
+            for each, rows in ((self, slice(count)), (other, slice(count, None))):
+                both[rows, : each._terms.shape[1]] = each._onsets[name]
+            self._onsets[name] = both
+        self.fans = np.concatenate((self.fans, other.fans))
+        self._varies = np.concatenate((self._varies, other._varies), axis=2)
+        self._sums = self._sums.joined(other._sums)
+        model = self._of_tray.of(self.fans)
+        model.continue_as(self._model)
+        self._model, self._hypotheses = model, self._of_all.of(self.fans)
+        self._terms = self._log_terms()
+
+    def _keep(self, rows: Array) -> None:
+        """Keep some of the fans, (n,) by their place."""
+        self.fans, self._varies = self.fans[rows], self._varies[:, :, rows]
+        self._onsets = {name: each[rows] for name, each in self._onsets.items()}
+        onsets = np.tile(np.arange(self._terms.shape[1]), (len(rows), 1))
+        self._sums, self._terms = self._sums.of(rows, onsets), self._terms[rows]
+        self._model, self._hypotheses = self._model.of(rows), self._of_all.of(self.fans)
+
+
+def _posterior(terms: Array) -> Array:
+    """Probabilities of onsets and faults, from their log terms, (n, m, faults) each."""
+    weights = np.exp(terms - terms.max(axis=(1, 2), keepdims=True))
+    return np.asarray(weights / weights.sum(axis=(1, 2), keepdims=True))
+
+
+def _unsteady(varies: Array, terms: Array) -> Array:
+    """Probability that the fault has no signature, (n,). varies: (2, n) squares and their number; terms: of the others,
+    (n, m, faults)."""
+    _, prior, times = UNSTEADY
+    squares, number = varies
+    logs = [0.5 * (squares * r / (1.0 + r) - number * math.log1p(r)) for r in times]
+    log_odds = np.logaddexp.reduce(logs) + math.log(prior / len(times))
+    return np.asarray(expit(log_odds - np.logaddexp.reduce(terms, axis=(1, 2))))

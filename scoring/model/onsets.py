@@ -67,17 +67,30 @@ class Sums:
         """(fans, onsets) products off the diagonal of A that a fault uses"""
         self.products = np.zeros((fans, onsets, columns), np.float32)
 
-    def of(self, fan: int, onsets: Array, columns: int) -> Sums:
-        """A copy of some onsets and the first columns of one fan."""
-        copied = Sums(1, len(onsets), columns, self._pairs)
-        parts = self._parts[fan].reshape(-1, *self.squares.shape[1:])[:, onsets, :columns]
-        copied._parts[0], copied._factors[0] = parts.reshape(len(parts), -1), self._factors[fan]
-        copied._used = self._used
-        copied.squares[0] = self.squares[fan, onsets, :columns]
-        copied.products[0] = self.products[fan, onsets, :columns]
-        copied._pairs = [pair for pair in self._pairs if max(pair) < columns]
-        copied.crossed = {pair: self.crossed[pair][[fan]][:, onsets] for pair in copied._pairs}
+    def of(self, fans: Array, onsets: Array) -> Sums:
+        """A copy of some fans, (n,) by number, and of some onsets of each, (n, m) by number."""
+        count, columns = onsets.shape[1], self.squares.shape[2]
+        copied, rows = Sums(len(fans), count, columns, self._pairs), fans[:, np.newaxis]
+        of_onsets = self._parts.reshape(*self._parts.shape[:2], *self.squares.shape[1:])
+        copied._parts = of_onsets[rows, :, onsets].swapaxes(1, 2).reshape(copied._parts.shape)
+        copied._factors, copied._used = self._factors[fans], self._used
+        copied.squares, copied.products = self.squares[rows, onsets], self.products[rows, onsets]
+        copied.crossed = {pair: each[rows, onsets] for pair, each in self.crossed.items()}
         return copied
+
+    def joined(self, other: Sums) -> Sums:
+        """A copy of these fans and then those of another; those of fewer onsets get empty ones."""
+        fans, columns = len(self._rows), self.squares.shape[2]
+        found = Sums(fans + len(other._rows), max(self.squares.shape[1], other.squares.shape[1]), columns, self._pairs)
+        for each, rows in ((self, slice(fans)), (other, slice(fans, None))):
+            each._gather()
+            own = slice(each.squares.shape[1] * columns)
+            found._parts[rows, :CARRIED, own] = each._parts[:, :CARRIED]
+            onsets = slice(each.squares.shape[1])
+            found.squares[rows, onsets], found.products[rows, onsets] = each.squares, each.products
+            for pair, crossed in found.crossed.items():
+                crossed[rows, onsets] = each.crossed[pair]
+        return found
 
     def kept(self, fans: Array) -> dict[str, Array]:
         """The state of some fans."""
@@ -189,10 +202,10 @@ class Hypotheses:
         self._stuck = [row for row, fault in enumerate(self.faults) if STUCK in fault.columns]
         self._means = [(row, fault.mean) for row, fault in enumerate(self.faults) if fault.mean]
 
-    def of(self, fan: int) -> Hypotheses:
-        """Hypotheses of one fan, with the rows of all of its tray."""
+    def of(self, fans: Array) -> Hypotheses:
+        """Hypotheses of some fans, (n,) by number, with the rows of all of their tray."""
         found = copy(self)
-        found._has_own_drive = self._has_own_drive[[fan]]
+        found._has_own_drive = self._has_own_drive[fans]
         return found
 
     def log_weights(self) -> Array:

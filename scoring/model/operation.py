@@ -58,9 +58,9 @@ class Fans:
     prefers_balance: Array
     """true if the torque balance is read, and not the speed, where both are known"""
 
-    def of(self, fan: int) -> Fans:
-        """Select one fan."""
-        return replace(self, **{name: each[[fan]] for name, each in vars(self).items() if isinstance(each, np.ndarray)})
+    def of(self, fans: Array) -> Fans:
+        """Select some fans, (n,) by number."""
+        return replace(self, **{name: each[fans] for name, each in vars(self).items() if isinstance(each, np.ndarray)})
 
     def slope(self, speed_rad_s: Array) -> Array:
         """Slope of the torque that a fan needs, over its speed."""
@@ -105,9 +105,9 @@ class Inputs:
     is_balance: Array
     """true where the torque balance is read, and not the speed"""
 
-    def of(self, fan: int) -> Inputs:
-        """Inputs of one fan."""
-        return Inputs(**{name: each[[fan]] for name, each in vars(self).items()})
+    def of(self, fans: Array) -> Inputs:
+        """Inputs of some fans, (n,) by number."""
+        return Inputs(**{name: each[fans] for name, each in vars(self).items()})
 
 
 class Operation(Saved):

@@ -119,9 +119,27 @@ def test_fans_of_both_kinds_of_drive_and_tacho_in_one_tray_have_alarms_and_clear
     raised = with_drop(made, decision, 0.2, 30.0)
     assert sorted(each[1:] for each in raised) == [(0, True), (1, True)]
     for fan in range(2):
-        assert decision.alarms[fan].causes()[0].probability > 0.0
+        assert decision.alarms.causes(fan)[0].probability > 0.0
     ends_s = made.time_s
     assert all(time_s - ends_s < 2.0 * OVER_S for time_s, _, _ in plays(made, decision, 60.0))
+
+
+def test_the_causes_of_a_fan_do_not_depend_on_which_others_have_an_alarm() -> None:
+    found = []
+    for faults in ({1: 20.0}, {0: 15.0, 1: 20.0, 2: 20.0, 3: 26.0}):
+        made = MadeFans(twin_of(4).fans, 0.2, moving, seed=3, own=0.3)
+        decision = made.decision()
+        made.fault_from_s = 15.0
+        plays(made, decision, 15.0)
+        for _ in range(30):
+            made.sizes[:, DRIVE] = [-0.12 * (made.time_s >= faults.get(fan, np.inf)) for fan in range(4)]
+            made.sizes[0, DRIVE] *= made.time_s < 22.0  # it ends while the others last
+            plays(made, decision, 1.0)
+        assert set(decision.alarms.fans) == set(faults) - {0}
+        found.append([(each.cause, each.probability, each.change) for each in decision.alarms.causes(1)[:2]])
+    alone, among_others = found
+    assert [cause for cause, *_ in alone] == [cause for cause, *_ in among_others]
+    np.testing.assert_allclose([each[1:] for each in alone], [each[1:] for each in among_others], atol=2e-3)
 
 
 def test_a_fan_whose_speed_varies_is_unsteady_and_its_alarm_stays_until_it_is_steady_again() -> None:
@@ -136,7 +154,7 @@ def test_a_fan_whose_speed_varies_is_unsteady_and_its_alarm_stays_until_it_is_st
         is_returning.append(bool(decision.is_returning[0]))
     assert [each[1:] for each in changes] == [(0, True)]
     assert not any(is_returning[250:])
-    first = decision.alarms[0].causes()[0]
+    first = decision.alarms.causes(0)[0]
     assert (first.cause, first.probability > 0.95) == ("unsteady", True)
     assert 1.5 < first.change < 3.0, "times as much as a healthy fan"
     ends_s, made.sizes[:] = made.time_s, 0.0

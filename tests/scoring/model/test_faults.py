@@ -38,8 +38,8 @@ def first_causes(rows: Sequence[Fault], *, has_own_drive: bool) -> list[str]:
         made.sizes[fan, list(row.columns)] = sizes
     made.fault_from_s = 40.0
     plays(made, deciding, 60.0)
-    alarms = [deciding.alarms.get(fan) for fan in range(len(rows))]
-    return [alarm.causes()[0].cause if alarm else "no alarm" for alarm in alarms]
+    causes = [deciding.alarms.causes(fan) for fan in range(len(rows))]
+    return [each[0].cause if each else "no alarm" for each in causes]
 
 
 @pytest.mark.parametrize(
@@ -57,7 +57,7 @@ def test_a_speed_that_no_rotor_makes_is_the_tachos_while_the_command_moves() -> 
     deciding = made.decision()
     plays(made, deciding, 40.0)
     plays(made, deciding, 20.0, lambda one: with_reading(one, 10.0 * fans.top_rad_s - one.predicted_rad_s))
-    first, *_ = deciding.alarms[0].causes()
+    first, *_ = deciding.alarms.causes(0)
     assert (first.cause, first.probability > 0.99) == ("sensor_scaling", True)
 
 
@@ -81,7 +81,7 @@ def test_what_a_rotor_does_by_its_torque_balance_is_named_and_clears_while_the_c
         one = bin_of(number, 100_000_000, len(causes), healthy, command=torque)
         deciding.take(with_reading(one, real - healthy + rng.normal(0.0, fans.noise_rad_s)))
         if number == 899:
-            assert [deciding.alarms[fan].causes()[0].cause for fan in range(len(causes))] == causes
+            assert [deciding.alarms.causes(fan)[0].cause for fan in range(len(causes))] == causes
     assert deciding.active.tolist()[:2] == [False, False], "40 s after the repair"
 
 
