@@ -113,11 +113,15 @@ class TrayScorer:
             if self._against:
                 self._against.forget(fans)
 
+    def statistic(self, fan: int) -> Statistic:
+        """See FanFacts."""
+        return Statistic(int(self._now.statistic[fan]))
+
     def measured(self, fan: int) -> Measured:
         """See FanFacts."""
         decision = self._decision
         residual, std = float(decision.deviation_rad_s[fan]), float(decision.deviation_std_rad_s[fan])
-        statistic = Statistic(int(self._now.statistic[fan]))
+        statistic = self.statistic(fan)
         speed = float(decision.now.speed_rad_s[fan]) if decision.now else 0.0
         slow = self.wear.of(fan)
         if statistic == Statistic.WEAR and slow:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -43,6 +43,10 @@ class Measured:
 
 class FanFacts(Protocol):
     """Facts about the fans of a tray at the end of a bin."""
+
+    def statistic(self, fan: int) -> Statistic:
+        """Statistic that an alarm of a fan is about now."""
+        ...
 
     def measured(self, fan: int) -> Measured:
         """Measurements of a fan with an alarm."""
@@ -90,7 +94,7 @@ class AlarmManager:
                 self.cleared += event.transition == Transition.CLEARED
                 self._due_t_ns.pop(fan, None)
                 measured = replace(measured, statistic=before.statistic)  # nothing speaks for a fault any more
-            elif event.transition == Transition.RAISED or (now.judged[fan] and _is_other(measured, before)):
+            elif event.transition == Transition.RAISED or (now.judged[fan] and _is_other(measured.statistic, before)):
                 self._due_t_ns[fan] = _again_after(now.t_ns)
                 changed["causes"] = facts.causes(fan)
             self.raised += event.transition == Transition.RAISED
@@ -110,10 +114,10 @@ class AlarmManager:
             self._due_t_ns[fan] = left or [now.t_ns + AGAIN_AFTER_S[-1] * NS_PER_S]
         alarms: list[Alarm] = []
         for fan in self._due_t_ns:
-            before, measured = self._next_message(fan), facts.measured(fan)
+            before = self._last_emitted[fan]
             if not before.active or before.stale or not now.judged[fan]:
                 continue
-            is_other = _is_other(measured, before)
+            is_other = _is_other(facts.statistic(fan), before)
             if not (is_other or fan in due or fan in begins):
                 continue
             if is_other:
@@ -121,7 +125,7 @@ class AlarmManager:
             causes = facts.causes(fan, () if is_other else before.causes)
             if is_other or _is_news(causes, before.causes):
                 changed = {"t_ns": now.t_ns, "transition": Transition.DIAGNOSED, "causes": causes}
-                alarms.append(self._emit(replace(before, **vars(measured), **changed)))
+                alarms.append(self._emit(replace(self._next_message(fan), **vars(facts.measured(fan)), **changed)))
         return alarms
 
     def answer(self, request: Request, last_t_ns: int) -> list[Alarm]:
@@ -266,9 +270,9 @@ def _again_after(t_ns: int) -> list[int]:
     return [t_ns + after_s * NS_PER_S for after_s in AGAIN_AFTER_S]
 
 
-def _is_other(measured: Measured, before: Alarm) -> bool:
+def _is_other(statistic: Statistic, before: Alarm) -> bool:
     """Return whether what an alarm is about is of another kind than it was."""
-    of_both = {measured.statistic, before.statistic}
+    of_both = {statistic, before.statistic}
     return len(of_both) > 1 and of_both != set(OF_SPEED)
 
 
@@ -303,7 +307,8 @@ def _state_fields(state: AlarmState) -> dict[str, Any]:
 
 def _to_json(alarm: Alarm) -> dict[str, Any]:
     """The fields of an alarm."""
-    return {name: value for name, value in asdict(alarm).items() if name != "header"}
+    fields = {name: value for name, value in vars(alarm).items() if name != "header"}
+    return fields | {"causes": [vars(cause) for cause in alarm.causes]}
 
 
 def _from_json(stored: Mapping[str, Any]) -> Alarm:
