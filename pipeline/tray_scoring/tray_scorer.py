@@ -182,8 +182,11 @@ class TrayScorer:
     def _decide(self, one: Bin, item: Prediction) -> list[Alarm]:
         """Bring all up to date with the end of a bin; returns the messages on alarms."""
         decision, against, row = self._decision, self._against, one.row
+        gap_s = (one.t_ns - decision.operation.t_ns) / NS_PER_S - decision.bin_s
         decision.take(one)
         assert decision.now is not None
+        if gap_s > 0.0:
+            self._falls.rest(gap_s)
         self._falls.take(decision.now)
         if against:
             is_now = against.kind[row] > 0
@@ -251,6 +254,7 @@ class TrayScorer:
             "seen": self._seen,
             "command": self._command,
             "kind": self._kind,
+            "stands": self._stands,
         }
         if self._against:
             arrays |= within("against", self._against.kept())
@@ -283,3 +287,4 @@ class TrayScorer:
             self._against.restore(part("against", stored))
         self._now = ScoreColumns(**part("now", stored))
         self._seen, self._command, self._kind = stored["seen"], stored["command"], stored["kind"]
+        self._stands = stored["stands"]

@@ -351,7 +351,7 @@ class Decision(Saved):
         varies = np.zeros(len(known), np.bool_)
         if len(self.alarms.fans):
             varies[self.alarms.fans] = self.alarms.varies
-        is_left = size * np.sign(self._peak) > LEFT_SIGMAS * np.sqrt(variance)
+        is_left = np.abs(size) > LEFT_SIGMAS * np.sqrt(variance)  # on either side
         is_healthy = self.active & ~varies & ~is_left & (self._log_odds() < -math.log(OVER_ODDS))
         self.is_returning = np.where(known, is_healthy, self.is_returning)
         over_s = np.where(is_healthy, self._over_s + self.bin_s * self.operation.bins_held, 0.0)

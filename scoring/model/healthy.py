@@ -37,7 +37,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fantwin.schemas.messages import Array
-from fantwin.scoring.model.operation import Fans, Inputs
+from fantwin.scoring.model.operation import LOWEST_LENGTH, Fans, Inputs
 from fantwin.scoring.model.priors import Priors
 from fantwin.scoring.model.saved import Saved
 
@@ -157,6 +157,7 @@ class HealthyFans(Saved):
         self.covariance *= kept[:, np.newaxis] * kept
         variance = np.einsum("nii->ni", self.covariance)  # a view
         variance[:, AGE] += p.ageing_per_sqrt_h**2 * passed_s / 3600.0
+        variance[:, COUNT] = self._missed
         for state, std in ((WANDER, p.wander), (AIR, p.air)):
             variance[:, state] += std**2 * (1.0 - kept[state] ** 2)
         variance[:, LOCAL] += np.square(p.local_rad_s / (0.5 * self.fans.top_rad_s)) * (1.0 - kept[LOCAL] ** 2)
@@ -180,9 +181,10 @@ class HealthyFans(Saved):
         local = p.local_rad_s**2 + variances.sum(axis=0)
         is_of_lowest, is_unseen = variances / local
         # what is unseen is not renewed by the speed: a fault must not widen what is not known of a fan
-        path = now.command_moved + (1.0 - is_unseen) * moved + is_of_lowest * now.command_path
+        path = (now.command_moved + (1.0 - is_unseen) * moved) / p.local_length
+        path += is_of_lowest * now.command_moved / LOWEST_LENGTH
         per_s = (1.0 - is_unseen) / p.local_s + is_unseen / UNSEEN_S
-        remains = np.exp(-path / p.local_length - self._bin_s * per_s)
+        remains = np.exp(-path - self._bin_s * per_s)
         self.kept[:, LOCAL - AIR] = remains
         self.noise[:, LOCAL] = local / np.square(np.maximum(now.speed_rad_s, SLOWEST_RAD_S)) * (1.0 - remains**2)
         faded = covariance[:, FADING] * self.kept[:, :, np.newaxis]
@@ -278,5 +280,6 @@ def _prior(fans: Fans, p: Priors, period_s: float) -> Array:
         covariance[:, state, state] = std**2
     phase_s = (fans.held_s + period_s) / math.sqrt(6.0)  # of window and sample: two phases, then and now
     covariance[:, LATE, LATE] = np.square(phase_s)
+    covariance[:, COUNT, COUNT] = np.square(p.count * fans.pulse_rad_s) / 12.0
     covariance[:, LOCAL, LOCAL] = np.square(p.local_rad_s / (0.5 * top))
     return covariance

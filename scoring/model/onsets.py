@@ -280,12 +280,12 @@ def _without_others(fault: Fault, sums: Sums) -> tuple[Array, Array, Array]:
     for one in range(len(std)):
         squares[one, one] += 1.0
     for one in range(len(std) - 1, 0, -1):
-        pivot, product = squares[one, one], products[one]
+        pivot, product = np.maximum(squares[one, one], 1.0), products[one]  # rounded, it may be less
         found += 0.5 * (product**2 / pivot - np.log(pivot))
         ratio = squares[one, :one] / pivot
         products[:one] -= ratio * product
         squares[:one, :one] -= ratio[:, np.newaxis] * squares[one, :one]
-    return found, squares[0, 0], products[0]
+    return found, np.maximum(squares[0, 0], 1.0), products[0]
 
 
 class Evidence:

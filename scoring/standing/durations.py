@@ -12,7 +12,7 @@ class Durations:
 
     def __init__(self, valid: Array, period_ns: int) -> None:
         self.valid = valid
-        self._period_ns = period_ns
+        self.period_ns = period_ns
 
     def of(self, grows: Array, ends: Array, before_ns: Array) -> Array:
         """Durations, ns, (..., n, fans): they grow with samples of `grows` and begin again with those of `ends`, both
@@ -20,7 +20,7 @@ class Durations:
 
         before_ns: (..., fans) after the last block, and after this one when it returns.
         """
-        grown: Array = (grows & self.valid).cumsum(axis=-2) * self._period_ns
+        grown: Array = (grows & self.valid).cumsum(axis=-2) * self.period_ns
         ended = ends & self.valid
         at_end = np.maximum.accumulate(np.where(ended, grown, 0), axis=-2)
         has_ended = np.logical_or.accumulate(ended, axis=-2)

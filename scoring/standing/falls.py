@@ -23,7 +23,7 @@ class Falls(Saved):
 
     KEPT = (
         *("_share", "_lasted_s", "_rest_s", "_is_first", "_passed_s", "_has_stood", "stands", "is_falling"),
-        *("_steady_share", "_steady_s"),
+        *("_steady_share", "_steady_s", "_has_turned"),
     )
 
     def __init__(self, fans: Fans, bin_s: float) -> None:
@@ -44,6 +44,8 @@ class Falls(Saved):
         """(fans,) true while the tacho still shows the first reading of the fall"""
         self._has_stood = np.zeros(count, np.bool_)
         """(fans,) true after a fan has stood since it fell: what it turns at rest is no part of the fall"""
+        self._has_turned = np.zeros(count, np.bool_)
+        """(fans,) true once a fan has been seen to turn: else it was not seen how it fell"""
         self.stands = np.zeros(count, np.bool_)
         self.is_falling = np.zeros(count, np.bool_)
 
@@ -66,11 +68,19 @@ class Falls(Saved):
         self._rest_s = np.where(falls, self._rest_s + np.where(self._is_first, 0.0, turned_s), 0.0)
         self._lasted_s = np.where(falls, self._lasted_s + turned_s, 0.0)
         self._passed_s = np.where(known, 0.0, self._passed_s)
+        is_off = expected < STANDS * self._fans.top_rad_s
+        self._has_turned = ~is_off & (self._has_turned | (known & (share > FALLS)))
         self._has_stood = falls & (self._has_stood | (known & (share < STANDS)))
         self.stands = np.where(known, share < STANDS, self.stands)
         self.is_falling = np.where(known, share < FALLING, self.is_falling)
 
-    def of(self, fan: int) -> Fall:
-        """The fall of a fan that falls or stands."""
+    def rest(self, gap_s: float) -> None:
+        """Let a gap pass: a fall within it was not seen."""
+        self._has_turned &= gap_s <= self._fans.held_s
+
+    def of(self, fan: int) -> Fall | None:
+        """The fall of a fan that falls or stands; None if it was not seen."""
+        if not self._has_turned[fan]:
+            return None
         held_s = max(float(self._fans.held_s[fan]), self._bin_s)
         return Fall(float(self._lasted_s[fan]), float(self._rest_s[fan]), float(self._fans.coasts_s[fan]), held_s)

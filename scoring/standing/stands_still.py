@@ -38,6 +38,7 @@ class StandsStill(Saved):
         started_s = UNKNOWN_STARTED_S + reach_s if healthy.start_s is None else healthy.start_s + 0.0 * reach_s
         self._started_ns = started_s * NS_PER_S
         self._lapse_limit_s = lapse_limit_s(healthy)
+        self._held_s = np.array([tacho.held_s for tacho in tachos])
         self._start_limit_s = start_limit_s(healthy, reach_s)
         self._missing_limit_s: Array = reach_s + MISSING_S
         self._lasted_ns = np.zeros((4, len(tachos)), np.int64)
@@ -60,7 +61,8 @@ class StandsStill(Saved):
             self._lasted_ns[1:],
         )
         has_turned = turned > 0
-        of_stood = stood / np.where(has_turned, self._lapse_limit_s, self._start_limit_s) / NS_PER_S
+        two_readings_s = np.maximum(self._lapse_limit_s, self._held_s + counts.period_ns / NS_PER_S)  # one may be wrong
+        of_stood = stood / np.where(has_turned, two_readings_s, self._start_limit_s) / NS_PER_S
         of_silent = silent / self._missing_limit_s / NS_PER_S
         kind = np.where(of_silent > of_stood, 0, np.where(has_turned, 1, 2))
         return np.maximum(of_stood, of_silent), drives & turns, kind

@@ -100,6 +100,15 @@ def test_the_alarm_of_a_small_fault_follows_it_for_long_also_when_it_grows_and_c
     assert sorted(each[1:] for each in plays(made, decision, 60.0)) == [(0, False), (1, False)]
 
 
+def test_a_fault_that_becomes_its_opposite_is_still_a_fault() -> None:
+    made = MadeFans(twin_of(1).fans, 0.1, steady, seed=2, own=0.0)
+    decision = made.decision()
+    plays(made, decision, 20.0)
+    assert [each[1:] for share in (0.3, -0.2) for each in with_drop(made, decision, share, 30.0)] == [(0, True)]
+    assert decision.fault[0][0] == pytest.approx(0.2, rel=0.1) and not decision.is_returning[0]
+    assert [each[1:] for each in plays(made, decision, 30.0)] == [(0, False)]
+
+
 @pytest.mark.parametrize(("tacho", "lasts_s"), [(Tacho(), 30.0), (COUNTING, 100.0)], ids=["at once", "counting"])
 def test_an_alarm_stays_for_as_long_as_anything_is_left_of_its_fault(tacho: Tacho, lasts_s: float) -> None:
     """A fan that loses nearly all of its speed, and one of which a third of the fault remains."""

@@ -43,6 +43,21 @@ def test_a_fan_that_comes_to_rest_stands_and_has_run_on_for_as_long_as_its_readi
         assert falls.stands[0] == (speed < 0.08 * TWIN_SPEED)
         assert falls.is_falling[0] == (speed < 0.6 * TWIN_SPEED)
     fall = falls.of(0)
+    assert fall is not None
     assert least_s <= fall.lasted_s <= most_s
     assert fall.rest_s == pytest.approx(max(fall.lasted_s - 0.85 * BIN_S, 0.0), abs=0.1 * BIN_S), "but for one reading"
     assert fall.coasts_s == pytest.approx(COASTS_S)
+
+
+@pytest.mark.parametrize(("turned_s", "gap_s"), [(0.0, 0.0), (3.0, 30.0)], ids=["from the start", "after a gap"])
+def test_how_long_a_fan_ran_on_is_not_known_where_nobody_saw_it(turned_s: float, gap_s: float) -> None:
+    fans = twin_of(1).fans
+    operation, falls = Operation(fans, round(BIN_S * 1e9)), Falls(fans, BIN_S)
+    for number in range(round((turned_s + 1.0) / BIN_S)):
+        is_turning = number * BIN_S < turned_s
+        one = bin_of(number if is_turning else number + round(gap_s / BIN_S), round(BIN_S * 1e9), 1, TWIN_SPEED)
+        one = with_reading(one, 0.0 * one.predicted_rad_s if is_turning else -one.predicted_rad_s)
+        if number == round(turned_s / BIN_S):
+            falls.rest(gap_s)
+        falls.take(operation.inputs(one))
+    assert falls.stands[0] and falls.of(0) is None
