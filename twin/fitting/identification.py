@@ -58,6 +58,9 @@ LAG_IN_STANDARD_ERRORS = 3.3
 # Data that excite a fan hold ten or more units of information about ln J per sample, a hundred times this anchor.
 ANCHOR_PER_SAMPLE = 0.1
 NEARLY_BEST = 1.25
+MOST_AHEAD, LEAST_ALIKE, TIMES_AS_ALIKE = 5, 0.3, 1.2
+"""samples by which a speed may be found to be ahead of its command; least correlation of their changes with which it
+is, and least multiple of that without a shift"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,9 +191,27 @@ def _filtered_start(pieces: Sequence[Run], top_speed_rad_s: Array, progress: Pro
     )
     smallest = errors.min(axis=0)
     for fan in np.flatnonzero(~np.isfinite(smallest)):
-        raise TwinError(f"fan {fan}: the speed does not follow the command; check which columns are command and speed")
+        raise TwinError(f"fan {fan}: {_why_not(pieces, int(fan))}")
     best = LAMBDA_LADDER - 1 - np.argmax((errors <= NEARLY_BEST * smallest)[::-1], axis=0)
     return candidates[best, np.arange(fans)], ladder[best]
+
+
+def _why_not(pieces: Sequence[Run], fan: int) -> str:
+    """Why the speed of a fan seems not to follow its command: it may be earlier than the command, by some samples."""
+    steps = [np.diff((piece.command[:, fan], np.nan_to_num(piece.speed_rad_s[:, fan]))) for piece in pieces]
+    size = np.sqrt(np.prod(sum(np.square(step).sum(axis=1) for step in steps)))
+    alike = [
+        sum(float(command[ahead:] @ speed[: len(speed) - ahead]) for command, speed in steps) / size
+        for ahead in range(MOST_AHEAD + 1)
+    ]
+    ahead = int(np.argmax(alike))
+    if alike[ahead] > max(LEAST_ALIKE, TIMES_AS_ALIKE * alike[0]):
+        seconds = ahead * float(np.median([piece.median_period_s for piece in pieces]))
+        return (
+            f"the speed changes about {seconds:.3g} s before the command does; are the times of its rows the "
+            "beginnings of the time over which pulses are counted? Give them the time of its end"
+        )
+    return "the speed does not follow the command; check which columns are command and speed"
 
 
 def _stable(parameters: Array, top_speed_rad_s: Array) -> Array:

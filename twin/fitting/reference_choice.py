@@ -12,6 +12,7 @@ import numpy as np
 
 from fantwin.schemas.channels import BY_NAME
 from fantwin.schemas.reference_conditions import ReferenceConditions
+from fantwin.twin.errors import TwinError
 from fantwin.twin.fitting.identification import Identification, identify
 from fantwin.twin.progress import Progress, unreported, within
 from fantwin.twin.reference import at_reference, ratios_of, reference_of
@@ -44,7 +45,10 @@ def identify_at_reference(
         if not _varies(runs, conditions, name):
             continue
         fewer = replace(conditions, **{name: None})
-        without = identify(at_reference(runs, fewer), progress=within(f"without {BY_NAME[name].title}", progress))
+        try:
+            without = identify(at_reference(runs, fewer), progress=within(f"without {BY_NAME[name].title}", progress))
+        except TwinError:  # they cannot be identified without it
+            continue
         with_rad_s, without_rad_s = (_rmse_rad_s(each) for each in (identification, without))
         if without_rad_s < (1.0 - LEAST_GAIN) * with_rad_s:
             conditions, identification = fewer, without

@@ -82,7 +82,7 @@ def import_table(
         typer.Option(
             metavar="KIND[:window_s=S,pulses=N,...]",
             help="How the speeds were measured: instantaneous (default), count, average or period, with the keys of "
-            "`tacho` in [[tray]]: one for all fans, or one per fan. Repeatable.",
+            "`tacho` of a tray: one for all fans, or one per fan. Repeatable.",
         ),
     ] = None,
     poles: Annotated[int | None, typer.Option(help="Magnetic poles of a motor, for speeds in erpm.")] = None,
@@ -127,7 +127,8 @@ def import_table(
     write_table(table, output, tray, tachos)
     hints = tacho_hints(table.t_ns / NS_PER_S, table.speed_rad_s, tachos, range(table.fans))
     fans = "1 fan" if table.fans == 1 else f"{table.fans} fans"
-    period = f"{table.median_period_s * 1e3:.3g} ms apart (median)"
+    period_s = table.median_period_s
+    period = f"{f'{period_s:.3g} s' if period_s >= 1.0 else f'{period_s * 1e3:.3g} ms'} apart (median)"
     line = f"{output}: {len(table.t_ns)} samples of {fans} over {table.duration_s:.1f} s, {period}"
     lines = (line, *(f"  {note}" for note in (*notes, *table.notes)))
     show(import_summary(table, output) | {"hints": hints, "notes": notes}, *lines, json_output=json_output)

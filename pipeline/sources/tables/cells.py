@@ -63,6 +63,12 @@ class TimeColumn:
         """Return whether the unit is an assumption: numbers without one."""
         return not self._is_given and self._unit != DATE_UNIT
 
+    @property
+    def lacks_zone(self) -> bool:
+        """Return whether the dates do not say of which time zone they are."""
+        date = _date(self._first) if self._unit == DATE_UNIT else None
+        return date is not None and date.tzinfo is None
+
     def add(self, rows: Sequence[Sequence[str]]) -> None:
         """Append the cells of some rows. Raises UserError for a time beyond the year 2116."""
         self._first = self._first or next((row[self._index] for row in rows if row[self._index]), "")
@@ -115,10 +121,16 @@ def _count_ns(scale: int) -> Callable[[str], int | None]:
     return parse
 
 
-def _date_ns(cell: str) -> int | None:
+def _date(cell: str) -> datetime | None:
     try:
-        date = datetime.fromisoformat(_DATE_AND_FRACTION.sub(r"\1.\2", cell))
+        return datetime.fromisoformat(_DATE_AND_FRACTION.sub(r"\1.\2", cell))
     except ValueError:
+        return None
+
+
+def _date_ns(cell: str) -> int | None:
+    date = _date(cell)
+    if date is None:
         return None
     since = (date if date.tzinfo else date.replace(tzinfo=UTC)) - _UNIX_EPOCH
     return since // timedelta(microseconds=1) * 1000

@@ -72,7 +72,7 @@ class Table:
     """unit of the table: rpm, rad/s, hz or deg/s"""
     repairs: Repairs
     assumed: str = ""
-    """units that were assumed, and how to give them, in one line; empty if all were given"""
+    """units and time zone that were assumed, and how to give units, in one line; empty if all were given"""
     auxiliary: Mapping[str, Array] = field(default_factory=dict[str, Array])
     """other measured columns, (n, fans) each, NaN where missing, by name in schemas.channels"""
 
@@ -165,6 +165,8 @@ def read_table(
     speed_rad_s = np.column_stack([column.values() for column in speeds])
     speed_rad_s *= RAD_S_PER_TABLE_UNIT[unit]
     assumed = _assumed(times.name if times and times.is_assumed else "", "" if found[0][2] else found[0][0])
+    if times and times.lacks_zone:
+        assumed = "; ".join(filter(None, (assumed, f"dates of {times.name!r} have no time zone: UTC assumed")))
     of_all = [column.values() for columns in others.values() for column in columns * (len(speeds) // len(columns))]
     table = clean_samples(path, t_ns, has_time, command_values, np.column_stack([speed_rad_s, *of_all]), unit)
     of_speed, *measured = np.split(table.speed_rad_s, len(others) + 1, axis=1)

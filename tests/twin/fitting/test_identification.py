@@ -85,6 +85,15 @@ def test_a_command_that_never_changes_and_a_dead_sensor_are_refused() -> None:
             identify([Run("bad", t_s, held, speed_rad_s)])
 
 
+def test_a_speed_that_is_ahead_of_its_command_is_refused_with_what_the_times_of_its_rows_may_be() -> None:
+    """As of a table whose rows have the times at which their counts begin."""
+    rng = np.random.default_rng(5)
+    command = np.repeat(rng.uniform(20.0, 90.0, 120), 20)[:, np.newaxis]
+    speed_rad_s = np.roll(3.0 * command, -2, axis=0) + rng.normal(0.0, 0.5, command.shape)
+    with pytest.raises(TwinError, match="fan 0: the speed changes about 2 s before the command does"):
+        identify([Run("early", np.arange(len(command), dtype=np.float64), command, speed_rad_s)])
+
+
 def test_a_recording_of_few_time_constants_is_said_to_be_too_short_before_anything_else() -> None:
     """The published fan has a time constant of about 0.2 s: 5 s are few, 20 s are enough."""
     first = identify([fan_data.published_run(1, duration_s=5.0)]).warnings[0]

@@ -102,7 +102,8 @@ def test_dates_are_recognised_and_read_as_utc_and_nanoseconds_since_1970_are_not
 
 def test_dates_and_periods_need_no_unit_and_a_name_with_blanks_is_quoted(tmp_path):
     dates = "t,u,y\n2019-11-05 17:14:08,1,10\n2019-11-05 17:14:09,2,20\n"
-    assert table(tmp_path, dates, speed=["y:rpm"]).assumed == ""
+    assert table(tmp_path, dates, speed=["y:rpm"]).assumed == "dates of 't' have no time zone: UTC assumed"
+    assert table(tmp_path, dates.replace("08,", "08Z,").replace("09,", "09Z,"), speed=["y:rpm"]).assumed == ""
     read = table(tmp_path, "the u,the y\n1,10\n2,20\n", None, ["the u"], ["the y"], "10ms")
     assert (
         read.assumed == "no unit given, speeds in rad/s assumed; if that is wrong, use for example --speed 'the y:rpm'"
