@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import re
 import subprocess
 import sys
@@ -52,17 +51,16 @@ def packages_of(modules: set[str]) -> set[str]:
     return {installed()[PARTS.get(module, module)][0].lower().replace("_", "-") for module in modules}
 
 
+IMPORT = re.compile(r"^\s*(?:from (\w+)[\w.]* import|import (\w+))", re.MULTILINE)
+
+
 def imported() -> dict[str, set[str]]:
     """The modules of others that the product imports, each with the files that import it."""
     found: dict[str, set[str]] = {}
     for path in (path for folder in PRODUCT for path in (ROOT / folder).rglob("*.py")):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.ImportFrom):
-                full = [node.module or ""] if not node.level else []
-            else:
-                full = [each.name for each in node.names] if isinstance(node, ast.Import) else []
-            for module in {each.partition(".")[0] for each in full} - {*sys.stdlib_module_names, "fantwin"}:
-                found.setdefault(module, set()).add(path.relative_to(ROOT).as_posix())
+        modules = {of or itself for of, itself in IMPORT.findall(path.read_text(encoding="utf-8"))}
+        for module in modules - {*sys.stdlib_module_names, "fantwin"}:
+            found.setdefault(module, set()).add(path.relative_to(ROOT).as_posix())
     return found
 
 
