@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from scipy.signal import lfilter
 
 from fantwin.pipeline.learning.healthy_history import HealthyHistory
 from fantwin.schemas.header import Header
@@ -32,10 +33,8 @@ def moving(seconds: float, fans: int = 2, seed: int = 1) -> Array:
 
 def recorded(folder: Path, first_s: float, command: Array, rate_hz: float = RATE_HZ) -> None:
     """Add a recording of fans with a time constant of a second, from first_s after START_S on."""
-    speed = GAIN * command
     decay = np.exp(-1.0 / rate_hz)
-    for k in range(1, len(command)):
-        speed[k] = GAIN * command[k - 1] + decay * (speed[k - 1] - GAIN * command[k - 1])
+    speed, _ = lfilter([0.0, 1.0 - decay], [1.0, -decay], GAIN * command, axis=0, zi=GAIN * command[:1])
     speed += np.random.default_rng(len(command)).normal(0.0, NOISE_RAD_S, speed.shape)
     add_history(folder, first_s, command, speed, rate_hz)
 
