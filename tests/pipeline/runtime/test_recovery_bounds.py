@@ -179,30 +179,6 @@ def test_row_11_an_endless_answer_ends_at_its_bound(endless, monkeypatch, last, 
     assert len(answers) == 1
 
 
-def test_row_11_a_message_larger_than_any_of_its_topic_is_refused(endpoint):
-    key, arrived = tray_key("s", "a", "clock"), threading.Event()
-    config, got = BusConfig(endpoint=endpoint), []
-
-    def receive(_key: str, payload: bytes) -> None:
-        got.append(len(payload))
-        arrived.set()
-
-    with Bus(config) as bus, Bus(config) as other:
-        bus.subscribe(key, receive)
-        publisher = other.publisher(key, BY_NAME["clock"], "", "p")
-
-        def small_arrives() -> bool:
-            publisher.put(bytes(10))
-            return arrived.is_set()
-
-        eventually(small_arrives, "they have met")
-        publisher.put(bytes(BY_NAME["clock"].largest_bytes + 1))
-        publisher.put(bytes(11))
-        eventually(lambda: 11 in got, "the next arrived")
-    assert set(got) == {10, 11}
-    assert bus.refused_too_large == 1
-
-
 def test_row_11_the_inbox_is_bounded_in_bytes_and_what_must_not_be_missed_is_not_dropped():
     inbox = Inbox(drops_oldest=True)
     for number in range(5):
