@@ -60,43 +60,57 @@ def test_help_has_a_panel_for_each_folder_of_commands_in_order():
     assert panels == sorted(panels)
 
 
-def modules_after(code: str) -> set[str]:
-    """What a new process has imported after this, and must have ended with nothing worse than SystemExit."""
-    show = "finally: print('\\n' + ' '.join(sys.modules))"
-    done = subprocess.run(
-        [sys.executable, "-c", f"import sys\nfrom fantwin.pipeline.cli import main\ntry: {code}\n{show}"],
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
+LISTS = """
+try:
+    sys.argv = ["fantwin", "--help"]
+    main.main()
+except SystemExit:
+    sys.argv = ["fantwin", "dmo"]
+    try:
+        main.main()
+    finally:
+        show()
+"""
+REGISTERS = """
+main._register(["command"])
+show()
+main._register(["up"])
+import fantwin.pipeline.cli.watch.one_stage
+show()
+main._register(["alarms", "status"])
+show()
+"""
+
+
+def run(code: str) -> tuple[subprocess.CompletedProcess[str], list[set[str]]]:
+    """A new process, and what it has imported whenever it shows that."""
+    begin = "import sys\nfrom fantwin.pipeline.cli import main\ndef show(): print('imported', *sys.modules)\n"
+    words = [sys.executable, "-c", begin + code]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
     assert "Traceback" not in done.stderr
-    return set(done.stdout.splitlines()[-1].split())
+    return done, [{*line.split()} for line in done.stdout.splitlines() if line.startswith("imported")]
 
 
-@pytest.mark.parametrize("words", ["--help", "dmo"])
-def test_the_list_of_commands_imports_none_of_them(words: str) -> None:
-    modules = modules_after(f"sys.argv = ['fantwin', '{words}']; main.main()")
-    assert {m for m in modules if m in ("numpy", "scipy") or m.startswith("fantwin.pipeline.cli.")} == {
-        "fantwin.pipeline.cli.main"
-    }
+def of_commands(modules: set[str]) -> set[str]:
+    return {each.removeprefix("fantwin.pipeline.cli.") for each in modules if each.startswith("fantwin.pipeline.cli.")}
 
 
-def test_the_process_of_a_stage_imports_no_rich_and_no_other_command() -> None:
-    modules = modules_after("main._register(['up']); import fantwin.pipeline.cli.watch.one_stage")
-    assert {m for m in modules if m == "rich" or m.startswith(("rich.", "fantwin.pipeline.cli."))} == {
-        *("fantwin.pipeline.cli.exposure", "fantwin.pipeline.cli.main", "fantwin.pipeline.cli.options"),
-        *("fantwin.pipeline.cli.watch", "fantwin.pipeline.cli.watch.one_stage", "fantwin.pipeline.cli.watch.up"),
-    }
+def test_the_list_of_commands_imports_none_of_them_also_for_a_mistyped_one() -> None:
+    done, (modules,) = run(LISTS)
+    assert of_commands(modules) == {"main"}
+    assert modules.isdisjoint(("numpy", "scipy"))
+    assert done.returncode == 2 and "No such command 'dmo'" in done.stderr
 
 
-def test_commands_beside_a_running_site_import_nothing_that_is_slow() -> None:
-    modules = modules_after("main._register(['alarms', 'command', 'status', 'up'])")
-    assert {"scipy", "onnxruntime", "pandas", "matplotlib", "rerun", "torch"}.isdisjoint(modules)
-
-
-def test_a_command_imports_nothing_that_only_watching_and_judging_need() -> None:
-    """It is to be answered at once, and most of its time is imports."""
+def test_a_command_and_a_stage_import_nothing_but_what_they_need() -> None:
+    """They are to start at once, and most of that time is imports."""
+    _, (command, stage, beside) = run(REGISTERS)
     rooms = ("scoring", "stages", "twin", "pipeline.launch", "pipeline.runtime.stage")
-    unneeded = (*(f"fantwin.{room}" for room in rooms), "rich", "scipy", "onnxr")
-    assert [name for name in modules_after("main._register(['command'])") if name.startswith(unneeded)] == []
+    watching_and_judging = (*(f"fantwin.{room}" for room in rooms), "rich", "scipy", "onnxr")
+    assert [name for name in command if name.startswith(watching_and_judging)] == []
+    assert of_commands(stage) - of_commands(command) <= {"exposure", "main", "options", "watch.one_stage", "watch.up"}
+    assert "rich" not in stage
+    assert {"scipy", "onnxruntime", "pandas", "matplotlib", "rerun", "torch"}.isdisjoint(beside)
 
 
 INTERRUPTED_WHEN_IT_IMPORTS = """
@@ -112,24 +126,18 @@ main()
 """
 
 
-@pytest.mark.parametrize("module", ["typer", "fantwin.pipeline.cli.main", "fantwin.pipeline.cli.watch.up"])
+@pytest.mark.parametrize("module", ["typer", "fantwin.pipeline.cli.watch.up"])
 def test_ctrl_c_while_a_command_is_still_imported_ends_it_without_a_word(module: str) -> None:
     code = INTERRUPTED_WHEN_IT_IMPORTS.format(module=module)
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout, done.stderr) == (-signal.SIGINT, "", "")
 
 
-@pytest.mark.parametrize(
-    ("words", "code", "said"),
-    [
-        ("view none.mcap", 1, "fantwin: none.mcap: cannot read the recording: No such file or directory"),
-        ("vieww", 2, "No such command 'vieww'"),
-    ],
-)
-def test_a_mistake_in_a_process_of_its_own_is_an_exit_code_and_no_traceback(words: str, code: int, said: str) -> None:
-    done = fantwin(*words.split())
-    assert (done.returncode, done.stdout) == (code, "")
-    assert said in done.stderr and "Traceback" not in done.stderr
+def test_a_mistake_in_a_process_of_its_own_is_an_exit_code_and_no_traceback() -> None:
+    done = fantwin("view", "none.mcap")
+    assert (done.returncode, done.stdout) == (1, "")
+    assert "fantwin: none.mcap: cannot read the recording: No such file or directory" in done.stderr
+    assert "Traceback" not in done.stderr
 
 
 @pytest.mark.parametrize(
