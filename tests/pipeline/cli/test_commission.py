@@ -10,14 +10,14 @@ from fantwin.pipeline.recordings.disk_room import DAY_NS, DiskRoom
 from fantwin.pipeline.recordings.parts import RecordingParts
 from fantwin.pipeline.recordings.recorder_config import RecorderConfig
 from fantwin.pipeline.recordings.sequence_ledger import SequenceLedger
-from tests.support.running_chain import fantwin
+from tests.support.fantwin_command import as_typed
 
 
 def test_why_its_doctor_step_fails_is_on_standard_error(tmp_path: Path, endpoint: str) -> None:
     configuration = tmp_path / "fantwin.toml"
     text = f'[bus]\nendpoint = "{endpoint}"\n[[tray]]\nname = "tray1"\nfans = 1\nport = "none"\n'
     configuration.write_text(text, encoding="utf-8")
-    done = fantwin("commission", "-c", configuration)
+    done = as_typed("commission", "-c", configuration)
     assert done.returncode == 1
     assert "FIX  acquisition/tray1: " in done.stderr
     assert done.stderr.rstrip().endswith("fantwin: `fantwin doctor` failed (exit code 1) and has said why")

@@ -10,8 +10,8 @@ import pytest
 
 from fantwin.pipeline.bus.access_rules import SiteRoles
 from fantwin.pipeline.bus.router import open_router
+from tests.support.fantwin_command import as_typed
 from tests.support.fantwin_command import fantwin as called
-from tests.support.running_chain import fantwin
 from tests.support.secured_site import SITE, SecuredSite, free_endpoint
 
 
@@ -32,9 +32,8 @@ def test_a_stage_with_a_certificate_of_another_role_ends_with_1_and_one_line(sit
     other = site.certificates.folder / "viewer"
     words = [f"bus.security.{name}='{other}.{end}'" for name, end in (("certificate", "pem"), ("key", "key"))]
     with site.running():
-        done = fantwin(
-            "up", "--only", "resampler", "-c", site.config.path, *(w for word in words for w in ("--set", word))
-        )
+        settings = (w for word in words for w in ("--set", word))
+        done = as_typed("up", "--only", "resampler", "-c", site.config.path, *settings)
     assert done.returncode == 1
     assert done.stderr.startswith("fantwin: its certificate says 'viewer', which may not publish grid of a"), (
         done.stderr
