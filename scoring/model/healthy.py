@@ -37,7 +37,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fantwin.schemas.messages import Array
-from fantwin.scoring.model.operation import LOWEST_LENGTH, Fans, Inputs
+from fantwin.scoring.model.operation import Fans, Inputs
 from fantwin.scoring.model.priors import Priors
 from fantwin.scoring.model.saved import Saved
 
@@ -181,10 +181,9 @@ class HealthyFans(Saved):
         local = p.local_rad_s**2 + variances.sum(axis=0)
         is_of_lowest, is_unseen = variances / local
         # what is unseen is not renewed by the speed: a fault must not widen what is not known of a fan
-        path = (now.command_moved + (1.0 - is_unseen) * moved) / p.local_length
-        path += is_of_lowest * now.command_moved / LOWEST_LENGTH
+        path = now.command_moved + (1.0 - is_unseen) * moved + is_of_lowest * now.command_path
         per_s = (1.0 - is_unseen) / p.local_s + is_unseen / UNSEEN_S
-        remains = np.exp(-path - self._bin_s * per_s)
+        remains = np.exp(-path / p.local_length - self._bin_s * per_s)
         self.kept[:, LOCAL - AIR] = remains
         self.noise[:, LOCAL] = local / np.square(np.maximum(now.speed_rad_s, SLOWEST_RAD_S)) * (1.0 - remains**2)
         faded = covariance[:, FADING] * self.kept[:, :, np.newaxis]

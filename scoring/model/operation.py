@@ -18,8 +18,6 @@ FASTEST = 2.0
 """multiple of the top speed beyond which a free run has diverged"""
 LOWEST_ERROR = 0.01
 """standard deviation of the lowest command that acts, share of the commands"""
-LOWEST_LENGTH = 2.0 * LOWEST_ERROR
-"""distance from it, share of the commands, over which the error that this makes fades, and becomes another"""
 STEADY_S = 0.5
 """time constant by which the measured speed is averaged where the torque balance is read: it removes what a speed loop
 does around a speed"""
@@ -85,8 +83,10 @@ class Inputs:
     """rate of that speed"""
     load: Array
     """mean of the squares of the shares of the top speed of the other fans of the tray"""
+    command_path: Array
+    """movement of the command so far, share of the largest command so far"""
     command_moved: Array
-    """movement of the command by more than BACKLASH, share of the largest command so far"""
+    """share that it has moved by more than BACKLASH"""
     unseen_rad_s: Array
     """standard deviation of the twin's error where it was not trained"""
     of_lowest_rad_s: Array
@@ -127,8 +127,8 @@ class Operation(Saved):
         """end of the last bin; 0: there was none"""
         self._speed, self._was_balance = np.zeros(count), np.zeros(count, np.bool_)
         self._moved_to = np.zeros(count)
-        self._command, self._largest = np.zeros(count), np.full(count, 1e-9)
-        """(fans,) command of the last bin as far as it moved by more than BACKLASH; the largest"""
+        self._command, self._largest = np.zeros((2, count)), np.full(count, 1e-9)
+        """(2, fans) command of the last bin, as it acts and as far as it moved by more than BACKLASH; the largest"""
         self._has_lowest = np.isfinite(fans.lowest_command).any()
 
     def inputs(self, one: Bin) -> Inputs:
@@ -150,8 +150,8 @@ class Operation(Saved):
         self._largest = np.maximum(self._largest, np.abs(one.command))
         slack = BACKLASH * self._largest
         acting = np.fmax(one.command, fans.lowest_command)
-        command = np.clip(self._command, acting - slack, acting + slack)
-        command_moved = np.abs(command - self._command) / self._largest
+        command = np.stack((acting, np.clip(self._command[1], acting - slack, acting + slack)))
+        command_path, command_moved = np.abs(command - self._command) / self._largest
         self.t_ns, self._speed, self._was_balance, self._moved_to = one.t_ns, speed, is_balance, moved_to
         self._command = command
         readings = np.where(is_balance, one.balances, one.readings)
@@ -166,6 +166,7 @@ class Operation(Saved):
             moved_to,
             moves,
             (share.sum() - share) / max(len(share) - 1, 1),
+            command_path,
             command_moved,
             unseen,
             self._of_lowest(one.command) if self._has_lowest else np.zeros(len(speed)),
@@ -188,7 +189,7 @@ class Operation(Saved):
         error = LOWEST_ERROR * fans.commands
         slope = fans.top_rad_s / np.maximum(fans.commands - fans.lowest_command, error)
         beyond = np.maximum(command - fans.lowest_command, 0.0)  # below it the speed is that of its end
-        near = np.exp(-0.5 * np.square(beyond / (LOWEST_LENGTH * fans.commands)))
+        near = np.exp(-0.5 * np.square(beyond / (2.0 * error)))
         return np.nan_to_num(error * slope * near)
 
     def samples_rad_s(self, one: Bin, now: Inputs) -> Array:

@@ -69,14 +69,15 @@ class Falls(Saved):
         self._lasted_s = np.where(falls, self._lasted_s + turned_s, 0.0)
         self._passed_s = np.where(known, 0.0, self._passed_s)
         is_off = expected < STANDS * self._fans.top_rad_s
-        self._has_turned = ~is_off & (self._has_turned | (known & (share > FALLS)))
+        turns = known & ~is_off & (share > FALLS)
+        self._has_turned = (self._has_turned | turns) & ~(is_off & ~self._has_stood)  # its command ended that
         self._has_stood = falls & (self._has_stood | (known & (share < STANDS)))
         self.stands = np.where(known, share < STANDS, self.stands)
         self.is_falling = np.where(known, share < FALLING, self.is_falling)
 
     def rest(self, gap_s: float) -> None:
-        """Let a gap pass: a fall within it was not seen."""
-        self._has_turned &= gap_s <= self._fans.held_s
+        """Let a gap pass: of a fall that may have begun in a long one too little is seen."""
+        self._has_turned &= self._has_stood | (gap_s <= np.maximum(self._fans.held_s, 0.5 * self._fans.coasts_s))
 
     def of(self, fan: int) -> Fall | None:
         """The fall of a fan that falls or stands; None if it was not seen."""

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from fantwin.schemas.messages import Array
-from fantwin.schemas.tacho import Tacho
 from fantwin.scoring.model.bins import Bin
 from fantwin.scoring.model.faults import DRAG, SCALE
 from tests.support.made_bins import MadeFans, plays, with_balance, with_reading
@@ -120,16 +119,3 @@ def test_a_gap_ends_no_alarm_and_what_is_healthy_after_it_ends_it_once(gap_s: fl
     made.sizes[:] = 0.0
     cleared = plays(made, decision, 20.0)
     assert sorted((fan, is_raised) for _, fan, is_raised in cleared) == [(fan, False) for fan in range(FANS)]
-
-
-def test_where_the_twin_is_uncertain_near_the_lowest_command_a_command_that_hardly_moves_tells_nothing_new() -> None:
-    """A thermostat does so: a touch that takes a tenth of a slow fan is not taken up as an error of the twin."""
-    tacho = Tacho(kind="count", pulses=2, window_s=0.5)
-    lowest = replace(twin_of(FANS, tachos=(tacho,)).fans, lowest_command=np.full(FANS, 57.0), commands=300.0)
-    made = MadeFans(
-        lowest, 0.5, lambda time_s: 60.0 + 2.0 * np.sin(time_s) if time_s > 20.0 else 300.0, seed=4, own=0.3
-    )
-    decision = made.decision(declared_s=86400.0)
-    assert plays(made, decision, 80.0) == []
-    made.fault_from_s, made.sizes[:, SCALE] = 80.0, -0.12
-    assert len(plays(made, decision, 15.0)) == FANS

@@ -28,12 +28,13 @@ def test_on_a_plateau_a_twin_may_be_wrong_as_at_its_end_and_no_move_there_tells_
     end, below, far_below, beyond = inputs_of(LOWEST, 0.9 * LOWEST, 0.3 * LOWEST, 2.0 * LOWEST)
     assert end.of_lowest_rad_s > 0.0
     assert below.of_lowest_rad_s == far_below.of_lowest_rad_s == end.of_lowest_rad_s
-    assert below.command_moved == far_below.command_moved == 0.0
+    assert below.command_path == far_below.command_path == far_below.command_moved == 0.0
     assert beyond.of_lowest_rad_s < 0.01 * end.of_lowest_rad_s
-    assert beyond.command_moved == pytest.approx(0.5, abs=0.01)
+    assert beyond.command_path == pytest.approx(0.5)
 
 
-def test_a_command_that_goes_to_and_fro_has_not_moved() -> None:
+def test_a_command_that_goes_to_and_fro_has_a_path_and_has_not_moved() -> None:
     first, _, *later = inputs_of(50.0, *(50.0 + 0.3 * (-1.0) ** number for number in range(20)))
     assert first.command_moved > 0.0
+    assert sum(float(each.command_path[0]) for each in later) > 0.1
     assert sum(float(each.command_moved[0]) for each in later) == 0.0

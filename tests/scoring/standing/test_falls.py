@@ -42,8 +42,9 @@ def test_a_fan_that_comes_to_rest_stands_and_has_run_on_for_as_long_as_its_readi
         falls.take(now)
         assert falls.stands[0] == (speed < 0.08 * TWIN_SPEED)
         assert falls.is_falling[0] == (speed < 0.6 * TWIN_SPEED)
+    falls.rest(30.0)
     fall = falls.of(0)
-    assert fall is not None
+    assert fall is not None, "also after a gap, since it has stood before"
     assert least_s <= fall.lasted_s <= most_s
     assert fall.rest_s == pytest.approx(max(fall.lasted_s - 0.85 * BIN_S, 0.0), abs=0.1 * BIN_S), "but for one reading"
     assert fall.coasts_s == pytest.approx(COASTS_S)
