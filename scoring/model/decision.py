@@ -199,8 +199,9 @@ class Decision(Saved):
             **within("missing", self.missing.arrays()),
             **within("wrong", self.wrong.arrays()),
             **within("evidence", self._evidence.kept(kept)),
-            **within("alarms", self.alarms.kept()),
         }
+        if len(self.alarms.fans):
+            arrays |= within("alarms", self.alarms.kept())
         return {"t_ns": self.operation.t_ns}, arrays
 
     def restore(self, stored: Mapping[str, Array], t_ns: int = 0) -> None:
@@ -216,7 +217,9 @@ class Decision(Saved):
         self.wrong.restore(part("wrong", stored))
         self._evidence.restore_kept(part("evidence", stored))
         self.operation.t_ns = t_ns
-        self.alarms.restore(part("alarms", stored))
+        self.alarms.clear()
+        if of_alarms := part("alarms", stored):
+            self.alarms.restore(of_alarms)
 
     def _rest(self, bins: int) -> None:
         """Let a gap pass."""
