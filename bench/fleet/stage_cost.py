@@ -1,9 +1,9 @@
 """What a fan-sample costs in each stage, and the memory of a fan in the scorer.
 
 Rough fans at 100 Hz under random stairs, healthy unless `--in-alarm` says otherwise, watched by the calibrated twin of
-one: trays of 8, of 64, and 20 trays of 500. Messages are made beforehand and taken by the cores one after the
-other, in this process: time of the processor for the cores of the stages and for the codec. Memory is by how much this
-process grows once there are scorers. Bus, recorder and viewer are not in it.
+one: trays of 8, of 64, and 20 trays of 500. Messages are made beforehand and taken by the cores one after the other,
+in this process: time of the processor for the cores of the stages and for the codec. Memory is by how much this process
+grows once there are scorers. Bus, recorder and viewer are not in it.
 
     python -m bench.fleet.stage_cost
 """
@@ -72,7 +72,8 @@ class Cost:
 def main(
     seconds: Annotated[float, typer.Option(help="Of samples, for each row.")] = 30.0,
     fans_of_tray: Annotated[
-        list[int] | None, typer.Option(help="8, 64 or 500, which makes 10,000 fans; repeatable. Default: all three.")
+        list[int] | None,
+        typer.Option(help="One tray of so many, but 16 of 8, 4 of 64 and 20 of 500; repeatable. Default: these three."),
     ] = None,
     in_alarm: Annotated[float, typer.Option(help="Share of the fans that lose speed, and so have an alarm.")] = 0.0,
     json_output: JsonOption = False,
@@ -84,7 +85,7 @@ def main(
         twin = calibrated_twin(Path(folder))
         for fans in fans_of_tray or TRAYS:
             for block_s in BLOCKS_S:
-                hall = Hall(fans * TRAYS[fans], fans, block_s)
+                hall = Hall(fans * TRAYS.get(fans, 1), fans, block_s)
                 progress(f"{hall.trays} trays of {fans} fans, messages of {block_s:g} s")
                 rows.append(_row(hall, block_s, cost_of(hall, seconds, twin, in_alarm), seconds))
     show({"us of the processor for each fan-sample": rows}, ["bytes: of all four messages"], as_json=json_output)

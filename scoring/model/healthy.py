@@ -110,7 +110,7 @@ class HealthyFans(Saved):
         self.noise[:, AGE] = priors.ageing_per_sqrt_h**2 * bin_s / 3600.0
         self.noise[:, WANDER] = priors.wander**2 * (1.0 - self.kept[:, WANDER - AIR] ** 2)
         self.noise[:, AIR] = priors.air**2 * (1.0 - self.kept[:, 0] ** 2)
-        self._missed = np.square(priors.count * fans.pulse_rad_s) / 12.0
+        self._missed = _missed(fans, priors)
         self._adjoins = fans.adjoins & (fans.held_s > 0.75 * bin_s)
         """(fans,) true where each count begins where the one before ended, and no bin contains two"""
         self._of_balance = np.zeros(count)
@@ -266,6 +266,11 @@ class HealthyFans(Saved):
         self.covariance -= halves @ np.multiply(halves.swapaxes(1, 2), BOTH_BUT_NOT, order="C")
 
 
+def _missed(fans: Fans, p: Priors) -> Array:
+    """Variance of the part of a pulse that a count misses, (fans,)."""
+    return np.asarray(np.square(p.count * fans.pulse_rad_s) / 12.0)
+
+
 def _prior(fans: Fans, p: Priors, period_s: float) -> Array:
     top = fans.top_rad_s
     covariance = np.zeros((len(top), STATES, STATES))
@@ -279,6 +284,6 @@ def _prior(fans: Fans, p: Priors, period_s: float) -> Array:
         covariance[:, state, state] = std**2
     phase_s = (fans.held_s + period_s) / math.sqrt(6.0)  # of window and sample: two phases, then and now
     covariance[:, LATE, LATE] = np.square(phase_s)
-    covariance[:, COUNT, COUNT] = np.square(p.count * fans.pulse_rad_s) / 12.0
+    covariance[:, COUNT, COUNT] = _missed(fans, p)
     covariance[:, LOCAL, LOCAL] = np.square(p.local_rad_s / (0.5 * top))
     return covariance

@@ -71,7 +71,7 @@ class FansInAlarm:
         }
         own._varies = np.zeros((2, 2, 1))
         own._sums = evidence.sums.of(own.fans, places[np.newaxis])
-        own._model, own._hypotheses = self._of_tray.of(own.fans), self._of_all.of(own.fans)
+        own._hypotheses = self._of_all.of(own.fans)
         own._weigh()
         self._join(own)
 

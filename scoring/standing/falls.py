@@ -14,7 +14,7 @@ CONSTANT = 0.02
 """relative difference below which two readings above FALLING show a fan that turns slowly, not one that falls"""
 FALLING = 0.6
 """share of the expected speed: a fan below it may come to rest"""
-SLOWEST_RAD_S = 1.0
+LEAST_EXPECTED_RAD_S = 1.0
 """lowest expected speed of a fan that turns"""
 STEADY = 0.1
 """share of a reading within which a fan stays that falls no more, for longer than a whole coast"""
@@ -56,7 +56,7 @@ class Falls(Saved):
         known = now.is_new & np.isfinite(now.newest_rad_s)
         self._passed_s = self._passed_s + self._bin_s
         expected = now.speed_rad_s - np.where(now.is_balance, now.deviation_rad_s, 0.0)
-        share = np.abs(now.newest_rad_s) / np.maximum(expected, SLOWEST_RAD_S)
+        share = np.abs(now.newest_rad_s) / np.maximum(expected, LEAST_EXPECTED_RAD_S)
         turned_s = np.where(known & ~self._has_stood, share * self._passed_s, 0.0)
         self._is_first = (self._is_first & ~now.changes) | (known & (self._lasted_s == 0.0))
         is_constant = (share > FALLING) & (np.abs(share - self._share) < CONSTANT * share)
@@ -70,7 +70,7 @@ class Falls(Saved):
         self._rest_s = np.where(falls, self._rest_s + np.where(self._is_first, 0.0, turned_s), 0.0)
         self._lasted_s = np.where(falls, self._lasted_s + turned_s, 0.0)
         self._passed_s = np.where(known, 0.0, self._passed_s)
-        is_off = expected < SLOWEST_RAD_S
+        is_off = expected < LEAST_EXPECTED_RAD_S
         turns = known & ~is_off & (share > FALLS)
         self._has_turned = (self._has_turned | turns) & ~(is_off & ~self._has_stood)  # its command ended that
         self._has_stood = falls & (self._has_stood | (known & (share < STANDS)))

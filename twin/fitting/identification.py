@@ -208,8 +208,8 @@ def _why_not(pieces: Sequence[Run], fan: int) -> str:
     if alike[ahead] > max(LEAST_ALIKE, TIMES_AS_ALIKE * alike[0]):
         seconds = ahead * float(np.median([piece.median_period_s for piece in pieces]))
         return (
-            f"the speed changes about {seconds:.3g} s before the command does; are the times of its rows the "
-            "beginnings of the time over which pulses are counted? Give them the time of its end"
+            f"the speed changes about {seconds:.3g} s before the command does; does each row carry the time at which "
+            "its count of pulses begins? Give it the time at which the count ends"
         )
     return "the speed does not follow the command; check which columns are command and speed"
 
