@@ -303,7 +303,7 @@ def test_a_stage_that_may_drop_discards_its_oldest_items_and_counts_them(config,
     class Slow(Passer):
         def step(self, item: Any) -> Sequence[Message]:
             release.wait(600)
-            taken.append(int(item.host_receive_t_ns[0]))
+            taken.extend(item.host_receive_t_ns.tolist())  # what is left beside a gap may come joined
             if taken[-1] == count - 1:
                 newest.set()
             return []
