@@ -10,14 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 
 import numpy as np
-from scipy.linalg import get_lapack_funcs
 
 from fantwin.schemas.messages import Array
 from fantwin.scoring.column_state import ColumnState
-
-(_solve_bands,) = get_lapack_funcs(("tbtrs",), dtype=np.float64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,28 +157,27 @@ class TorqueBalance(ColumnState):
 
 
 FEW_ROWS, ROWS_OF_FAN = 8, 2
-"""filtered row by row: a call of a library for all fans, or for one of them, costs as much as these"""
+"""filtered row by row, all fans at once: up to so many rows it costs no more than to filter fan by fan"""
 SETTLED = 0.6
 """weight of the samples in the filter from which on the balance is valid: one time constant"""
 
 
 def by_rows(rows: int, fans: int) -> bool:
-    """Return whether to filter row by row, all fans at once, where each fan needs a call of its own otherwise."""
+    """Return whether to filter row by row, all fans at once, instead of fan by fan."""
     return rows <= max(FEW_ROWS, ROWS_OF_FAN * fans)
 
 
 def filter_rows(keep: float, rows: Array, state: Array) -> Array:
     """Filter along the first axis, y[k] = (1 - keep) x[k] + keep y[k-1], by samples, so that cuts change nothing.
 
-    Solved as a lower bidiagonal system of equations, because `scipy.signal` takes two seconds to import.
+    In plain numbers, because `scipy.signal` takes two seconds to import.
 
     rows: (n, m). state: (1, m), keep times the y before the first. Returns y (n, m).
     """
     right = (1.0 - keep) * rows
     right[0] += state[0]
-    bands = np.array([[1.0], [-keep]]).repeat(len(rows), axis=1)
-    solved: Array = _solve_bands(bands, np.asfortranarray(right), uplo="L", overwrite_b=1)[0]
-    return solved
+    columns = (accumulate(column, lambda y, x: x + keep * y) for column in right.T.tolist())
+    return np.array([list(column) for column in columns]).T
 
 
 def unbroken_rows(flags: Array) -> Sequence[slice]:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from scipy.special import gammaincinv
-
 COVERAGE = 0.95
 HOURS_PER_DAY = 24.0
 
 
 def poisson_interval(count: float) -> tuple[float, float]:
     """95 % interval of the expected count, given the count."""
+    from scipy.special import gammaincinv  # noqa: PLC0415  scipy takes long to import, and stages do without
+
     outside = (1.0 - COVERAGE) / 2
     low = float(gammaincinv(count, outside)) if count > 0 else 0.0
     return low, float(gammaincinv(count + 1, 1.0 - outside))

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from fantwin.schemas.twin_card import CardError, TwinCard
-
-HOURS_PER_DAY = 24.0
+from fantwin.scoring.calibration.alarm_rate import HOURS_PER_DAY, daily_interval
+from fantwin.scoring.calibration.calibration import Calibration
 
 
 @dataclass(frozen=True)
@@ -38,8 +38,6 @@ class ObservedRate:
 
     def interval_95(self, alarms: int) -> tuple[float, float]:
         """The exact 95 % interval of the rate of independent alarms (Garwood), per fan and day."""
-        from fantwin.scoring.calibration.alarm_rate import daily_interval  # noqa: PLC0415  scipy takes long to import
-
         return daily_interval(alarms, self.fan_hours)
 
     @property
@@ -86,8 +84,6 @@ def _number(value: float) -> str:
 
 def declared_per_day(card_json: str) -> float | None:
     """The rate that a twin's card declares, false alarms per fan and day; None: it declares none, or cannot be read."""
-    from fantwin.scoring.calibration.calibration import Calibration  # noqa: PLC0415  scipy, again
-
     try:
         calibration = TwinCard.from_json(card_json).calibration
         return Calibration.model_validate(calibration).false_alarms_per_day if calibration else None

@@ -14,7 +14,6 @@ import math
 from collections.abc import Mapping
 
 import numpy as np
-from scipy.special import expit
 
 from fantwin.schemas.messages import Array
 from fantwin.scoring.diagnosis.ranked_causes import PossibleCause
@@ -232,4 +231,4 @@ def _unsteady(varies: Array, terms: Array) -> Array:
     squares, number = varies
     logs = [0.5 * (squares * r / (1.0 + r) - number * math.log1p(r)) for r in times]
     log_odds = np.logaddexp.reduce(logs) + math.log(prior / len(times))
-    return np.asarray(expit(log_odds - np.logaddexp.reduce(terms, axis=(1, 2))))
+    return np.exp(-np.logaddexp(0.0, np.logaddexp.reduce(terms, axis=(1, 2)) - log_odds))

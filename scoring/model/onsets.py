@@ -24,7 +24,6 @@ from copy import copy
 from itertools import combinations
 
 import numpy as np
-from scipy.special import erfc
 
 from fantwin.schemas.messages import Array
 from fantwin.scoring.model.faults import OF_TACHO, STUCK, Fault
@@ -38,7 +37,9 @@ BATCH = 8
 FARTHEST, STEPS = 5.0, 256
 """largest argument of the table of log erfc, and its steps within one; erfc gives the chance that a size has the sign
 of its fault"""
-LOG_ERFC = np.log(erfc(np.arange(-FARTHEST, FARTHEST + 2.0 / STEPS, 1.0 / STEPS))).astype(np.float32)
+LOG_ERFC = np.log([math.erfc(at) for at in np.arange(-FARTHEST, FARTHEST + 2.0 / STEPS, 1.0 / STEPS)]).astype(
+    np.float32
+)
 LARGEST_LOG = 80.0
 """largest logarithm that is exponentiated: single precision overflows at 88"""
 

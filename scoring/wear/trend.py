@@ -25,7 +25,6 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.special import stdtrit
 
 from fantwin.schemas.messages import Array
 from fantwin.schemas.units import NS_PER_S
@@ -132,6 +131,7 @@ class WearSeries:
         n = len(known)
         if n < MIN_POINTS:
             return None
+        from scipy.special import stdtrit  # noqa: PLC0415
         from scipy.stats import theilslopes  # noqa: PLC0415  what only shows wear does without this large import
 
         t_ns, value = np.array([point.t_ns for point in known]), np.array([point.value for point in known])

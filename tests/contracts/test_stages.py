@@ -7,6 +7,8 @@ reports in one line, and makes the same of the same messages.
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -64,6 +66,15 @@ def test_the_row_of_a_stage_says_what_its_declaration_says(row: StageRow) -> Non
     assert (stage.name, row.topics(), stage.may_drop) == (row.name, (stage.reads, stage.writes), row.may_drop)
     assert stage.about and issubclass(stage.config, StageConfig)
     assert set(stage.undecoded) <= set(stage.reads)
+
+
+def test_no_stage_imports_what_it_can_do_without_until_it_needs_it() -> None:
+    load = "import sys; from fantwin.pipeline.config.registry import STAGES; [row.load() for row in STAGES.values()]"
+    loaded = subprocess.run(
+        [sys.executable, "-c", f"{load}; print(*sys.modules)"], check=True, capture_output=True, text=True
+    ).stdout.split()
+    assert {"numpy", "fantwin.stages.scorer", "fantwin.stages.twin_integrator"} <= set(loaded)
+    assert {"scipy", "torch", "onnxruntime", "rerun", "dask"}.isdisjoint(loaded)
 
 
 def sessions(*kinds: type[Message]) -> st.SearchStrategy[list[Message]]:
