@@ -25,8 +25,8 @@ def build_and_join(
     stop: threading.Event,
     is_replayed: Callable[[], bool],
 ) -> tuple[Bus, dict[str, BuiltStage]]:
-    """Build a process of a stage and join the bus: afterwards, so that what cannot be built says so even where the bus
-    cannot be joined; earlier if a core continues from what others keep. If it fails, nothing is left. session_id: of
+    """Build a process of a stage, then join the bus: a stage that cannot be built says so even where there is no bus.
+    Only a core that continues from what others keep joins it earlier. If this fails, nothing is left. session_id: of
     the session on the bus. is_replayed: see Context.
 
     Raises:

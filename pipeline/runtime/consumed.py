@@ -1,5 +1,5 @@
-"""What a session of a stage consumed, as few messages as say it: so that its outputs need not be recorded to be made
-again.
+"""Reports of what a session of a stage consumed, in as few messages as possible. With them its outputs can be made
+again without having been recorded.
 
 Each output carries its input position. From one output to the next it usually moves on without a break, and then the
 first and the last say all. A `Consumed` is due

@@ -1,5 +1,5 @@
-"""The last message about each tray that a stage keeps for others: what a stage continues from where its own file is
-missing or old.
+"""Snapshots that a stage keeps for others, the last one of each tray. A stage whose own file is missing or old
+continues from them.
 
 The recorder keeps the last snapshot of each of its trays. So a scorer that is killed with its host goes on elsewhere.
 """

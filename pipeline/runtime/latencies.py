@@ -20,7 +20,7 @@ _MAX_IN_WINDOW = 2000
 
 
 class Latencies:
-    """Of the outputs of one stage."""
+    """Latencies of the outputs of one stage: the time, s, from the newest sample of an output until it is sent."""
 
     def __init__(self) -> None:
         self._newest_s: deque[tuple[float, float]] = deque(maxlen=_MAX_IN_WINDOW)

@@ -45,7 +45,7 @@ from fantwin.schemas.streams import stage_losses
 from fantwin.schemas.topics import BY_NAME, alive_key, health_key, tray_key
 
 TICK_S, EARLY_S = 0.06, 0.02
-"""A tick comes so soon after the last one at the latest; after a message, so much earlier: one waking does for both."""
+"""longest time between ticks; a tick due within EARLY_S comes at once if nothing waits: one waking does for both"""
 WATCH_S = 0.25
 """how often it is seen whether `stop` has been set while the loop hangs; the loop itself sees it at its next tick"""
 HEALTH_PERIOD_S = 1.0
@@ -323,8 +323,8 @@ class Runner:
         return reported[0] if reported else self._build_health(StageStatus.DEGRADED, with_counts=False, is_last=True)
 
     def _handle_what_waits(self) -> int:
-        """Take what else is in the inbox now, so that messages of a tray are joined. Not so much that what the inbox
-        holds back would be in memory here. Returns how many items that were."""
+        """Take what else is in the inbox now, so that messages of a tray are joined; returns the number of items. It is
+        bounded, so that what the inbox holds back does not pile up here."""
         most = min(self._inbox.waiting(), INBOX_SIZE - len(self._due))
         for taken in range(most):
             if self._due.bytes >= MOST_DUE_BYTES or (item := self._inbox.get(0)) is None:

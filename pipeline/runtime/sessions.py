@@ -189,7 +189,7 @@ class Sessions:
         return self._owners[stage].named(instance) if stage in self._owners else None
 
     def is_replaced(self, producer: str) -> bool:
-        """Whether this producer is a session of whose stage and instance another one started later."""
+        """Whether another session of the same stage and instance has started later than this producer's."""
         session = self._by_producer.get(producer)
         return session is not None and self.named(session.stage, session.instance) is not session
 

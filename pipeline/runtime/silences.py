@@ -75,7 +75,7 @@ class Silences:
         self._ended: dict[str, _Ended] = {}
         """by tray whose producer has ended"""
         self._unordered_s: dict[str, float] = {}
-        """by tray: when a producer first ended not in order since one last published, monotonic time"""
+        """by tray: monotonic time, s, of the first end not in order since a producer last published"""
         self._heard: dict[str, dict[str, _Heard]] = {}
         """by tray and producer"""
         self._shown: set[str] = set()

@@ -66,12 +66,12 @@ class Core(Protocol):
         return ()
 
     def tick(self, now_ns: int) -> Sequence[Message]:
-        """Called about every 50 ms. `now_ns` is the host's time, or the replay's while one feeds the stage."""
+        """Let time pass; called about every 50 ms. now_ns: time of the host, or of the replay that feeds the stage."""
         return ()
 
     def confirm_input(self, *, is_complete: bool) -> None:
-        """Called before each `tick`: whether the producer of the main input has shown since the last one that all that
-        it has sent has been processed here. If not, the link may be cut, and what is missing may still come."""
+        """Note, before each `tick`, whether the main input is complete: its producer has shown since the last tick that
+        all that it has sent has been processed here. If not, the link may be cut, and messages may still come."""
 
     def close(self) -> Sequence[Message]:
         """Called once after the last item: return what is still held, release adapters."""

@@ -30,7 +30,7 @@ class _Due:
 
 
 class Steps:
-    """Of all cores of a process."""
+    """Runs the steps of all cores of a process, and publishes what they make."""
 
     def __init__(
         self,

@@ -35,7 +35,7 @@ class HealthyTwin:
     advice: Advice = Advice()
     standstill: Standstill | None = None
     unseen_error: UnseenError | None = None
-    """where healthy runs do not show it; None: its card says nothing about it"""
+    """error of the twin where it was not trained; None: its card says nothing about it"""
     has_supply: bool = False
     """whether it needs the supply voltage, and so allows for it"""
     priors: Priors = Priors()

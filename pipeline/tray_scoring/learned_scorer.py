@@ -125,11 +125,11 @@ class LearnedTwinScorer(Core):
             self._store.unlock()
 
     def counters(self) -> Mapping[str, int]:
-        """Of all twins so far."""
+        """Sums over the cores of all twins so far."""
         return self._counts + Counter(self._core.counters() if self._core else {})
 
     def notes(self) -> Sequence[str]:
-        """Those of the core; before the first twin, why nothing is judged."""
+        """Notes of the core; before the first twin, the reasons why nothing is judged."""
         return self._core.notes() if self._core else self._judged_share.notes
 
     def problem(self) -> str:

@@ -19,11 +19,13 @@ class ScorerConfig(StageConfig):
         default=None,
         gt=0,
         le=8640,
-        description="declared rate of false alarms of a fan; default: that of the twin's calibration, else 0.03, "
-        "about one a month",
+        description="declared rate of false alarms, per fan and day; default: that of the twin's calibration, else "
+        "0.03, about one a month",
     )
     alarm_share: float = Field(
-        default=0.1, gt=0, description="share of the speed that a fault takes, from which a warning is an alarm"
+        default=0.1,
+        gt=0,
+        description="share of the speed: a fault that takes at least this much is an alarm, a smaller one a warning",
     )
     alarms_need: tuple[Literal["confirm", "reset"], ...] = Field(
         default=(),
@@ -33,6 +35,6 @@ class ScorerConfig(StageConfig):
     asks_for_snapshots: bool | None = Field(
         default=None,
         description="whether it continues from the snapshot that a recorder keeps, where that is newer than its own "
-        "file, as on another host; with false and without the file, everything starts from the beginning; default: if "
-        "it is one of several shards",
+        "file, as on another host; with false and without the file, everything starts from the beginning; default: "
+        "true for one of several shards, else false",
     )

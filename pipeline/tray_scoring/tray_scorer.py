@@ -40,7 +40,7 @@ WEAR_EVERY_S = 600.0
 """between two points of the wear of a fan, which takes days to months"""
 NO_READING = KINDS.index(Standing.NO_READING)
 NAMED_AFTER_S, FALLING_S = 3.0, 4.0
-"""an onset is so old before a cause is named; so long after an alarm a fan that has lost much speed may come to rest"""
+"""age of an onset from which a cause is named; time after an alarm in which a fan that lost much speed may stop"""
 
 
 class TrayScorer:

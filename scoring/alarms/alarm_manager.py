@@ -277,7 +277,8 @@ def _is_other(statistic: Statistic, before: Alarm) -> bool:
 
 
 def _is_news(causes: tuple[Diagnosis, ...], than: tuple[Diagnosis, ...]) -> bool:
-    """Return whether causes are worth a message. What a fan does after it stood says less of why it came to rest."""
+    """Return whether causes are worth a message. After causes of standing still, those of another kind are not: they
+    say less about why the fan came to rest."""
     stood = bool(than) and is_of_standstill(than[0])
     return bool(causes) and not (stood and not is_of_standstill(causes[0])) and says_more(causes, than)
 

@@ -331,8 +331,8 @@ class Decision(Saved):
         return found
 
     def _log_odds(self) -> Array:
-        """(fans,) log of how much likelier the fault of an alarm is, as large as it was at most and as it shows at this
-        speed, than a healthy fan."""
+        """Log odds, (fans,), of the fault of an alarm against a healthy fan: the fault at its largest, as it shows at
+        the present speed."""
         expected = self._peak * self._shows
         return expected * (self.model.mean[:, FAULT] - 0.5 * expected) / np.maximum(self._own_variance(), 1e-12)
 

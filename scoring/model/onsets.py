@@ -164,8 +164,8 @@ class Sums:
 
 
 def log_erfc(values: Array) -> Array:
-    """Logarithms of the complementary error function, to 1e-5 up to FARTHEST and about beyond it, twice as fast as
-    SciPy's: most of the time went there."""
+    """Logarithms of the complementary error function, to 1e-5 up to FARTHEST and roughly beyond it. Twice as fast as
+    SciPy's, in which most of the time would be spent."""
     place = (np.fmax(np.fmin(values, FARTHEST), -FARTHEST) + FARTHEST) * STEPS  # what is no number becomes one
     before = place.astype(np.int32)
     place -= before

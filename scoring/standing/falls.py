@@ -78,7 +78,7 @@ class Falls(Saved):
         self.is_falling = np.where(known, share < FALLING, self.is_falling)
 
     def rest(self, gap_s: float) -> None:
-        """Let a gap pass: of a fall that may have begun in a long one too little is seen."""
+        """Let a gap of gap_s pass. A fall that may have begun within a long gap counts as not seen."""
         self._has_turned &= self._has_stood | (gap_s <= np.maximum(self._fans.held_s, 0.5 * self._fans.coasts_s))
 
     def of(self, fan: int) -> Fall | None:
