@@ -10,7 +10,7 @@ import numpy as np
 from fantwin.schemas.channels import measured_columns
 from fantwin.schemas.enums import FanState, InvalidReason, Statistic
 from fantwin.schemas.messages import Array, Prediction, Score
-from fantwin.scoring.samples import BALANCE_COUNTS, among
+from fantwin.scoring.samples import BALANCE_COUNTS, among, arrived
 
 BAND_SIGMAS = 2.0
 NONE, WARMING_UP = np.uint8(InvalidReason.NONE), np.uint8(InvalidReason.WARMING_UP)
@@ -55,12 +55,14 @@ class ScoreColumns:
             getattr(self, name)[rows] = column
 
 
-def score_of(item: Prediction, of: ScoreColumns, unseen_rad_s: Array | float = 0.0) -> Score:
-    """The message of a block. of: its rows. unseen_rad_s: (n, fans) standard deviation of the twin's error where it was
-    not trained."""
-    has_balance = among(item.invalid_reason, *BALANCE_COUNTS) & np.isfinite(item.torque_balance_command)
+def score_of(
+    item: Prediction, of: ScoreColumns, reads_balance: Array | bool = True, unseen_rad_s: Array | float = 0.0
+) -> Score:
+    """The message of a block. of: its rows. reads_balance: (fans,) as in `Fans`. unseen_rad_s: (n, fans) standard
+    deviation of the twin's error where it was not trained."""
+    has_balance = among(item.invalid_reason, *BALANCE_COUNTS) & np.isfinite(item.torque_balance_command) & reads_balance
     has_residual = item.valid & np.isfinite(item.measured_speed_rad_s) & np.isfinite(item.predicted_speed_rad_s)
-    is_standing = of.is_active & (of.statistic == int(Statistic.STANDSTILL))
+    is_standing = of.is_active & (of.statistic == int(Statistic.STANDSTILL)) & arrived(item.invalid_reason)
     valid = has_residual | has_balance | is_standing
     band = BAND_SIGMAS * np.hypot(item.sigma_rad_s, unseen_rad_s)
     half_range = item.reading_range_rad_s if len(item.reading_range_rad_s) else np.zeros(valid.shape)

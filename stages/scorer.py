@@ -48,13 +48,11 @@ REST_NS_PER_FAN = 5_000_000  # between snapshots with alarms of a larger tray: e
 NOT_JUDGED_S = 10.0  # health names a fan that has had no score for this long: beyond the start of a free run
 SHOWN_NS = 60 * NS_PER_S  # how long health says that a snapshot was not used
 NEW_START = "what was learned of the fans, alarms and wear start from the beginning"
+WEAR_CONTINUES = "what was learned of the fans and alarms start from the beginning, wear continues"
 OPERATORS_KEPT = "shelved, suppressed and out of service are kept"
 ANOTHER_TWIN = f"the snapshot is of another twin: {NEW_START}; {OPERATORS_KEPT}"
-EARLIER_TWIN = (
-    "the snapshot is of the previous twin: what was learned of the fans and alarms start from the beginning, wear "
-    f"continues; {OPERATORS_KEPT}"
-)
-READ_IN_PART = f"the snapshot can be read in part only: {NEW_START}; {OPERATORS_KEPT}"
+EARLIER_TWIN = f"the snapshot is of the previous twin: {WEAR_CONTINUES}; {OPERATORS_KEPT}"
+READ_IN_PART = "the snapshot can be read in part only: {}; " + OPERATORS_KEPT
 NOT_READ = f"the snapshot cannot be read: {NEW_START}, and nothing is shelved, suppressed or out of service"
 NOT_CALIBRATED = (
     "the twin is not calibrated: its alarms rest on what fans have in common, and their rate is not checked; "
@@ -106,7 +104,7 @@ class ScorerCore(Core):
         stored = snapshot_store.load() if snapshot_store and not continues else None
         self._at_start = self.restore(stored) if stored else self._continued(continues) if continues else []
         """messages to be emitted first"""
-        is_ahead = started_t_ns is not None and self._samples.last_t_ns > started_t_ns + SET_BACK_NS
+        is_ahead = started_t_ns is not None and not continues and self._samples.last_t_ns > started_t_ns + SET_BACK_NS
         self._may_be_set_back = is_ahead and self._is_restored
         """the snapshot is of later times than now: the first prediction shows whether all times have gone back"""
 
@@ -145,10 +143,8 @@ class ScorerCore(Core):
             except RESTORE_ERRORS:
                 self._start_new()
                 self.tray.alarms.restore(state["alarms"])
-                with suppress(*RESTORE_ERRORS):
-                    self.tray.wear.restore(state["wear"])
                 self._counts["snapshots_not_understood"] += 1
-                self._not_restored = READ_IN_PART
+                self._not_restored = READ_IN_PART.format(WEAR_CONTINUES if self._restore_wear(state) else NEW_START)
         self._samples.last_t_ns = self._snapshot_t_ns = snapshot.t_ns
         self._input_producer, self._is_restored = input_producer, True
         if self._not_restored:
@@ -156,7 +152,7 @@ class ScorerCore(Core):
         return [replace(snapshot, restored=True), *self.tray.alarms.republish()]
 
     def _restore_wear(self, state: Mapping[str, Any]) -> bool:
-        """Continue the wear of the twin before; False if it cannot be read."""
+        """Continue the wear, with a model that knows nothing of the fans yet; False if it cannot be read."""
         try:
             self.tray.wear.restore_of_earlier_twin(state["wear"])
         except RESTORE_ERRORS:

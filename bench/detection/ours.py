@@ -62,7 +62,7 @@ class HealthyBins:
             twin = load_tray_twin(self.twin, block.fans)
             fans = modelled_fans(twin)
             bin_ns = bin_ns_of(block.period_ns, float(fans.held_s.min()))
-            self._bins[run] = Bins(bin_ns, fans.top_rad_s, twin.unseen_error)
+            self._bins[run] = Bins(bin_ns, fans.top_rad_s, fans.reads_balance, twin.unseen_error)
             tray = RecordedTray(Path(run), run, block.fans, "rad/s")
             self._runs[run] = TrayRun(tray, bin_ns, block.period_ns, ())
         with self._file(run).open("ab") as file:

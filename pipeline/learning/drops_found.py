@@ -62,7 +62,7 @@ def smallest_drops(twin: TrayTwin, calibration: Calibration) -> Array:
     bin_ns = bin_ns_of(period_ns, float(fans.held_s.min()))
     limit = FreeLimit(calibration.priors, 86400.0 / calibration.false_alarms_per_day)
     decision = limit.decision(fans, bin_ns, period_ns)
-    bins = Bins(bin_ns, fans.top_rad_s, None)
+    bins = Bins(bin_ns, fans.top_rad_s, fans.reads_balance, None)
     speed_rad_s, drop = np.repeat(SPEEDS, len(DROPS)) * fans.top_rad_s, np.tile(DROPS, len(SPEEDS))
     scores: list[Array] = []
     for one in bins.take(dropping(twin, fans, speed_rad_s, drop)):

@@ -73,6 +73,8 @@ class LearnedTwinScorer(Core):
         self._counts: Counter[str] = Counter()
         """of the cores before the current one"""
         self._problem = ""
+        self._refused: ModelCard | None = None
+        """the last twin that cannot be used"""
         stored = store.load() if store else None
         if stored:
             self._note_what_was_scored(stored)
@@ -160,7 +162,7 @@ class LearnedTwinScorer(Core):
     def _change_twin(self, name: str) -> list[Message]:
         """Change to the core of a twin, if it has arrived; returns the messages of the change."""
         card = self._cards.get(name)
-        if card is None:
+        if card is None or card is self._refused:
             return []
         try:
             twin = tray_twin(Path(name), card.content, self._tray.fans)
@@ -170,7 +172,7 @@ class LearnedTwinScorer(Core):
                 continues = replace(continues, twin_sha256=twin.sha256)  # what was learned, alarms and wear go on
             core = self._core_of(twin, continues)
         except StageError as error:
-            self._problem = str(error)
+            self._problem, self._refused = str(error), card
             return []
         emitted: list[Message] = [*before]
         if self._core:

@@ -66,6 +66,8 @@ class TrayScorer:
         """(4, fans) lowest and highest speed, lowest and highest command since an alarm was raised"""
         self._command = np.zeros(fans)
         """(fans,) newest command"""
+        self._is_commissioned = np.zeros(fans, np.bool_)
+        """(fans,) true where it has just been commissioned, which ends its alarm, whether there are samples or not"""
         self._now = ScoreColumns.empty(fans)
 
     def _open(self, period_ns: int) -> None:
@@ -73,7 +75,7 @@ class TrayScorer:
         twin, before = self.twin, self._decision if self._period_ns else None
         bin_ns = bin_ns_of(period_ns, float(twin.fans.held_s.min()))
         self._period_ns = period_ns
-        self._bins = Bins(bin_ns, twin.fans.top_rad_s, twin.unseen_error)
+        self._bins = Bins(bin_ns, twin.fans.top_rad_s, twin.fans.reads_balance, twin.unseen_error)
         period_s = period_ns / NS_PER_S
         self._decision = Decision(twin.fans, bin_ns, period_s, twin.declared_s, twin.priors, twin.limit_factor)
         self._falls = Falls(twin.fans, self._decision.bin_s)
@@ -94,7 +96,7 @@ class TrayScorer:
             begin = one.row
             alarms += self._decide(one, item)
         columns.fill(slice(begin, len(item.t_ns)), self._now)
-        return score_of(item, columns, self._bins.unseen_rad_s), alarms
+        return score_of(item, columns, self.twin.fans.reads_balance, self._bins.unseen_rad_s), alarms
 
     def notices(self) -> list[str]:
         """Notes on fans that change slowly, and on tachos that are not sound."""
@@ -109,6 +111,7 @@ class TrayScorer:
         """Forget what was learned of some fans, (fans,) of bool, after the sample at t_ns."""
         if fans.any():
             self._decision.begin_again(fans)
+            self._is_commissioned |= fans
             self.wear.forget(fans, t_ns)
             if self._against:
                 self._against.forget(fans)
@@ -160,11 +163,16 @@ class TrayScorer:
     @property
     def stands_against_command(self) -> Array:
         """See FanFacts."""
-        return self._stands | (self._decision.active & self._falls.stands)
+        return self._stands | (self._decision.active & self._has_stopped)
+
+    @property
+    def _has_stopped(self) -> Array:
+        """Return where a fan stands, (fans,), by readings that may not be wrong."""
+        return self._falls.stands & ~self._decision.wrong.may_be
 
     def _causes_of_deviation(self, fan: int, command: float) -> tuple[Diagnosis, ...]:
         decision, falls = self._decision, self._falls
-        if falls.stands[fan]:
+        if self._has_stopped[fan]:
             return standstill_causes(Standing.CAME_TO_REST, falls.of(fan), command)
         causes = decision.alarms.causes(fan)
         if not causes:  # it is of before a gap
@@ -177,7 +185,7 @@ class TrayScorer:
 
     def _seen_since(self, fan: int, age_s: float) -> SeenSinceOnset:
         slowest, fastest, lowest, highest = self._seen[:, fan].tolist()
-        return SeenSinceOnset(age_s, slowest, fastest, lowest, highest, bool(self._falls.stands[fan]))
+        return SeenSinceOnset(age_s, slowest, fastest, lowest, highest, bool(self._has_stopped[fan]))
 
     def _decide(self, one: Bin, item: Prediction) -> list[Alarm]:
         """Bring all up to date with the end of a bin; returns the messages on alarms."""
@@ -200,7 +208,8 @@ class TrayScorer:
         active = decision.has_alarm | self._stands | is_worn
         idle = among(item.invalid_reason[row], *IDLE)
         is_silent = (decision.missing.is_active | self._stands) & arrived(item.invalid_reason[row])
-        judged = one.judged | idle | is_silent
+        judged = one.judged | idle | is_silent | self._is_commissioned
+        self._is_commissioned[:] = False
         self._see(one, self.alarms.active)
         self._now = self._columns(score, active, is_worn, against.score[row] if against else np.zeros(self.fans))
         is_large = self._stands | (np.abs(decision.fault[0]) >= self._alarm_share)

@@ -70,8 +70,9 @@ class Bin:
     deviation_rad_s: Array
     """their mean distance from it"""
     predicted_rad_s: Array
+    """mean of the free run, or of the readings without one; NaN where neither is known"""
     measured_rad_s: Array
-    """their mean; NaN without a reading"""
+    """mean of the readings; NaN without one"""
     newest_rad_s: Array
     """the newest reading; NaN without one"""
     another: Array
@@ -94,9 +95,9 @@ class Bin:
 class Bins:
     """Collects the samples of one tray."""
 
-    def __init__(self, bin_ns: int, top_rad_s: Array, unseen: UnseenError | None) -> None:
-        """Begin without a sample. top_rad_s: (fans,)."""
-        self._bin_ns, self._top, self._unseen = bin_ns, top_rad_s, unseen
+    def __init__(self, bin_ns: int, top_rad_s: Array, reads_balance: Array, unseen: UnseenError | None) -> None:
+        """Begin without a sample. top_rad_s: (fans,); reads_balance: (fans,) as in `Fans`."""
+        self._bin_ns, self._top, self._reads_balance, self._unseen = bin_ns, top_rad_s, reads_balance, unseen
         self._parts: list[dict[str, Array]] = []
         self._number = 0
         self.unseen_rad_s: Array | float = 0.0
@@ -160,7 +161,7 @@ class Bins:
             "unseen_balance": unseen_balance,
             "command": np.nan_to_num(block.command).clip(-LARGEST_COMMAND, LARGEST_COMMAND),
             "balance": np.where(
-                among(reason, *BALANCE_COUNTS),
+                among(reason, *BALANCE_COUNTS) & self._reads_balance,
                 block.torque_balance_command.clip(-LARGEST_COMMAND, LARGEST_COMMAND),
                 np.nan,
             ),
@@ -187,7 +188,7 @@ class Bins:
         counts = rows["counts"] & ~wrong
         measured, predicted = np.isfinite(rows["measured"]), np.isfinite(rows["predicted"])
         has_balance = np.isfinite(rows["balance"]) & measured & ~wrong
-        speed = mean(rows["measured"], measured)
+        speed = np.where(measured.any(axis=0), mean(rows["measured"], measured), np.nan)
         pair, after, missing = rows["pair"], rows["after_missing"], rows["missing"]
         transitions = (pair & ~after, pair & ~after & missing, pair & after, pair & after & missing)
         return Bin(
@@ -201,7 +202,7 @@ class Bins:
             readings=counts.sum(axis=0),
             deviation_rad_s=mean(deviation, counts),
             predicted_rad_s=np.where(predicted.any(axis=0), mean(rows["predicted"], predicted), speed),
-            measured_rad_s=np.where(measured.any(axis=0), speed, np.nan),
+            measured_rad_s=speed,
             newest_rad_s=newest(rows["measured"], measured),
             another=rows["another"],
             balances=has_balance.sum(axis=0),

@@ -71,6 +71,7 @@ class Decision(Saved):
         "_shape",
         "_is_probable",
         "_shows",
+        "_newest",
     )
 
     def __init__(
@@ -103,6 +104,8 @@ class Decision(Saved):
         where it may be this fault"""
         self._shows = np.ones(count)
         """(fans,) least part of its largest share that a fault takes at the present speed"""
+        self._newest = np.zeros(count, np.int64)
+        """(fans,) bin of the newest reading"""
         self.is_returning = np.zeros(count, np.bool_)
         """(fans,) true where an alarm is active and a healthy fan is OVER_ODDS times as probable"""
         self.in_balance = np.zeros(count, np.bool_)
@@ -133,9 +136,12 @@ class Decision(Saved):
         self.missing.take(one.missing)
         now = self.operation.inputs(one)
         now = replace(now, is_new=now.is_new | (self.wrong.waits & (now.readings > 0)))  # what is far cannot wait
+        for fan in np.flatnonzero((now.readings > 0) & (self.number - self._newest > FORGETS_S / self.bin_s)).tolist():
+            self._forget(fan)  # the bins without a reading were no onsets
         now, pushes = self._weigh(one, now)
         self.now = now
         known = now.readings > 0
+        self._newest = np.where(known, self.number, self._newest)
         self.in_balance = np.where(known, now.is_balance, self.in_balance)
         is_over_limit = np.isfinite(self.log_statistic) & (self.log_statistic > self.log_limit)
         for fan in np.flatnonzero(known & ~self.active & is_over_limit).tolist():
@@ -172,7 +178,8 @@ class Decision(Saved):
         self.model.restore(before.model.arrays())
         self.missing.restore(before.missing.arrays())
         self.log_statistic[:] = -np.inf
-        self._raised[:] = self.onset[:] = 0
+        self._raised[:] = self.onset[:] = self._newest[:] = 0
+        self._is_probable[:, self._hypotheses.stuck_rows] = False
 
     @property
     def fault(self) -> tuple[Array, Array]:
@@ -231,6 +238,7 @@ class Decision(Saved):
             self._evidence.since[:] = self.number
             self.log_statistic[:] = -np.inf
             self.alarms.clear()
+            self._is_probable[:, self._hypotheses.stuck_rows] = False
 
     def _weigh(self, one: Bin, now: Inputs) -> tuple[Inputs, Array]:
         """Update model and evidence with a bin; return the inputs that count, and `forces` of each onset."""

@@ -200,7 +200,7 @@ class Hypotheses:
             self._first[row, fault.columns[0]] = fault.std[0]
         signs = np.array([fault.sign for fault in self.faults if fault.sign])
         self._against = (-math.sqrt(0.5) * signs).astype(np.float32)
-        self._stuck = [row for row, fault in enumerate(self.faults) if STUCK in fault.columns]
+        self.stuck_rows = [row for row, fault in enumerate(self.faults) if STUCK in fault.columns]
         self._means = [(row, fault.mean) for row, fault in enumerate(self.faults) if fault.mean]
 
     def of(self, fans: Array) -> Hypotheses:
@@ -247,7 +247,7 @@ class Hypotheses:
         products -= np.log(pivots, out=pivots)
         products *= 0.5
         found += products
-        for row in self._stuck:
+        for row in self.stuck_rows:
             found[row][has_changed] = -np.inf
         return found
 

@@ -58,6 +58,12 @@ class Fans:
     prefers_balance: Array
     """true if the torque balance is read, and not the speed, where both are known"""
 
+    @property
+    def reads_balance(self) -> Array:
+        """Return where the torque balance can be read, (fans,): a reading that is held steps, and a step is an impulse
+        of the balance."""
+        return np.asarray(self.held_s == 0.0)
+
     def of(self, fans: Array) -> Fans:
         """Select some fans, (n,) by number."""
         return replace(self, **{name: each[fans] for name, each in vars(self).items() if isinstance(each, np.ndarray)})
@@ -134,10 +140,10 @@ class Operation(Saved):
     def inputs(self, one: Bin) -> Inputs:
         """Inputs of a bin; bins come in order of time."""
         fans = self._fans
-        predicted = np.minimum(np.abs(one.predicted_rad_s), FASTEST * fans.top_rad_s)
+        predicted = np.where(np.isfinite(one.predicted_rad_s), np.abs(one.predicted_rad_s), self._speed)
+        predicted = np.minimum(predicted, FASTEST * fans.top_rad_s)
         measured = np.where(np.isfinite(one.measured_rad_s), np.abs(one.measured_rad_s), predicted)
-        is_steady = fans.held_s == 0.0  # a reading that is held steps, and a step is an impulse of the balance
-        is_balance = (one.balances > 0) & is_steady & (fans.prefers_balance | (one.readings == 0))
+        is_balance = (one.balances > 0) & (fans.prefers_balance | (one.readings == 0))
         steady = np.where(self._was_balance, self._speed, measured)
         steady = steady + (measured - steady) * -np.expm1(-self._bin_s / STEADY_S)
         speed = np.where(is_balance, steady, predicted)

@@ -54,8 +54,8 @@ class WrongReadings(Saved):
         """number of spells of the tray that lasted at least 1, 2, ... readings"""
         self._side, self._long, self._different = np.zeros((3, 2, count))
         """(2, fans), from the expected reading and from that of a healthy fan: side on which the newest reading is
-        far, 0 if it is not; samples since the first far one on that side, itself included; different readings since
-        then, the first one included"""
+        far, 0 if it is not; samples with a reading since the first far one on that side, itself included; different
+        readings since then, the first one included"""
         self.agree = np.zeros(count, np.bool_)
         """(fans,) true where the newest reading is far, and enough before it were"""
 
@@ -101,7 +101,7 @@ class WrongReadings(Saved):
             is_first = np.where(raised < 0, ~self._are_enough(agree_at), self._long[1] > raised + row)
             self._learn(ends[1] & (self._side[1] != 0.0) & is_first)
             self._side, began[ends[0]] = np.where(ends, sides[:, row], self._side), row
-            self._long = np.where(ends, 1.0, self._long + 1.0)
+            self._long = np.where(ends, 1.0, self._long + known[row])
             self._different = np.where(ends, 1.0, self._different + (known[row] & self._holds & another[row]))
             waits[row] = far[0, row]
             agree = far[0, row] & self._are_enough(agree_at)

@@ -48,7 +48,9 @@ def test_without_any_one_part_a_fan_that_loses_a_fifth_of_its_speed_has_an_alarm
     fans, bin_ns = made_fans(2), bin_ns_of(block.period_ns, 0.0)
     with importlib.import_module("bench.detection.without").without(name):
         decision = Decision(fans, bin_ns, block.period_ns / NS_PER_S, 86_400.0, Priors())
-        for one in Bins(bin_ns, np.full(2, TOP_RAD_S), None).take(replace(block, measured_speed_rad_s=slower)):
+        for one in Bins(bin_ns, np.full(2, TOP_RAD_S), np.ones(2, np.bool_), None).take(
+            replace(block, measured_speed_rad_s=slower)
+        ):
             decision.take(one)
     assert decision.active.tolist() == [True, False]
 

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from fantwin.pipeline.site.alarm_book import AlarmBook
+from fantwin.pipeline.tray_scoring.scorer_config import ScorerConfig
 from fantwin.pipeline.tray_scoring.snapshot_store import SnapshotStore
 from fantwin.schemas.blocks import cut
 from fantwin.schemas.enums import Action, FanState, Transition
@@ -22,6 +23,7 @@ from fantwin.schemas.messages import Alarm, Score, ScorerSnapshot
 from fantwin.schemas.units import NS_PER_S
 from fantwin.scoring.alarms.alarm_flags import is_listed, is_retained, is_silenced
 from fantwin.scoring.alarms.current_alarms import CurrentAlarm
+from fantwin.scoring.wear.wear_monitor import WearMonitor
 from fantwin.stages.scorer import ScorerCore
 from tests.support.scored_blocks import (
     EPOCH_NS,
@@ -32,6 +34,7 @@ from tests.support.scored_blocks import (
     prediction_of,
     request_of,
     snapshot_of,
+    twin_of,
 )
 
 HOUR = 360_000  # samples
@@ -179,7 +182,11 @@ def test_operator_settings_outlive_a_snapshot_of_another_twin_or_read_in_part_an
     lost: str,
 ) -> None:
     state = json.loads(raised().state_json)
-    before = state["wear"]["state"]
+    worn = WearMonitor(3, 600.0)
+    for day in range(2):
+        at_ns = EPOCH_NS + (day - 2) * 86_400 * NS_PER_S
+        worn.update(at_ns, np.ones(3, np.bool_), lambda: (np.full(3, -0.08), np.full(3, 0.007)))
+    before = state["wear"] = worn.snapshot()
     state.pop(lost, None)
     successor = core_of(3, sha256="another" if lost == "twin" else "twin")
     memory, *emitted = successor.restore(replace(raised(), state_json=json.dumps(state)))
@@ -194,8 +201,10 @@ def test_operator_settings_outlive_a_snapshot_of_another_twin_or_read_in_part_an
     assert successor.step(request_of(Action.SHELVE, 1, sequence=1, duration_s=60.0)) == [], "it was answered"
     (score,), _ = feed(successor, [prediction_of(np.zeros((1, 3)), first=100)])
     assert (score.state == FanState.NORMAL).all() and not score.expected_residual_rad_s.any()
-    is_kept = json.loads(snapshot_of(successor).state_json)["wear"]["state"] == before
+    of_wear = json.loads(snapshot_of(successor).state_json)["wear"]
+    is_kept = of_wear["fans"] == before["fans"]
     assert is_kept == (lost == "model"), "wear starts again where it cannot be read, or the twin is another"
+    assert not any(of_wear["state"]["has_shift"]), "what the model says of the fans from now on joins what was measured"
     _, (unshelved,) = feed(successor, [request_of(Action.UNSHELVE, 1, sequence=2)])
     assert unshelved.transition == Transition.UNSHELVED
     feed(successor, [prediction_of(np.zeros((1, 3)), first=6098)])
@@ -248,6 +257,24 @@ def test_row_13_a_snapshot_that_is_ahead_of_a_clock_that_was_set_back_keeps_no_f
     successor = core_of(3, sha256=twin, snapshot_store=store, started_t_ns=int(made.t_ns[0]))
     assert [len(message.t_ns) for message in successor.step(made) if isinstance(message, Score)] == [20]
     assert not successor.counters().get("repeated")
+
+
+@pytest.mark.parametrize("twin", ["twin", "another"])
+def test_samples_that_come_again_to_the_core_of_the_next_twin_are_not_scored_again(twin: str) -> None:
+    before = core_of(3)
+    feed(before, [prediction_of(np.zeros((100, 3)))])
+    (snapshot,) = before.last_snapshot()
+    successor = ScorerCore(
+        3,
+        "rad/s",
+        ScorerConfig(),
+        twin_of(3, sha256=twin),
+        started_t_ns=EPOCH_NS - 10 * NS_PER_S,
+        continues=snapshot,
+        is_learned=True,
+    )
+    (score,), _ = feed(successor, [prediction_of(np.zeros((40, 3)), first=80, producer="integrator-2")])
+    assert len(score.t_ns) == 20 and "set back" not in successor.problem()
 
 
 def test_alarms_of_a_discarded_snapshot_are_no_longer_current() -> None:

@@ -241,7 +241,7 @@ def _computed(path: Path, part: HealthyPart) -> Iterator[TrayRun]:
             twin = load_tray_twin(part.twin, tray.fans)
             fans = modelled_fans(twin)
             bin_ns = bin_ns_of(first.period_ns, float(fans.held_s.min()))
-            bins = Bins(bin_ns, fans.top_rad_s, twin.unseen_error)
+            bins = Bins(bin_ns, fans.top_rad_s, fans.reads_balance, twin.unseen_error)
             recorded = RecordedTray(path, tray.name, tray.fans, tray.speed_unit)
             yield TrayRun(recorded, bin_ns, first.period_ns, _binned(bins, chain([first], blocks)))
 

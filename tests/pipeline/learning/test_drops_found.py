@@ -42,7 +42,7 @@ def found_after_s(path: Path, drops: Array) -> Array:
     decision = Decision(fans, bin_ns, exact.period_ns / NS_PER_S, 3600.0, CALIBRATION.priors)
     found_s = np.full(len(drops), np.inf)
     noisy = replace(exact, measured_speed_rad_s=exact.measured_speed_rad_s + noise_rad_s)
-    for one in Bins(bin_ns, fans.top_rad_s, None).take(noisy):
+    for one in Bins(bin_ns, fans.top_rad_s, fans.reads_balance, None).take(noisy):
         after_s = one.t_ns / NS_PER_S - STEADY_S
         if after_s > WITHIN_S[1]:
             break

@@ -38,7 +38,11 @@ class MadeRuns:
         self.fans, self._period_ns = made_fans(FANS), block.period_ns
         self._bin_ns = bin_ns_of(block.period_ns, 0.0)
         self._bins = [
-            list(Bins(self._bin_ns, self.fans.top_rad_s, None).take(running(FANS, SECONDS, seed, wander=0.006)))
+            list(
+                Bins(self._bin_ns, self.fans.top_rad_s, self.fans.reads_balance, None).take(
+                    running(FANS, SECONDS, seed, wander=0.006)
+                )
+            )
             for seed in seeds
         ]
 

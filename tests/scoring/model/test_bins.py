@@ -17,7 +17,7 @@ SAMPLES, BIN_NS = 60, 100_000_000
 
 
 def new() -> Bins:
-    return Bins(BIN_NS, np.full(2, TOP_SPEED), None)
+    return Bins(BIN_NS, np.full(2, TOP_SPEED), np.ones(2, np.bool_), None)
 
 
 def told(one: Bin) -> dict[str, list[float]]:

@@ -23,7 +23,9 @@ RUN_S = 300.0
 
 
 def bins_of(seconds: float, seed: int, **varies: float) -> list[Bin]:
-    return list(Bins(BIN_NS, made_fans(FANS).top_rad_s, None).take(running(FANS, seconds, seed, **varies)))
+    fans = made_fans(FANS)
+    bins = Bins(BIN_NS, fans.top_rad_s, fans.reads_balance, None)
+    return list(bins.take(running(FANS, seconds, seed, **varies)))
 
 
 def sums_of(bins: Sequence[Bin], fans: Fans | None = None) -> RunSums:
