@@ -20,7 +20,3 @@ class ColumnState(ABC):
         The last axis of each is over the fans, if it is of fans. Names of times end in `_t_ns`; NEVER_NS stands for
         none.
         """
-
-    def arrays(self) -> dict[str, Array]:
-        """The columns, and what else is kept that follows from them."""
-        return self.columns()

@@ -22,21 +22,21 @@ class JointStates:
         """joint: with the fans of all trays. of_trays: of each, the same states in the same order. begin_t_ns: when the
         block of each begins."""
         self._joint = joint
-        self._arrays = [[state.arrays() for state in states] for states in zip(*of_trays, strict=True)]
+        self._arrays = [[state.columns() for state in states] for states in zip(*of_trays, strict=True)]
         self._trays = len(of_trays)
         self._later_ns = np.array(begin_t_ns) - begin_t_ns[0]
 
     def gather(self) -> None:
         """Write the states of the trays into the joint ones."""
         for state, of_trays in zip(self._joint, self._arrays, strict=True):
-            for name, array in state.arrays().items():
+            for name, array in state.columns().items():
                 np.concatenate([of_tray[name] for of_tray in of_trays], axis=-1, out=array)
                 self._move(name, array, -1)
 
     def scatter(self) -> None:
         """Write the joint states back to those of the trays."""
         for state, of_trays in zip(self._joint, self._arrays, strict=True):
-            for name, array in state.arrays().items():
+            for name, array in state.columns().items():
                 self._move(name, array, 1)
                 fans = array.shape[-1] // self._trays
                 for k, of_tray in enumerate(of_trays):

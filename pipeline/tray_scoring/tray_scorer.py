@@ -151,7 +151,7 @@ class TrayScorer:
             return standstill_causes(kind, fall, command)
         if decision.active[fan]:
             return self._causes_of_deviation(fan, command)
-        words, seen, fan_of_twin = self._words, self._seen_since(fan, 0.0), self.twin.steady_fans[fan]
+        words, seen, fan_of_twin = self._words, self._seen_since(fan), self.twin.steady_fans[fan]
         if decision.missing.is_active[fan]:
             dropout = PossibleCause(SENSOR_DROPOUT, 1.0, float(decision.missing.share[fan]), np.nan)
             return words.of([dropout], seen, fan_of_twin)
@@ -181,11 +181,10 @@ class TrayScorer:
         is_new = decision.raised_s(fan) < FALLING_S
         if age_s < NAMED_AFTER_S or (is_new and falls.is_falling[fan]):
             return (Diagnosis(cause=CANNOT_TELL, probability=1.0, evidence=f"{CAUSES[CANNOT_TELL]}: {KNOWN_SOON}"),)
-        return self._words.of(causes, self._seen_since(fan, age_s), self.twin.steady_fans[fan])
+        return self._words.of(causes, self._seen_since(fan), self.twin.steady_fans[fan])
 
-    def _seen_since(self, fan: int, age_s: float) -> SeenSinceOnset:
-        slowest, fastest, lowest, highest = self._seen[:, fan].tolist()
-        return SeenSinceOnset(age_s, slowest, fastest, lowest, highest, bool(self._has_stopped[fan]))
+    def _seen_since(self, fan: int) -> SeenSinceOnset:
+        return SeenSinceOnset(*self._seen[:, fan].tolist())
 
     def _decide(self, one: Bin, item: Prediction) -> list[Alarm]:
         """Bring all up to date with the end of a bin; returns the messages on alarms."""

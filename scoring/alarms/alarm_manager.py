@@ -16,7 +16,6 @@ from fantwin.scoring.alarms.alarm_flags import is_listed
 from fantwin.scoring.alarms.alarm_state import AlarmState, ConditionSettings
 from fantwin.scoring.alarms.alarm_text import AlarmText
 from fantwin.scoring.alarms.alarms_of_tray import AlarmsOfTray, Decided
-from fantwin.scoring.diagnosis.causes import is_of_standstill
 from fantwin.scoring.diagnosis.ranked_causes import says_more
 
 AGAIN_AFTER_S = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512)
@@ -277,10 +276,8 @@ def _is_other(statistic: Statistic, before: Alarm) -> bool:
 
 
 def _is_news(causes: tuple[Diagnosis, ...], than: tuple[Diagnosis, ...]) -> bool:
-    """Return whether causes are worth a message. After causes of standing still, those of another kind are not: they
-    say less about why the fan came to rest."""
-    stood = bool(than) and is_of_standstill(than[0])
-    return bool(causes) and not (stood and not is_of_standstill(causes[0])) and says_more(causes, than)
+    """Return whether causes are worth a message."""
+    return bool(causes) and says_more(causes, than)
 
 
 def _is_slower(alarm: Alarm) -> bool:
@@ -289,21 +286,7 @@ def _is_slower(alarm: Alarm) -> bool:
 
 def _state_fields(state: AlarmState) -> dict[str, Any]:
     """The fields of an alarm message that carry its state."""
-    return {
-        "active": state.active,
-        "severity": state.severity,
-        "onset_t_ns": state.onset_t_ns,
-        "acknowledged": state.acknowledged,
-        "confirmed": state.confirmed,
-        "latched": state.latched,
-        "shelved_until_t_ns": state.shelved_until_t_ns,
-        "suppressed": state.suppressed,
-        "out_of_service": state.out_of_service,
-        "stale": state.stale,
-        "feedback": state.feedback,
-        "feedback_by": state.feedback_by,
-        "feedback_reason": state.feedback_reason,
-    }
+    return {name: value for name, value in vars(state).items() if name not in ("acknowledged_by", "comment")}
 
 
 def _to_json(alarm: Alarm) -> dict[str, Any]:

@@ -6,11 +6,12 @@ which says no more than its flags do, is not compared.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 from fantwin.schemas.enums import Severity, Statistic, Transition
 from fantwin.schemas.messages import Alarm
-from fantwin.schemas.units import SpeedUnit
-from fantwin.scoring.alarms.deviation_text import AlarmUnits
-from fantwin.scoring.diagnosis.causes import CANNOT_TELL, CAUSES, STANDSTILL_CAUSES
+from fantwin.schemas.units import RAD_S_PER_UNIT, SpeedUnit
+from fantwin.scoring.diagnosis.causes import CANNOT_TELL, CAUSES, is_of_standstill
 
 TRANSITIONS = {
     Transition.CLEARED: "back to normal",
@@ -30,8 +31,35 @@ TRANSITIONS = {
     Transition.MARKED_FALSE: "marked as a false alarm",
 }
 """transitions whose line depends on nothing else"""
+SIGMAS = 2.0
+"""half of the interval of a size"""
 CONTINUES = "the alarm continues from before the restart"
 NOT_AS_COMMANDED = "does not turn or stop as commanded"
+
+
+@dataclass(frozen=True)
+class AlarmUnits:
+    """The units of a tray."""
+
+    speed: SpeedUnit
+    command: str = ""
+    """empty where the twin does not say"""
+
+    def shown_speed(self, speed_rad_s: float) -> str:
+        """A speed in the unit that people are shown, without the unit."""
+        speed = speed_rad_s / RAD_S_PER_UNIT[self.speed]
+        return f"{speed:.0f}" if speed >= 10 else f"{speed:.2g}"
+
+    def deviation(self, alarm: Alarm) -> str:
+        """Deviation of a fan from its healthy state, by its speed or by its torque balance."""
+        if alarm.residual_rad_s or not alarm.torque_balance_command:
+            side = "slower" if alarm.residual_rad_s < 0 else "faster"
+            size = self.shown_speed(abs(alarm.residual_rad_s))
+            error = self.shown_speed(SIGMAS * alarm.residual_std_rad_s)
+            return f"{size} {self.speed} {side} than when healthy (± {error})"
+        side = "more" if alarm.torque_balance_command > 0 else "less"
+        size, error = abs(alarm.torque_balance_command), SIGMAS * alarm.torque_balance_std_command
+        return f"takes {size:.2g} {self.command or 'of command'} {side} than when healthy (± {error:.2g})"
 
 
 class AlarmText:
@@ -108,4 +136,4 @@ def _after_restart(alarm: Alarm) -> str:
 
 
 def _is_against_command(alarm: Alarm) -> bool:
-    return bool(alarm.causes) and alarm.causes[0].cause in STANDSTILL_CAUSES
+    return bool(alarm.causes) and is_of_standstill(alarm.causes[0])

@@ -45,7 +45,8 @@ class UnscoredMonitor:
         self._unscored_ns = np.zeros(fans, np.int64)
         self._invalid_reason = np.zeros(fans, np.uint8)
         self._was_scored = np.zeros(fans, np.bool_)
-        self._window = _Window(fans)
+        self._window_ns, self._scored_ns = 0, np.zeros(fans, np.int64)
+        """length of the window so far, and (fans,) the time of it in which each was scored"""
         self._rare_windows = np.zeros(fans, np.int64)
         """number of windows in which a fan was scored rarely, since the last one in which it was scored for half of the
         time"""
@@ -68,15 +69,14 @@ class UnscoredMonitor:
     def _count_shares(self, period_ns: int, judged: Array) -> None:
         """Count the scored time in windows. They end at the same samples, whatever the blocks."""
         while len(judged):
-            rows = min(len(judged), -(-(self._limit_ns - self._window.length_ns) // period_ns))
-            self._window.add(period_ns, judged[:rows])
+            rows = min(len(judged), -(-(self._limit_ns - self._window_ns) // period_ns))
+            self._window_ns += rows * period_ns
+            self._scored_ns += np.count_nonzero(judged[:rows], axis=0) * period_ns
             judged = judged[rows:]
-            if self._window.length_ns >= self._limit_ns:
-                doubled_ns = 2 * self._window.scored_ns
-                is_rare = (doubled_ns > 0) & (doubled_ns < self._window.length_ns)
-                is_enough = doubled_ns >= self._window.length_ns
-                self._rare_windows = np.where(is_enough, 0, self._rare_windows + is_rare)
-                self._window = _Window(len(self._rare_windows))
+            if self._window_ns >= self._limit_ns:
+                is_enough = 2 * self._scored_ns >= self._window_ns
+                self._rare_windows = np.where(is_enough, 0, self._rare_windows + (self._scored_ns > 0))
+                self._window_ns, self._scored_ns[:] = 0, 0
 
     def problem(self) -> str:
         """Line on the fans that are not scored; empty for none. Times double, so that the line rarely changes."""
@@ -94,19 +94,6 @@ class UnscoredMonitor:
             fans = np.flatnonzero(rarely & (self._latest_reason == reason))
             parts.append(f"{_subject(fans)} not scored most of the time: {_explanation(reason)}")
         return "; ".join(parts)
-
-
-class _Window:
-    """Time for which each fan was scored since the window began, in ns."""
-
-    def __init__(self, fans: int) -> None:
-        self.length_ns = 0
-        self.scored_ns = np.zeros(fans, np.int64)
-
-    def add(self, period_ns: int, judged: Array) -> None:
-        """Add samples. judged: (n, fans)."""
-        self.length_ns += len(judged) * period_ns
-        self.scored_ns += np.count_nonzero(judged, axis=0) * period_ns
 
 
 def _subject(fans: Array) -> str:

@@ -2,7 +2,6 @@
 
 Causes differ in how they change with the speed (docs/explanation/diagnosis.md), so what is missing is motion: a change
 of the speed by a third, beyond the speeds that were seen. The command for it follows from the healthy torque balance.
-A fan that does not turn shows nothing; whether it should turn says where to look.
 """
 
 from __future__ import annotations
@@ -13,10 +12,6 @@ from dataclasses import dataclass
 from fantwin.scoring.diagnosis.steady_fan import SteadyFan
 
 SLOWER, FASTER = 2.0 / 3.0, 4.0 / 3.0
-SURELY_TURNS = 2.0
-"""times the lowest command that turns a fan"""
-SOON_S = 3.0
-"""age below which an onset is too young for a command to be worth moving"""
 DIGITS = 2
 
 KNOWN_SOON = "more is known in a few seconds"
@@ -26,12 +21,10 @@ KNOWN_SOON = "more is known in a few seconds"
 class SeenSinceOnset:
     """Summary of what a fan did since the onset of its alarm."""
 
-    age_s: float
     lowest_rad_s: float
     highest_rad_s: float
     lowest_command: float
     highest_command: float
-    is_standing: bool
 
 
 @dataclass(frozen=True)
@@ -46,10 +39,6 @@ class Advice:
 
     def added_to(self, unclear: str, seen: SeenSinceOnset, fan: SteadyFan) -> str:
         """Why the cause is unclear, with what would tell."""
-        if seen.age_s < SOON_S:
-            return f"{unclear}: {KNOWN_SOON}"
-        if seen.is_standing:
-            return f"{unclear}: {self._to_turn(seen, fan)}"
         command = self._other_command(seen, fan)
         if not math.isfinite(command):
             return unclear
@@ -67,13 +56,6 @@ class Advice:
         faster = seen.highest_command * fan.needed(FASTER * high) / fan.needed(high)
         faster = min(faster, self.highest_command)
         return faster if faster > seen.highest_command else math.nan
-
-    def _to_turn(self, seen: SeenSinceOnset, fan: SteadyFan) -> str:
-        turns_from = max(self.lowest_command, fan.friction)
-        if seen.highest_command > turns_from:
-            return f"at {self._of(seen.highest_command)} it should turn: see whether it is free to turn and has power"
-        target = min(SURELY_TURNS * turns_from, self.highest_command)
-        return f"it does not turn: move the command to {self._of(target)}"
 
     def _of(self, command: float) -> str:
         size = abs(command)

@@ -67,7 +67,7 @@ class AgainstCommand(Saved):
                 self._judge(rows, block.command[rows], speed[rows], Durations(is_here[rows], block.period_ns))
             if end < n:
                 self._stands.forget(missed_ns[end] > self._stands.memory_s * NS_PER_S)
-                self._runs.forget(missed_ns[end] > self._runs.memory_s * NS_PER_S)
+                self._runs.forget(missed_ns[end] > 0)  # the fan may have been started and stopped within it
             begin = end
 
     def forget(self, fans: Array) -> None:

@@ -49,11 +49,6 @@ class RunsOn(Saved):
         self._peak_rad_s = np.zeros(len(tachos))
         """highest reading within the lag since the command stopped it; 0 if there is none"""
 
-    @property
-    def memory_s(self) -> float:
-        """Longest gap that is bridged: none, because the fan may have been started and stopped within it."""
-        return 0.0
-
     def update(self, command: Array, speed_rad_s: Array, counts: Durations) -> tuple[Array, Array, Array]:
         """Return the time in multiples of a healthy one, 0 where a fan does not run on; where a fan stands as it
         should; and the number of the kind in KINDS. All (n, fans), also command and speed_rad_s."""

@@ -40,14 +40,11 @@ class StandsStill(Saved):
         self._lapse_limit_s = lapse_limit_s(healthy)
         self._held_s = np.array([tacho.held_s for tacho in tachos])
         self._start_limit_s = start_limit_s(healthy, reach_s)
+        self.memory_s = float(np.max(self._start_limit_s))
+        """longest gap after which it is known how the fan was started"""
         self._missing_limit_s: Array = reach_s + MISSING_S
         self._lasted_ns = np.zeros((4, len(tachos)), np.int64)
         """(4, fans) time for which each has been driven, turned, stood, and given no reading"""
-
-    @property
-    def memory_s(self) -> float:
-        """Longest gap after which it is known how the fan was started."""
-        return float(np.max(self._start_limit_s))
 
     def update(self, command: Array, speed_rad_s: Array, counts: Durations) -> tuple[Array, Array, Array]:
         """Return the time in multiples of a healthy one; where a fan turns as it should; and the number of the kind in

@@ -1,4 +1,4 @@
-"""scoring.diagnosis.what_would_tell: the command that would tell a cause, or where to look at a standing fan."""
+"""scoring.diagnosis.what_would_tell: the command that would tell a cause."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from dataclasses import replace
 import pytest
 
 from fantwin.scoring.diagnosis.steady_fan import SteadyFan
-from fantwin.scoring.diagnosis.what_would_tell import KNOWN_SOON, Advice, SeenSinceOnset
+from fantwin.scoring.diagnosis.what_would_tell import Advice, SeenSinceOnset
 
 FAN = SteadyFan(viscous=2e-4, drag=3e-6, friction=0.04, top_rad_s=500.0)
-SEEN = SeenSinceOnset(20.0, 300.0, 300.0, FAN.needed(300.0), FAN.needed(300.0), is_standing=False)
+SEEN = SeenSinceOnset(300.0, 300.0, FAN.needed(300.0), FAN.needed(300.0))
 
 
 def advised(advice: Advice, seen: SeenSinceOnset = SEEN) -> float:
@@ -30,17 +30,7 @@ def test_the_command_makes_the_fan_a_third_slower_or_faster_where_that_would_not
     assert advised(Advice("V"), weak) == pytest.approx(2.0 * FAN.needed(200.0), rel=0.05), "of the command it takes now"
 
 
-def test_nothing_is_advised_where_no_other_command_is_known_or_more_comes_by_itself() -> None:
+def test_nothing_is_advised_where_no_other_command_is_known() -> None:
     at_its_only_one = Advice("V", lowest_command=0.3, highest_command=SEEN.highest_command)
     assert at_its_only_one.added_to("why", SEEN, FAN) == "why"
     assert Advice("V").added_to("why", replace(SEEN, lowest_rad_s=float("nan")), FAN) == "why"
-    assert Advice("V").added_to("why", replace(SEEN, age_s=1.0), FAN) == f"why: {KNOWN_SOON}"
-
-
-def test_a_fan_that_stands_should_turn_or_gets_a_command_that_turns_it() -> None:
-    stands = replace(SEEN, lowest_rad_s=0.0, highest_rad_s=0.0, is_standing=True)
-    assert Advice("duty/255", lowest_command=30.0).added_to("why", replace(stands, highest_command=113.0), FAN) == (
-        "why: at 113 duty/255 it should turn: see whether it is free to turn and has power"
-    )
-    idle = replace(stands, highest_command=0.0)
-    assert Advice("", 0.15).added_to("why", idle, FAN) == "why: it does not turn: move the command to 0.30"
