@@ -84,22 +84,13 @@ class TorqueBalance(ColumnState):
         drag = (model.viscous + model.drag * np.abs(mean)) * mean
         excess = acting - model.inertia * (speed - before) / period_s - drag - model.friction
         keep = float(np.exp(-model.filter_rate_per_s * period_s))
-        if linked.all():
-            filtered, weight = self._all(excess, keep)
-        else:
-            filtered, weight = self._some(excess, linked, keep)
+        filtered, weight = self._filter(excess, linked, keep)
         self._filtered, self._weight = filtered[-1].copy(), weight[-1].copy()
         settled = linked & (weight >= SETTLED) & (np.abs(speed) <= model.highest_speed_rad_s)
         with np.errstate(invalid="ignore", divide="ignore"):
             return np.where(settled, filtered / weight, np.nan)
 
-    def _all(self, excess: Array, keep: float) -> tuple[Array, Array]:
-        both = np.hstack((excess, np.ones_like(excess)))
-        state = keep * np.concatenate((self._filtered, self._weight))[np.newaxis]
-        filtered = filter_rows(keep, both, state)
-        return filtered[:, : excess.shape[1]], filtered[:, excess.shape[1] :]
-
-    def _some(self, excess: Array, linked: Array, keep: float) -> tuple[Array, Array]:
+    def _filter(self, excess: Array, linked: Array, keep: float) -> tuple[Array, Array]:
         filtered, weight = np.zeros_like(excess), np.zeros_like(excess)
         if by_rows(*excess.shape):
             before, weight_before = self._filtered, self._weight

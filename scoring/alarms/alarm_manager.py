@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -286,7 +286,7 @@ def _is_slower(alarm: Alarm) -> bool:
 
 def _state_fields(state: AlarmState) -> dict[str, Any]:
     """The fields of an alarm message that carry its state."""
-    return {name: value for name, value in vars(state).items() if name not in ("acknowledged_by", "comment")}
+    return {name: value for name, value in asdict(state).items() if name not in ("acknowledged_by", "comment")}
 
 
 def _to_json(alarm: Alarm) -> dict[str, Any]:

@@ -135,7 +135,6 @@ class Operation(Saved):
         self._moved_to = np.zeros(count)
         self._command, self._largest = np.zeros((2, count)), np.full(count, 1e-9)
         """(2, fans) command of the last bin, as it acts and as far as it moved by more than BACKLASH; the largest"""
-        self._has_lowest = np.isfinite(fans.lowest_command).any()
 
     def inputs(self, one: Bin) -> Inputs:
         """Inputs of a bin; bins come in order of time."""
@@ -175,7 +174,7 @@ class Operation(Saved):
             command_path,
             command_moved,
             unseen,
-            self._of_lowest(one.command) if self._has_lowest else np.zeros(len(speed)),
+            self._of_lowest(one.command),
             one.half_range_rad_s,
             readings,
             ends & (self._held[0] + readings > 0.0),

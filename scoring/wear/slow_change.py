@@ -4,12 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from fantwin.schemas.units import NS_PER_S
-
-if TYPE_CHECKING:  # it loads scipy, which a command that shows alarms does not need
-    from fantwin.scoring.wear.trend import LimitForecast, Trend
+from fantwin.scoring.wear.trend import LimitForecast, Trend
 
 LIMIT_SHARE = 0.1
 """share of the speed; an alarm is raised where a change has surely reached it"""
