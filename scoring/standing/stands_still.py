@@ -19,7 +19,7 @@ from fantwin.schemas.units import NS_PER_S
 from fantwin.scoring.diagnosis.standstill_causes import Standing
 from fantwin.scoring.model.saved import Saved
 from fantwin.scoring.standing.durations import Durations
-from fantwin.scoring.standing.healthy_times import lapse_limit_s, start_limit_s
+from fantwin.scoring.standing.time_limits import lapse_limit_s, start_limit_s
 
 MISSING_S = 2.0  # beyond the reach of the tacho
 UNKNOWN_STARTED_S = 5.0  # beyond the reach: the length of a start, if none was seen

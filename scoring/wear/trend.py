@@ -36,6 +36,8 @@ MAX_ERROR_RATIO = 3.0
 """ratio to the median error of the points; a trend leaves out those with larger errors"""
 MIN_EFFECTIVE_POINTS = 5.0
 BATCHES = 24
+MIN_FORECAST_DAYS = 1.0
+"""observed time from which a limit is forecast"""
 MAX_HORIZON_RATIO = 10.0
 """horizon of the forecast of a limit, in multiples of the observed time"""
 REACHED = "the limit is already reached"
@@ -185,6 +187,8 @@ class WearSeries:
 def forecast_limit(trend: Trend, limit: float, now_ns: int) -> LimitForecast:
     """Forecast when the value will reach `limit`, which lies ahead in the direction of the trend, if the trend
     continues."""
+    if trend.days < MIN_FORECAST_DAYS:
+        return LimitForecast(unknown_reason="less than a day was observed")
     now = (now_ns - trend.origin_ns) / NS_PER_DAY
     distance = limit - (trend.level + trend.slope_per_day * now)
     if not trend.significant:

@@ -24,7 +24,6 @@ SETTLING_INTERVALS = 6
 """intervals from the first sample by a twin to the first point: the slow states are hardly known before"""
 REFERENCE_DAYS = 1.0
 """a change is the difference from the mean of this time after commissioning, which levels day and night"""
-MIN_FORECAST_DAYS = 1.0
 """time before the first forecast: weather and warming bearings change more within a day than wear does"""
 HALF_INTERVAL = 1.96
 """half of a 95 % interval, in standard errors"""
@@ -123,8 +122,6 @@ class WearMonitor:
     def _forecast(self, fan: int, trend: Trend | None) -> LimitForecast:
         if trend is None:
             return LimitForecast(unknown_reason="too few points so far")
-        if trend.days < MIN_FORECAST_DAYS:
-            return LimitForecast(unknown_reason="less than a day was observed")
         reference = self._reference(fan)
         line = replace(trend, level_error=math.hypot(trend.level_error, reference.std_error))
         limit = reference.value + math.copysign(LIMIT_SHARE, trend.slope_per_day)
