@@ -37,7 +37,7 @@ MAX_ERROR_RATIO = 3.0
 MIN_EFFECTIVE_POINTS = 5.0
 BATCHES = 24
 MIN_FORECAST_DAYS = 1.0
-"""observed time from which a limit is forecast"""
+"""observed time before the first forecast: weather and warming bearings change more within a day than wear does"""
 MAX_HORIZON_RATIO = 10.0
 """horizon of the forecast of a limit, in multiples of the observed time"""
 REACHED = "the limit is already reached"

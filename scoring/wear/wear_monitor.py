@@ -24,7 +24,6 @@ SETTLING_INTERVALS = 6
 """intervals from the first sample by a twin to the first point: the slow states are hardly known before"""
 REFERENCE_DAYS = 1.0
 """a change is the difference from the mean of this time after commissioning, which levels day and night"""
-"""time before the first forecast: weather and warming bearings change more within a day than wear does"""
 HALF_INTERVAL = 1.96
 """half of a 95 % interval, in standard errors"""
 MIN_CHANGE = 0.03
