@@ -55,9 +55,7 @@ class ScoreColumns:
             getattr(self, name)[rows] = column
 
 
-def score_of(
-    item: Prediction, of: ScoreColumns, reads_balance: Array | bool = True, unseen_rad_s: Array | float = 0.0
-) -> Score:
+def score_of(item: Prediction, of: ScoreColumns, reads_balance: Array, unseen_rad_s: Array | float) -> Score:
     """The message of a block. of: its rows. reads_balance: (fans,) as in `Fans`. unseen_rad_s: (n, fans) standard
     deviation of the twin's error where it was not trained."""
     has_balance = among(item.invalid_reason, *BALANCE_COUNTS) & np.isfinite(item.torque_balance_command) & reads_balance

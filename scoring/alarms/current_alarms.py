@@ -25,11 +25,6 @@ _DESCRIBES_THE_FAN = {
     Transition.CLEARED,
     Transition.REPUBLISHED,
 }
-PLAIN_FIELDS = (
-    *("fan", "active", "acknowledged", "confirmed", "latched", "shelved_until_t_ns", "suppressed", "out_of_service"),
-    *("stale", "onset_t_ns", "t_ns", "feedback_by", "feedback_reason"),
-)
-"""of a message, as they are in JSON, too"""
 _SAYS_HOW_FAR = {Transition.RAISED, Transition.SEVERITY}
 _NAMES_WHO_ACKNOWLEDGED = {Transition.ACKNOWLEDGED, Transition.REPUBLISHED}
 
@@ -89,10 +84,20 @@ class CurrentAlarm:
         alarm = self.newest
         return {
             "tray": alarm.header.tray,
-            **{name: getattr(alarm, name) for name in PLAIN_FIELDS},
+            "fan": alarm.fan,
             "severity": alarm.severity.name.lower(),
+            "active": alarm.active,
+            "acknowledged": alarm.acknowledged,
+            "confirmed": alarm.confirmed,
+            "latched": alarm.latched,
+            "shelved_until_t_ns": alarm.shelved_until_t_ns,
+            "suppressed": alarm.suppressed,
+            "out_of_service": alarm.out_of_service,
+            "stale": alarm.stale,
             "retained": is_retained(alarm),
             "presented": is_presented(alarm),
+            "onset_t_ns": alarm.onset_t_ns,
+            "t_ns": alarm.t_ns,
             "message": self.message,
             "message_t_ns": self.message_t_ns,
             "causes": [
@@ -101,6 +106,8 @@ class CurrentAlarm:
             ],
             "acknowledged_by": self.acknowledged_by,
             "feedback": alarm.feedback.name.lower(),
+            "feedback_by": alarm.feedback_by,
+            "feedback_reason": alarm.feedback_reason,
         }
 
 

@@ -133,13 +133,12 @@ class WearSeries:
         n = len(known)
         if n < MIN_POINTS:
             return None
-        from scipy.special import stdtrit  # noqa: PLC0415
-        from scipy.stats import theilslopes  # noqa: PLC0415  what only shows wear does without this large import
+        from scipy import special, stats  # noqa: PLC0415  what only shows wear does without this large import
 
         t_ns, value = np.array([point.t_ns for point in known]), np.array([point.value for point in known])
         origin_ns = int(t_ns[0]) + round(float((t_ns - t_ns[0]).mean()))
         day = (t_ns - origin_ns) / NS_PER_DAY
-        fitted: Any = theilslopes(value, day)
+        fitted: Any = stats.theilslopes(value, day)
         slope = float(fitted.slope)
         level = float(np.median(value - slope * day))
         residual = value - level - slope * day
@@ -150,7 +149,7 @@ class WearSeries:
         scatter = max(scatter, float(np.median(std_error[std_error <= largest])))
         level_error = scatter / math.sqrt(effective * THEIL_SEN_EFFICIENCY)
         slope_error = level_error / float(day.std())
-        t_quantile = float(stdtrit(min(effective, n // max(1, n // BATCHES)) - 2.0, 0.975))
+        t_quantile = float(special.stdtrit(min(effective, n // max(1, n // BATCHES)) - 2.0, 0.975))
         return Trend(
             origin_ns=origin_ns,
             slope_per_day=slope,
