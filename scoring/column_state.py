@@ -1,4 +1,4 @@
-"""State in arrays with a column for each fan, so that trays can be joined (pipeline.prediction.joint_states)."""
+"""State in arrays with a column for each fan, for joining trays (`pipeline.prediction.joint_tray_integrator`)."""
 
 from __future__ import annotations
 

@@ -11,8 +11,16 @@ import numpy as np
 
 from fantwin.simulation.faults import Fault, disturbance, four_pin_damage
 from fantwin.simulation.four_pin import FourPinFans, FourPinParameters, four_pin_tray
-from fantwin.simulation.plant import HEALTHY, Array, FanParameters, advance, at_rest, tray_of_fans
-from fantwin.simulation.surroundings import BACK_EMF_SHARE, RESISTANCE_OHM
+from fantwin.simulation.plant import (
+    BACK_EMF_SHARE,
+    HEALTHY,
+    RESISTANCE_OHM,
+    Array,
+    FanParameters,
+    advance,
+    at_rest,
+    tray_of_fans,
+)
 
 FanKind = Literal["dc", "4-pin"]
 FOUR_PIN_SUPPLY_V = 12.0

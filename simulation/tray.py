@@ -19,8 +19,7 @@ from fantwin.simulation.errors import SimulationError
 from fantwin.simulation.excitation import excitation
 from fantwin.simulation.fans import DcFans, FanKind, FourPinTray, simulated_fans
 from fantwin.simulation.faults import Fault, check_schedule, tacho_faults
-from fantwin.simulation.plant import DeviceClock
-from fantwin.simulation.surroundings import Surroundings, SurroundingsNow
+from fantwin.simulation.plant import DeviceClock, Surroundings, SurroundingsNow
 from fantwin.simulation.tacho import TachoSettings, simulated_tacho
 
 Array: TypeAlias = NDArray[np.float64]

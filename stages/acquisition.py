@@ -21,11 +21,15 @@ from typing import TypeAlias
 from pydantic import Field
 
 from fantwin.pipeline.acquisition.device_commands import DeviceCommands
-from fantwin.pipeline.acquisition.device_sequence import DeviceSequence
-from fantwin.pipeline.acquisition.input_quality import InputQuality
-from fantwin.pipeline.acquisition.plausibility import Plausibility
-from fantwin.pipeline.acquisition.raw_messages import ReceivedReading, raw_message
-from fantwin.pipeline.acquisition.sample_blocks import BlockEvent, ReadingBlock, SampleBlocks
+from fantwin.pipeline.acquisition.input_quality import InputQuality, Plausibility
+from fantwin.pipeline.acquisition.sample_blocks import (
+    BlockEvent,
+    DeviceSequence,
+    ReadingBlock,
+    ReceivedReading,
+    SampleBlocks,
+    raw_message,
+)
 from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageConfig, StageError

@@ -22,8 +22,7 @@ from pydantic import Field
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.learning.fan_alarms import FanAlarms
 from fantwin.pipeline.learning.healthy_history import HealthyHistory, recorded_raws
-from fantwin.pipeline.learning.learning_process import LearningProcess
-from fantwin.pipeline.learning.learning_schedule import LearningSchedule, Work
+from fantwin.pipeline.learning.learning_schedule import LearningProcess, LearningSchedule, Work
 from fantwin.pipeline.learning.ordinary_operation import OrdinaryOperation
 from fantwin.pipeline.learning.versions import TwinVersions, Version, VersionList, learning_folder, overlap
 from fantwin.pipeline.recordings.dates import format_utc

@@ -84,8 +84,8 @@ class OpcuaCore(SiteCore):
 
 def _serve(context: Context, model: SiteModel, desk: RequestDesk) -> OpcuaServer:
     from fantwin.pipeline.certificates import check_pair, make_self_signed, require_valid  # noqa: PLC0415  slow to import
-    from fantwin.pipeline.outputs.opcua.log_in import LogIn, TrustedClients  # noqa: PLC0415
     from fantwin.pipeline.outputs.opcua.server import Listening, OpcuaServer, application_uri  # noqa: PLC0415
+    from fantwin.pipeline.outputs.opcua.sessions import LogIn, TrustedClients  # noqa: PLC0415
     from fantwin.pipeline.site.users import Users  # noqa: PLC0415
 
     config: OpcuaConfig = context.config

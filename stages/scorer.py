@@ -26,12 +26,10 @@ from fantwin.pipeline.prediction.new_samples import BEGINNING_NS, NewSamples
 from fantwin.pipeline.prediction.tray_twin import TrayTwin, load_tray_twin, twin_path
 from fantwin.pipeline.runtime.stage import Admitted, BuiltStage, Context, Core, Stage, StageError, never
 from fantwin.pipeline.tray_scoring.healthy_twin import HealthyTwin, healthy_twin
-from fantwin.pipeline.tray_scoring.judged_share import JudgedShare
 from fantwin.pipeline.tray_scoring.learned_scorer import LearnedTwinScorer
 from fantwin.pipeline.tray_scoring.scorer_config import ScorerConfig
-from fantwin.pipeline.tray_scoring.snapshot_store import Elsewhere, SnapshotStore
-from fantwin.pipeline.tray_scoring.snapshot_times import with_times_moved
-from fantwin.pipeline.tray_scoring.tray_scorer import TrayScorer
+from fantwin.pipeline.tray_scoring.snapshot_store import Elsewhere, SnapshotStore, with_times_moved
+from fantwin.pipeline.tray_scoring.tray_scorer import JudgedShare, TrayScorer
 from fantwin.schemas.enums import Transition
 from fantwin.schemas.messages import Alarm, Message, ModelCard, Prediction, Request, Score, ScorerSnapshot
 from fantwin.schemas.topics import ALL_TRAYS

@@ -9,12 +9,11 @@ import numpy as np
 
 from fantwin.schemas.twin_card import DataCard, TrainingCard, TwinCard
 from fantwin.twin.errors import TwinError
-from fantwin.twin.export.onnx_twin import OnnxTwin
-from fantwin.twin.export.stored_model import stored_hybrid
+from fantwin.twin.export.onnx_twin import OnnxTwin, stored_hybrid
 from fantwin.twin.finishing import TrainedTwin, finish_twin
 from fantwin.twin.fitting.drive_fit import FoundDrive
 from fantwin.twin.fitting.fans_of_a_type import place_fans
-from fantwin.twin.fitting.placed_uncertainty import placed_uncertainty
+from fantwin.twin.fitting.model_uncertainty import placed_uncertainty
 from fantwin.twin.fitting.standstill import find_standstill
 from fantwin.twin.models.hybrid import Hybrid
 from fantwin.twin.models.physics import PARAMETER_NAMES

@@ -18,7 +18,7 @@ import numpy as np
 from bench.detection.tray_run import run_of
 from fantwin.schemas.reference_conditions import ReferenceConditions
 from fantwin.schemas.tacho import Tacho
-from fantwin.simulation.surroundings import Surroundings
+from fantwin.simulation.plant import Surroundings
 from fantwin.simulation.tacho import TachoSettings
 from fantwin.simulation.tray import TraySettings
 from fantwin.twin.build import evaluate, train_twin

@@ -16,11 +16,11 @@ from fantwin.pipeline.replay.offline.calibration_of_twin import calibrated
 from fantwin.pipeline.replay.offline.healthy_runs import HealthyPart, HealthyRuns
 from fantwin.pipeline.replay.offline.kept_bins import KeptBins, RecordedTray, TrayRun
 from fantwin.pipeline.runtime.stage import Core
-from fantwin.pipeline.tray_scoring.modelled_fans import modelled_fans
+from fantwin.pipeline.tray_scoring.healthy_twin import modelled_fans
 from fantwin.schemas.messages import Alarm, Array, Prediction, Score
 from fantwin.scoring.calibration.calibration import Calibration
 from fantwin.scoring.model.bins import Bin, Bins, bin_ns_of
-from fantwin.twin.export.card_entries import with_card_entries
+from fantwin.twin.export.onnx_export import with_card_entries
 
 NAME = "fantwin"
 ROOM_BYTES = 1 << 40

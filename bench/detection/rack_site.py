@@ -25,7 +25,7 @@ from fantwin.pipeline.config.loading import parse_config
 from fantwin.pipeline.config.settings import Config
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.learning.healthy_history import HealthyHistory
-from fantwin.pipeline.learning.learning_process import LearningProcess
+from fantwin.pipeline.learning.learning_schedule import LearningProcess
 from fantwin.pipeline.learning.next_version import make_next_version
 from fantwin.pipeline.learning.ordinary_operation import OrdinaryOperation
 from fantwin.pipeline.learning.versions import DECLARED_PER_DAY, TwinVersions, Version, learning_folder

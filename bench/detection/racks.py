@@ -24,10 +24,10 @@ from fantwin.pipeline.learning.sweep_steps import LEVELS, SHORT_LEVELS, levels_o
 from fantwin.schemas.messages import Array, Raw
 from fantwin.schemas.tacho import Tacho
 from fantwin.schemas.units import NS_PER_S
+from fantwin.simulation.excitation import Thermostat
 from fantwin.simulation.faults import CLOG_S, Fault, four_pin_damage
 from fantwin.simulation.four_pin import FourPinFans, FourPinParameters, four_pin_tray
 from fantwin.simulation.tacho import CountingTacho
-from fantwin.simulation.thermostat import Thermostat
 
 TACHOS = tuple(Tacho(kind="count", window_s=window_s) for window_s in (1.0, 1.0, 0.5, 0.5))
 """of the fans of a rack"""

@@ -37,7 +37,7 @@ from bench.detection.simulated_tables import (
 from bench.detection.without import LIST, UnknownMechanismError, list_mechanisms, mechanism, without
 from bench.printing import JsonOption, progress, show
 from fantwin.pipeline.errors import UserError
-from fantwin.scoring.calibration.alarm_rate import daily_interval
+from fantwin.scoring.calibration.calibration import daily_interval
 
 
 def main(

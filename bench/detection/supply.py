@@ -33,7 +33,7 @@ from fantwin.schemas.messages import Alarm, Grid, Prediction, Raw
 from fantwin.schemas.topics import tray_key
 from fantwin.schemas.units import NS_PER_S
 from fantwin.simulation.faults import Fault
-from fantwin.simulation.surroundings import Measured, Surroundings
+from fantwin.simulation.plant import Measured, Surroundings
 from fantwin.simulation.tacho import NoisyTacho, TachoSettings
 from fantwin.simulation.tray import TraySettings
 from fantwin.twin.build import evaluate, train_twin

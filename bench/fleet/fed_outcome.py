@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from fantwin.pipeline.recordings.order import in_order
+from fantwin.pipeline.recordings.parts import in_order
 from fantwin.pipeline.replay.offline.alarm_episodes import Episode, episodes
 from fantwin.pipeline.replay.offline.offline_pipeline import OfflinePipeline
 from fantwin.pipeline.replay.offline.plan import undisturbed_plan

@@ -25,8 +25,8 @@ from bench.stage_context import stage_context
 from bench.training.published_fan import RATE_HZ
 from fantwin.pipeline.config.loading import parse_config
 from fantwin.pipeline.runtime.building import build_parts
-from fantwin.pipeline.runtime.joint_step import step_together
 from fantwin.pipeline.runtime.stage import Core, load_stage
+from fantwin.pipeline.runtime.steps import step_together
 from fantwin.schemas.messages import Grid, Message
 
 STAGES = ("resampler", "twin_integrator")

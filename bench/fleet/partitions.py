@@ -31,7 +31,7 @@ from bench.fleet.network_hosts import ALONE, Host, Process, bridge
 from bench.printing import JsonOption, progress, show
 from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.config.settings import BusConfig
-from fantwin.pipeline.recordings.order import in_order
+from fantwin.pipeline.recordings.parts import in_order
 from fantwin.pipeline.replay.offline.replay_input import open_replay_input
 from fantwin.pipeline.site.site_watcher import SiteWatcher
 from fantwin.pipeline.site.stage_states import StageView

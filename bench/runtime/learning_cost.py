@@ -29,7 +29,7 @@ from bench.training.published_fan import RATE_HZ, ROUGH_RANGE, published_fan, ra
 from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.config.settings import BusConfig
 from fantwin.pipeline.learning.healthy_history import HealthyHistory
-from fantwin.pipeline.learning.learning_process import VARIABLE
+from fantwin.pipeline.learning.learning_schedule import VARIABLE
 from fantwin.pipeline.learning.versions import TwinVersions, learning_folder
 from fantwin.pipeline.selftest.scratch_site import FANTWIN
 from fantwin.pipeline.site.site_watcher import SiteWatcher

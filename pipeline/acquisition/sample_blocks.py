@@ -1,4 +1,8 @@
-"""Blocks of samples: what a source delivers within the time of one message reaches the stage together.
+"""Messages of raw samples: what a source delivers within the time of one message, and what the device's sequence number
+says of losses.
+
+Samples that were refused are lost. The gap that they leave in the sequence shows it; until there is a gap, or where
+there is no sequence, they are counted as `lost_refused`.
 
 So a stage with a line of 100 samples a second is woken 20 times a second, not 100 times. The rule is the same for all
 sources. Readings are handed over as soon as the next ones, by the time between
@@ -9,11 +13,99 @@ not arrive, the stage takes the waiting ones at its next tick.
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
+import numpy as np
+
+from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.sources.source import LinkDown, LinkUp, Reading, ReadingBatch, SampleSource, SourceEvent
+from fantwin.pipeline.timebase.device_clock import LARGEST_GAP, UINT32
+from fantwin.schemas.channels import CHANNELS
+from fantwin.schemas.messages import Array, Raw, StatedTacho
+from fantwin.schemas.units import RAD_S_PER_UNIT
+
+_RECENT_SAMPLES = 64  # how far back a repeated sample is recognised
+
+
+class DeviceSequence:
+    """Follows the sequence numbers of one device."""
+
+    def __init__(self) -> None:
+        self.refused = 0
+        """samples refused since the last that was used"""
+        self._last: int | None = None
+        self._recent: deque[tuple[int, int | None]] = deque(maxlen=_RECENT_SAMPLES)
+
+    def connection_interrupted(self) -> None:
+        """The device may have been restarted: a number seen before may now belong to a new sample."""
+        self._recent.clear()
+
+    def is_new(self, reading: Reading, counts: Counter[str]) -> bool:
+        """Return whether the reading is new; counts `lost_on_line`, `lost_refused`, `repeated` and
+        `device_restarts`."""
+        is_shown = False
+        if reading.sequence is not None and self._last is not None:
+            step = (reading.sequence - self._last) % UINT32
+            is_shown = 1 <= step <= LARGEST_GAP
+            if step != 1:
+                if (reading.sequence, reading.clock_us) in self._recent:
+                    counts["repeated"] += 1
+                    return False
+                if 1 < step <= LARGEST_GAP:
+                    counts["lost_on_line"] += step - 1
+                else:
+                    counts["device_restarts"] += 1
+        if self.refused and not is_shown:
+            counts["lost_refused"] += self.refused
+        self.refused = 0
+        if reading.sequence is not None:
+            self._last = reading.sequence
+            self._recent.append((reading.sequence, reading.clock_us))
+        return True
+
+
+@dataclass(frozen=True, slots=True)
+class ReceivedReading:
+    """A reading that will be published, and its time of receipt."""
+
+    reading: Reading
+    t_ns: int
+
+    @property
+    def columns(self) -> tuple[bool, ...]:
+        """Presence of each optional column: the samples of one message must agree."""
+        reading = self.reading
+        return (
+            reading.clock_us is not None,
+            reading.sequence is not None,
+            *(each.name in reading.measured for each in CHANNELS),
+        )
+
+
+def raw_message(block: Sequence[ReceivedReading], tray: TrayConfig, tachos: tuple[StatedTacho, ...] = ()) -> Raw:
+    """Make one message of samples that agree in their columns. tachos: what their source states to measure."""
+    readings = [received.reading for received in block]
+    measured: dict[str, Any] = {
+        name: np.array([reading.measured[name] for reading in readings], np.float32) for name in readings[0].measured
+    }
+    return Raw(
+        fans=tray.fans,
+        host_receive_t_ns=np.array([received.t_ns for received in block], np.int64),
+        device_clock_us=_uint32(r.clock_us for r in readings),
+        device_sequence=_uint32(r.sequence for r in readings),
+        command=np.array([r.command for r in readings], np.float64),
+        speed_rad_s=np.array([r.speed for r in readings], np.float64) * RAD_S_PER_UNIT[tray.speed_unit],
+        tachos=tachos,
+        **measured,
+    )
+
+
+def _uint32(values: Iterable[int | None]) -> Array:
+    """A column of numbers that wrap at 2^32; empty if the samples have none."""
+    return np.array([value % UINT32 for value in values if value is not None], np.uint32)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

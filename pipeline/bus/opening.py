@@ -1,4 +1,8 @@
-"""How a session on the bus is opened.
+"""Opening a session on the bus, and closing links whose other end has vanished.
+
+If a client is cut off while its router has data to send, the kernel of the router retransmits for a quarter of an hour.
+Until then Zenoh closes neither the connection nor the session, and still shows the client's tokens. A client that
+connects again meanwhile reaches nobody with its messages. Zenoh has no setting for this.
 
 Processes are peers that need no router. The first to start on a host listens on the configured endpoint; the others
 connect there and discover each other. When the first dies, the rest stay connected, and the next process to start
@@ -13,22 +17,78 @@ in every process. Over a socket they cost no more, and the processes of a small 
 from __future__ import annotations
 
 import json
+import socket
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import zenoh
 
-from fantwin.pipeline.bus.access_rules import SiteRoles, access_control
-from fantwin.pipeline.bus.endpoint import accepts_connections, foreign_program, require_tls_with_security
+from fantwin.pipeline.bus.endpoint import (
+    LEASE_MS,
+    OPEN_TIMEOUT_MS,
+    PEER_WAIT_US,
+    RETRY,
+    accepts_connections,
+    foreign_program,
+    require_tls_with_security,
+)
 from fantwin.pipeline.bus.errors import BusError, reason
-from fantwin.pipeline.bus.link import LEASE_MS, OPEN_TIMEOUT_MS, PEER_WAIT_US, RETRY
+from fantwin.pipeline.bus.rights import SiteRoles, access_control
 from fantwin.pipeline.bus.settings import Settings
 from fantwin.pipeline.config.settings import BusConfig
 
 if TYPE_CHECKING:
-    from fantwin.pipeline.bus.credentials import Credentials
+    from fantwin.pipeline.bus.identity import Credentials
+
+
+UNACKNOWLEDGED_MS = 6000
+"""longest time without an acknowledgement of sent data. Longer than the lease, which ends connections with nothing to
+send"""
+_LOOK_S = 1.0
+
+
+@contextmanager
+def given_up_soon() -> Iterator[None]:
+    """Inside the block, the kernel closes each TCP connection of this process that does not acknowledge sent data for
+    `UNACKNOWLEDGED_MS`. A system without this setting (TCP_USER_TIMEOUT) is left as it is."""
+    if not hasattr(socket, "TCP_USER_TIMEOUT"):
+        yield
+        return
+    has_ended = threading.Event()
+
+    def run() -> None:
+        while not has_ended.wait(_LOOK_S):
+            limit_connections()
+
+    thread = threading.Thread(target=run, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        has_ended.set()
+        thread.join()
+
+
+def limit_connections() -> None:
+    """Set the limit, `UNACKNOWLEDGED_MS`, for the TCP connections that this process has now."""
+    try:
+        paths = list(Path("/proc/self/fd").iterdir())
+    except OSError:  # no descriptor is free to list them with, or there is no such folder
+        return
+    for path in paths:
+        with suppress(OSError):  # closed meanwhile, or no socket
+            if path.readlink().name.startswith("socket:"):
+                its = socket.socket(fileno=int(path.name))
+                try:
+                    if its.type == socket.SOCK_STREAM and its.family in (socket.AF_INET, socket.AF_INET6):
+                        its.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, UNACKNOWLEDGED_MS)
+                finally:
+                    its.detach()  # the descriptor is not ours to close
+
 
 ONE_CONNECTS = {"peer": {"to_router": "always", "to_peer": "greater-zid"}}
 """Of two peers that discover each other, the one with the greater id connects. By default both connect at once, and
@@ -48,7 +108,7 @@ def credentials_of(config: BusConfig, roles: Sequence[str]) -> Credentials | Non
     require_tls_with_security(config)
     if config.security is None:
         return None
-    from fantwin.pipeline.bus.credentials import checked_credentials  # noqa: PLC0415  takes 0.1 s, which most do without
+    from fantwin.pipeline.bus.identity import checked_credentials  # noqa: PLC0415  takes 0.1 s, which most do without
 
     return checked_credentials(config.security, roles)
 

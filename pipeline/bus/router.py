@@ -8,15 +8,14 @@ from typing import TYPE_CHECKING, Any
 
 import zenoh
 
-from fantwin.pipeline.bus.access_rules import SiteRoles, access_control
-from fantwin.pipeline.bus.dead_links import given_up_soon
+from fantwin.pipeline.bus.endpoint import LEASE_MS, RETRY
 from fantwin.pipeline.bus.errors import BusError, reason
-from fantwin.pipeline.bus.link import LEASE_MS, RETRY
-from fantwin.pipeline.bus.rights import answer_rights
+from fantwin.pipeline.bus.opening import given_up_soon
+from fantwin.pipeline.bus.rights import SiteRoles, access_control, answer_rights
 from fantwin.pipeline.bus.settings import Settings
 
 if TYPE_CHECKING:
-    from fantwin.pipeline.bus.credentials import Credentials
+    from fantwin.pipeline.bus.identity import Credentials
 
 QUEUE_BATCHES = 16
 """of 64 KiB for each client, the most that Zenoh allows: for what is sent to a client that has vanished"""

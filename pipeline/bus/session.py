@@ -15,11 +15,9 @@ from typing import ClassVar, Self
 
 import zenoh
 
-from fantwin.pipeline.bus.access_rules import SiteRoles
 from fantwin.pipeline.bus.endpoint import endpoint_problem, somebody_listens
 from fantwin.pipeline.bus.errors import BusError, NoAnswerError
 from fantwin.pipeline.bus.identity import Forgeries, new_session_id, sender_of
-from fantwin.pipeline.bus.kept_messages import KeptQuery, answer_for_kept, ask_for_kept
 from fantwin.pipeline.bus.meeting import Meeting
 from fantwin.pipeline.bus.opening import (
     MEETING_LIMIT_S,
@@ -29,9 +27,16 @@ from fantwin.pipeline.bus.opening import (
     open_session,
     zenoh_config,
 )
-from fantwin.pipeline.bus.publisher import KeptBytes, Publisher
+from fantwin.pipeline.bus.publisher import KeptBytes, KeptQuery, Publisher, answer_for_kept, ask_for_kept
 from fantwin.pipeline.bus.recovery import ALL_PRODUCERS, LAST_SEQUENCE, Answer, OnAnswer, RecoveryRequest, recovery_key
-from fantwin.pipeline.bus.rights import awaited_rights, claims_of, granted_rights, refused_by_router, refused_in_words
+from fantwin.pipeline.bus.rights import (
+    SiteRoles,
+    awaited_rights,
+    claims_of,
+    granted_rights,
+    refused_by_router,
+    refused_in_words,
+)
 from fantwin.pipeline.config.roles import READERS
 from fantwin.pipeline.config.settings import BusConfig, Config
 from fantwin.schemas.topics import Topic, key_in_words, largest_bytes

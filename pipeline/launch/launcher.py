@@ -18,15 +18,14 @@ from fantwin.pipeline.config.roles import role_names, roles_of
 from fantwin.pipeline.config.settings import Config
 from fantwin.pipeline.config.shards import StageProcess, own_file, process_list
 from fantwin.pipeline.errors import UserError
-from fantwin.pipeline.launch.hang_detector import HangDetector
-from fantwin.pipeline.launch.processes import EXIT_CANNOT_START, Child
+from fantwin.pipeline.launch.processes import EXIT_CANNOT_START, Child, HangDetector
 from fantwin.pipeline.launch.site_report import RunningProcess, SiteReport
 from fantwin.pipeline.prediction.tray_twin import load_tray_twin, twin_path
 from fantwin.pipeline.recordings.parts import part_files, part_path
 from fantwin.pipeline.runtime.stage import load_stage
 from fantwin.pipeline.site.loss_accounting import Launched
 from fantwin.pipeline.site.site_watcher import SiteWatcher
-from fantwin.pipeline.site.stage_notes import note_lines
+from fantwin.pipeline.site.stage_states import note_lines
 from fantwin.pipeline.timebase.host_clock import HOST_CLOCK
 from fantwin.pipeline.timebase.stage_clock import REPLAY
 from fantwin.schemas.enums import StageStatus

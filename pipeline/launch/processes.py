@@ -1,21 +1,132 @@
-"""Child processes: one for each stage, or for each shard of a stage."""
+"""Child processes, one for each stage or shard of a stage: what they report by systemd's protocol, and which of them
+hangs.
+
+A stage that publishes to a hung stage is soon blocked itself. So only the stage that has been silent longest is named.
+All others get a new period, because they go on once it is gone.
+"""
 
 from __future__ import annotations
 
 import errno
 import os
+import secrets
 import signal
+import socket
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from pathlib import Path
 
 from fantwin.pipeline.config.shards import StageProcess
-from fantwin.pipeline.launch.notices import Notices
 from fantwin.pipeline.runtime.service_manager import VARIABLE as NOTIFY_VARIABLE
+from fantwin.pipeline.site.stage_states import START_LIMIT_S
 from fantwin.pipeline.timebase.host_clock import VARIABLE as CLOCK_VARIABLE
+
+_AT_WORK_S = 2.0
+_OWN_PAUSE_S = 1.0  # the launcher itself did not run: the machine was suspended or very busy
+
+
+@dataclass(slots=True)
+class _Heard:
+    at_s: float
+    is_ready: bool = False
+
+
+class HangDetector:
+    """Notes when each stage was last at work, and names the one that hangs. Times: monotonic clock, s."""
+
+    def __init__(self, limit_s: float) -> None:
+        """limit_s: how long a stage may be silent."""
+        self._limit_s = limit_s
+        self._heard: dict[str, _Heard] = {}
+        self._checked_s: float | None = None
+
+    def started(self, name: str, now_s: float) -> None:
+        """A stage has been started."""
+        self._heard[name] = _Heard(now_s)
+
+    def heard(self, name: str, now_s: float, *, is_ready: bool) -> None:
+        """The main loop of a stage has run."""
+        self._heard[name] = _Heard(now_s, is_ready)
+
+    def is_at_work(self, name: str, now_s: float) -> bool:
+        """Whether the main loop of a stage ran a moment ago."""
+        return name in self._heard and now_s - self._heard[name].at_s < _AT_WORK_S
+
+    def ended(self, name: str) -> None:
+        """A stage has ended."""
+        self._heard.pop(name, None)
+
+    def hung(self, now_s: float) -> tuple[str, float] | None:
+        """The stage that hangs, and for how many seconds; None if none does.
+
+        Call it at least once a second: a longer pause is taken to be one of the caller itself, and no stage is blamed
+        for it. The stage that is returned is forgotten; the caller must kill it.
+        """
+        pause_s = 0.0 if self._checked_s is None else now_s - self._checked_s
+        self._checked_s = now_s
+        if pause_s > _OWN_PAUSE_S:
+            for heard in self._heard.values():
+                heard.at_s = min(now_s, heard.at_s + pause_s)
+        silent = {name: now_s - heard.at_s for name, heard in self._heard.items() if self._is_overdue(heard, now_s)}
+        if not silent:
+            return None
+        name = max(silent, key=lambda each: silent[each])
+        del self._heard[name]
+        for heard in self._heard.values():
+            heard.at_s = now_s
+        return name, silent[name]
+
+    def _is_overdue(self, heard: _Heard, now_s: float) -> bool:
+        return now_s - heard.at_s > (self._limit_s if heard.is_ready else max(self._limit_s, START_LIMIT_S))
+
+
+_MAX_BYTES = 4096
+
+
+class Notices:
+    """The socket of one child. Only on Linux: its name is an abstract one, which leaves no file behind."""
+
+    def __init__(self) -> None:
+        """Open the socket.
+
+        Raises:
+            OSError: the system is out of memory or open files.
+        """
+        self.address = f"@fantwin-{os.getpid()}-{secrets.token_hex(8)}"
+        """value of NOTIFY_SOCKET for the child"""
+        self.is_ready = False
+        self.status = ""
+        """its last status line"""
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        try:
+            self._socket.setblocking(False)
+            self._socket.bind(f"\0{self.address[1:]}")
+        except OSError:
+            self._socket.close()
+            raise
+
+    def read(self) -> bool:
+        """Read all that has arrived; returns whether the child's main loop has run since the last call."""
+        was_at_work = False
+        while True:
+            try:
+                data = self._socket.recv(_MAX_BYTES)
+            except OSError:  # nothing more
+                return was_at_work
+            for line in data.decode(errors="replace").split("\n"):
+                name, _, value = line.partition("=")
+                was_at_work |= name == "WATCHDOG"
+                self.is_ready |= name == "READY"
+                self.status = value if name == "STATUS" else self.status
+
+    def close(self) -> None:
+        """Release the socket."""
+        self._socket.close()
+
 
 EXIT_CANNOT_START = 78  # the stage cannot run as configured; one line on stderr says why (EX_CONFIG of sysexits.h)
 

@@ -13,7 +13,7 @@ from fantwin.pipeline.learning.versions import Drop
 from fantwin.pipeline.prediction.tray_twin import TrayTwin, load_tray_twin
 from fantwin.pipeline.replay.offline.calibration_of_twin import calibration_in
 from fantwin.pipeline.replay.offline.healthy_runs import FreeLimit
-from fantwin.pipeline.tray_scoring.modelled_fans import modelled_fans
+from fantwin.pipeline.tray_scoring.healthy_twin import modelled_fans
 from fantwin.schemas.enums import InvalidReason
 from fantwin.schemas.messages import Array, Prediction
 from fantwin.schemas.units import NS_PER_S

@@ -16,18 +16,23 @@ import numpy as np
 
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.prediction.tray_twin import TrayTwin, load_tray_twin
-from fantwin.pipeline.recordings.checksum import sha256_of
 from fantwin.pipeline.recordings.clips.clip import require_no_clip
 from fantwin.pipeline.recordings.contents import contents_of
-from fantwin.pipeline.replay.offline.alarm_episodes import episodes
+from fantwin.pipeline.recordings.metadata import sha256_of
+from fantwin.pipeline.replay.offline.alarm_episodes import (
+    LeftOut,
+    MarkedAlarm,
+    alarms_in,
+    concerning,
+    episodes,
+    marked_alarms,
+)
 from fantwin.pipeline.replay.offline.calibration_of_twin import CalibratedTwin, calibration_in, number_text
 from fantwin.pipeline.replay.offline.healthy_runs import DecidedRun, HealthyPart, LearnedRun, MapRecordings
-from fantwin.pipeline.replay.offline.marked_alarms import LeftOut, MarkedAlarm, alarms_in, concerning, marked_alarms
 from fantwin.pipeline.replay.offline.rescoring import rescore
 from fantwin.schemas.enums import Feedback
 from fantwin.schemas.messages import Alarm
-from fantwin.scoring.calibration.alarm_rate import daily_interval
-from fantwin.scoring.calibration.calibration import Calibration, expected_alarms, is_exceeded
+from fantwin.scoring.calibration.calibration import Calibration, daily_interval, expected_alarms, is_exceeded
 from fantwin.scoring.model.priors import Priors
 
 

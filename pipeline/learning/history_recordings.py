@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fantwin.pipeline.learning.versions import TimeSpan, overlap
-from fantwin.pipeline.recordings.rare_messages import last_message_ns
+from fantwin.pipeline.recordings.indexed import last_message_ns
 from fantwin.pipeline.recordings.reading import RecordingError, read_recording
 from fantwin.pipeline.recordings.records import ACTIVE_SUFFIX
 from fantwin.pipeline.recordings.repair import repair_in_place

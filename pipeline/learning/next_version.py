@@ -22,7 +22,6 @@ from threadpoolctl import threadpool_limits
 
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.files import write_whole
-from fantwin.pipeline.learning.calibrating import calibrated_on, with_calibration
 from fantwin.pipeline.learning.drops_found import drops_found
 from fantwin.pipeline.learning.fan_changes import (
     changed_fans,
@@ -32,7 +31,7 @@ from fantwin.pipeline.learning.fan_changes import (
     mean_changes,
     residual_of,
 )
-from fantwin.pipeline.learning.fitting import fit_twin
+from fantwin.pipeline.learning.fitting import calibrated_on, fit_twin, with_calibration
 from fantwin.pipeline.learning.healthy_history import healthy_recordings, recordings_near_alarms
 from fantwin.pipeline.learning.history_recordings import HistoryRecording
 from fantwin.pipeline.learning.training_data import TrainingData, twin_errors
@@ -339,7 +338,7 @@ class _Work:
         named, done = self._place / "named.onnx", self._place / "calibrated.onnx"
         with twin_errors():
             # The command line loads twin only when it is needed.
-            from fantwin.twin.export.card_entries import with_card_entries  # noqa: PLC0415
+            from fantwin.twin.export.onnx_export import with_card_entries  # noqa: PLC0415
 
             named.write_bytes(with_card_entries(twin.read_bytes(), {"name": self._name}))
         self._say(f"{self._name}: calibrating on {_hours(sum(each.seconds for each in of))} of healthy running")

@@ -17,10 +17,10 @@ from fantwin.pipeline.prediction.free_run import FreeRun, FreeRunInputs
 from fantwin.pipeline.prediction.starting_fans import StartingFans
 from fantwin.pipeline.prediction.twin_file import TwinFile
 from fantwin.pipeline.runtime.stage import StageConfig
+from fantwin.schemas.blocks import present_columns
 from fantwin.schemas.channels import measured_columns
 from fantwin.schemas.enums import InvalidReason
 from fantwin.schemas.messages import Array, Grid, Prediction
-from fantwin.schemas.side_by_side import present_columns
 from fantwin.schemas.standstill import Standstill
 from fantwin.schemas.units import NS_PER_S
 from fantwin.scoring.column_state import ColumnState

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from fantwin.pipeline.recordings.order import Seen, in_order
+from fantwin.pipeline.recordings.parts import Seen, in_order
 from fantwin.pipeline.recordings.reading import RecordingError, read_recording
 from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.fields import (

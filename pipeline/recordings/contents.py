@@ -9,7 +9,6 @@ from typing import BinaryIO
 
 from fantwin.pipeline.recordings.disk import is_being_written
 from fantwin.pipeline.recordings.indexed import IndexedRecording, PartIndex
-from fantwin.pipeline.recordings.message_counts import MessageCounts
 from fantwin.pipeline.recordings.reading import METADATA_NAME
 from fantwin.pipeline.recordings.records import CORRUPT_DATA_ERRORS, indexed_reader
 from fantwin.pipeline.recordings.run_recordings import RECORDING_KEY
@@ -18,6 +17,7 @@ from fantwin.pipeline.recordings.sequence_ledger import (
     BEFORE_NAME,
     ENDED,
     LEDGER_NAME,
+    MessageCounts,
     StreamCounts,
     before_from_metadata,
     counts_from_metadata,

@@ -19,8 +19,7 @@ from fantwin.pipeline.recordings.reading import Reading, RecordingError, read_me
 from fantwin.pipeline.sources.tables.measured_table import hold_last
 from fantwin.pipeline.timebase.device_clock import DeviceClock
 from fantwin.schemas.channels import CHANNELS, measured_columns
-from fantwin.schemas.codec import CodecError
-from fantwin.schemas.fast_decode import decode_together
+from fantwin.schemas.codec import CodecError, decode_together
 from fantwin.schemas.messages import Array, Raw
 from fantwin.schemas.tacho import Tacho, tacho_of_each_fan
 from fantwin.schemas.topics import tray_of

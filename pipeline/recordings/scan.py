@@ -24,7 +24,6 @@ from mcap.records import (
 from mcap.summary import Summary
 from mcap.writer import MCAP0_MAGIC
 
-from fantwin.pipeline.recordings.message_counts import MessageCounts
 from fantwin.pipeline.recordings.reading import METADATA_NAME, left_out_of
 from fantwin.pipeline.recordings.records import (
     CORRUPT_DATA_ERRORS,
@@ -41,6 +40,7 @@ from fantwin.pipeline.recordings.sequence_ledger import (
     BEFORE_NAME,
     ENDED,
     LEDGER_NAME,
+    MessageCounts,
     SequenceLedger,
     StreamCounts,
     before_from_metadata,

@@ -1,6 +1,8 @@
 """The sequence ledger of a recording: how many messages of each stream were recorded, are missing, or came twice.
 
 See schemas/streams.py for what a stream is and how its gaps are counted.
+
+Counts the messages of a file: its sequence ledger, and the last health of each session and card of each twin.
 """
 
 from __future__ import annotations
@@ -9,7 +11,9 @@ import json
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 
+from fantwin.schemas.codec import CodecError, decode, decode_header
 from fantwin.schemas.health import Health
+from fantwin.schemas.messages import ModelCard
 from fantwin.schemas.streams import StreamId, StreamState, output_streams
 from fantwin.schemas.topics import HEALTH, known_topic
 
@@ -246,3 +250,39 @@ def _is_thinned(stream: StreamId) -> bool:
 def _stream(name: str) -> StreamId:
     key, _, producer = name.partition(" ")
     return key, producer
+
+
+class MessageCounts:
+    """Counts of one file. Messages are added in file order."""
+
+    def __init__(self) -> None:
+        self.ledger = SequenceLedger()
+        self.others: dict[str, StreamCounts] = {}
+        """messages on channels that are not fantwin's, by topic"""
+        self.sessions: dict[str, Health] = {}
+        """the last health of each session, by its producer; the session heard last is at the end"""
+        self.cards: dict[str, ModelCard] = {}
+        self.undecodable = 0
+        """messages that do not have the type of their channel"""
+
+    def add(self, key: str, received_t_ns: int, payload: bytes) -> None:
+        """Add a message."""
+        topic = known_topic(key)
+        if topic is None:
+            counts = self.others.setdefault(key, StreamCounts(first_ns=received_t_ns))
+            counts.messages += 1
+            counts.last_ns = max(received_t_ns, counts.last_ns or 0)
+            return
+        try:
+            header = decode_header(topic.message, payload)
+            message = decode(topic.message, payload) if topic.message in (Health, ModelCard) else None
+        except CodecError:
+            self.undecodable += 1
+            return
+        self.ledger.add(key, header.producer, header.sequence, received_t_ns)
+        if isinstance(message, Health):
+            self.sessions.pop(header.producer, None)
+            self.sessions[header.producer] = message
+            self.ledger.add_health(message)
+        elif isinstance(message, ModelCard):
+            self.cards[key] = message

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-from fantwin.pipeline.recordings.rare_messages import last_message_ns
-from fantwin.pipeline.recordings.reading import RecordingError, read_metadata
-from fantwin.pipeline.recordings.records import ACTIVE_SUFFIX, UnreadableError, whole_number
+from fantwin.pipeline.recordings.indexed import last_message_ns
+from fantwin.pipeline.recordings.reading import read_metadata
+from fantwin.pipeline.recordings.records import ACTIVE_SUFFIX, RecordingError, UnreadableError, whole_number
 from fantwin.pipeline.recordings.run_recordings import CLIPS, RECORDING_KEY
 
 SUFFIX = ".mcap"

@@ -13,8 +13,7 @@ from collections.abc import Callable, Iterable
 from fantwin.pipeline.bus.recovery import ALL_PRODUCERS, LAST_SEQUENCE, Answer, RecoveryRequest
 from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.runtime.inbox import Inbox, Recovered
-from fantwin.pipeline.runtime.sequence_tracker import Found
-from fantwin.pipeline.runtime.tracked_streams import Request
+from fantwin.pipeline.runtime.sequence_tracker import Found, Request
 from fantwin.schemas.topics import topic_of
 
 MOST_AT_A_TIME = 8

@@ -13,15 +13,12 @@ from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.config.roles import roles_of
 from fantwin.pipeline.config.settings import Config
 from fantwin.pipeline.config.shards import Shard
-from fantwin.pipeline.runtime.believed_health import BelievedHealth
-from fantwin.pipeline.runtime.due_messages import DueMessages
-from fantwin.pipeline.runtime.health import HealthBuilder
-from fantwin.pipeline.runtime.inbox import FromBus, Inbox, Liveness, Recovered
-from fantwin.pipeline.runtime.lost_sessions import LostSessions
+from fantwin.pipeline.runtime.health import BelievedHealth, HealthBuilder
+from fantwin.pipeline.runtime.inbox import DueMessages, FromBus, Inbox, Liveness, Recovered
 from fantwin.pipeline.runtime.missed_messages import Recovery
 from fantwin.pipeline.runtime.peers import Peers
 from fantwin.pipeline.runtime.sequence_tracker import Found, SequenceTracker
-from fantwin.pipeline.runtime.sessions import Sessions, this_host
+from fantwin.pipeline.runtime.sessions import LostSessions, Sessions, this_host
 from fantwin.pipeline.runtime.silences import Silences
 from fantwin.pipeline.runtime.stage import Stage
 from fantwin.pipeline.timebase.host_clock import HOST_CLOCK

@@ -4,6 +4,13 @@ Each session of a stage shows a liveliness token, which says its trays, from bef
 however it ends. A stage is refused at its start if the token of another process already shows one of its trays. Where
 two were started at once, or a network has healed, all see both tokens, and the one that started earlier ends. Until
 then the later one is the owner.
+
+Sessions on this host that were killed, and those whose link was cut.
+
+The token of a session disappears when its process dies, and also when a link is cut. The two can be distinguished
+only for processes on this host: by whether the process still runs.
+
+A stage is refused at its start where another process already has one of its trays.
 """
 
 from __future__ import annotations
@@ -11,12 +18,77 @@ from __future__ import annotations
 import os
 import re
 import socket
-from collections.abc import Collection, Iterable, Set
-from dataclasses import dataclass
+import threading
+import time
+from collections.abc import Callable, Collection, Iterable, Set
+from dataclasses import dataclass, field
 
+from fantwin.pipeline.bus.session import Bus
+from fantwin.pipeline.config.registry import STAGES
 from fantwin.pipeline.config.shards import Shard
+from fantwin.pipeline.runtime.stage import StageError
+from fantwin.pipeline.timebase.stage_clock import REPLAY
 from fantwin.schemas.health import Health
-from fantwin.schemas.topics import SESSION_CHUNK, health_key, session_key, stage_label, topic_of
+from fantwin.schemas.topics import (
+    ALL_TRAYS,
+    SESSION_CHUNK,
+    alive_key,
+    health_key,
+    session_key,
+    sessions_key,
+    stage_label,
+    topic_of,
+)
+
+APART_S, APART_LIMIT_S = 2.0, 60.0
+"""time after a token has disappeared in which a session whose process still runs counts as cut off: earlier, it may be
+about to end; later, its process id may be reused"""
+
+
+@dataclass
+class LostSessions:
+    """Finds sessions whose token has disappeared, and whether their process still runs. host: the name of this host, as
+    sessions show it."""
+
+    host: str
+    now_s: Callable[[], float] = time.monotonic
+    _seen: dict[str, Session] = field(default_factory=dict)
+    """by token: sessions whose process was once found to run here. The number of a process in another container may not
+    exist here, or may be that of another process"""
+    _gone: dict[str, tuple[Session, float]] = field(default_factory=dict)
+    """by token: those of them whose token has disappeared, and when; the last ones"""
+
+    def update(self, key: str, alive: bool) -> None:
+        """A token has appeared or disappeared."""
+        if not alive:
+            if (session := self._seen.pop(key, None)) is not None:
+                self._gone[key] = session, self.now_s()
+                if len(self._gone) > MOST_SESSIONS:
+                    del self._gone[next(iter(self._gone))]
+            return
+        self._gone.pop(key, None)
+        session = Session.of_key(key)
+        if session is None or session.host != self.host or session.process_id == os.getpid():
+            return
+        if session.may_live(self.host) and len(self._seen) < MOST_SESSIONS:
+            self._seen[key] = session
+
+    def take_killed(self) -> list[str]:
+        """The producers of the sessions that were killed; each is returned once."""
+        killed = {key: each for key, (each, _) in self._gone.items() if not each.may_live(self.host)}
+        for key in killed:
+            del self._gone[key]
+        return [each.producer for each in killed.values()]
+
+    def cut_off(self) -> list[str]:
+        """The producers of the sessions that still run, and whose token disappeared a while ago."""
+        now_s = self.now_s()
+        return [
+            each.producer
+            for each, since_s in self._gone.values()
+            if APART_S <= now_s - since_s < APART_LIMIT_S and each.may_live(self.host)
+        ]
+
 
 MOST_SESSIONS = 4096
 _BETWEEN_TRAYS = "+"
@@ -239,3 +311,49 @@ def trays_in_words(trays: Collection[str]) -> str:
 
 def _is_number(text: str) -> bool:
     return text.isascii() and text.isdigit() and len(text) < 20
+
+
+GOSSIP_S = 0.2
+"""how long a starting stage waits for further processes after it has met the first: they took 6 ms"""
+LEAVING_LIMIT_S = 2.0
+"""how long it waits for a predecessor that is about to leave"""
+_POLL_S = 0.02
+
+
+def refuse_second(bus: Bus, site: str, session: Session, stop: threading.Event) -> None:
+    """Return if no other process has a tray of this session in its stage, and no replay presents the site to a stage
+    with a device; wait a moment for one that is about to leave.
+
+    Raises:
+        StageError: one does.
+        BusError: a program that is not fantwin listens at the endpoint, or who is on the bus is not known.
+    """
+    replay = alive_key(site, REPLAY, ALL_TRAYS) if STAGES[session.stage].scope == "tray" else ""
+    bus.wait_for_others(stop)
+    met_s = time.monotonic()
+    while True:
+        others, is_replayed = _others(bus, site, session), bool(replay and bus.alive(replay))
+        limit_s = LEAVING_LIMIT_S if others or is_replayed else GOSSIP_S
+        if time.monotonic() - met_s >= limit_s or not bus.came_second or stop.wait(_POLL_S):
+            break
+    if is_replayed:
+        raise StageError(
+            f"a replay presents site {site!r}: stop it, or give {session.name} another site or bus.endpoint"
+        )
+    if others and others[0].instance == session.instance:
+        raise StageError(
+            f"{session.name} of site {site!r} already runs: {others[0].process}; stop that, or give this one another "
+            "site, tray or bus.endpoint"
+        )
+    if others:
+        shared = [tray for tray in session.trays or others[0].trays if others[0].has(tray)]
+        raise StageError(
+            f"{session.name} of site {site!r} cannot start: {others[0].name} already has {trays_in_words(shared)}: "
+            f"{others[0].process}; stop that, or give this one other trays"
+        )
+
+
+def _others(bus: Bus, site: str, session: Session) -> list[Session]:
+    found = filter(None, map(Session.of_key, bus.alive(sessions_key(site, session.stage))))
+    others = (each for each in found if each != session and each.shares_a_tray_with(session))
+    return [each for each in others if each.may_live(session.host)]

@@ -1,4 +1,8 @@
-"""Which alarms were raised while fans were judged, and what operators said of them: the observed rate.
+"""The observed rate of alarms: for how long fans were judged, which alarms were raised then, and what operators said of
+them.
+
+Of a large site some scores of each tray are decoded, and not every one; so a score stands for the time since the one
+before.
 
 It is kept in the file of the history of alarms, and goes on after a restart.
 """
@@ -7,16 +11,72 @@ from __future__ import annotations
 
 import sqlite3
 from collections.abc import Sequence
-from dataclasses import astuple
+from dataclasses import astuple, dataclass, replace
+
+import numpy as np
 
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.site.alarm_history import AlarmHistory
-from fantwin.pipeline.site.judged_time import JudgedStretch
 from fantwin.schemas.enums import Feedback, Transition
-from fantwin.schemas.messages import Alarm
+from fantwin.schemas.messages import Alarm, Score
 from fantwin.schemas.units import NS_PER_S
 from fantwin.scoring.alarms.alarm_state import GIVES_FEEDBACK
-from fantwin.scoring.calibration.observed_rate import ObservedRate
+from fantwin.scoring.calibration.calibration import ObservedRate
+
+LONGEST_STEP_NS = 5 * NS_PER_S
+"""between two scores of a stretch; after a longer pause another one begins"""
+LONGEST_PERIODS = 3
+"""and so long where samples come more slowly than that"""
+SAVED_EVERY_NS = 10 * NS_PER_S
+LEARNED = "learned"
+"""names the twins of a tray that learns them: each version continues the time of the one before"""
+
+
+@dataclass(frozen=True)
+class JudgedStretch:
+    """A time in which the fans of a tray were judged by one twin, or by learned ones.
+
+    Attributes:
+        fan_ns: judged time, summed over fans.
+        declared_per_day: false alarms per fan and day that the twin declares; None: none.
+    """
+
+    tray: str
+    twin: str
+    first_t_ns: int
+    last_t_ns: int
+    fan_ns: int
+    declared_per_day: float | None = None
+
+
+class JudgedTime:
+    """The stretch of each tray that is growing."""
+
+    def __init__(self) -> None:
+        self._growing: dict[str, JudgedStretch] = {}
+        self._saved_t_ns: dict[str, int] = {}
+
+    def add(self, score: Score, twin: str, declared_per_day: float | None) -> list[JudgedStretch]:
+        """A score of a tray has come. twin, declared_per_day: as in JudgedStretch. Returns what is to be kept now."""
+        tray, t_ns = score.header.tray, int(score.t_ns[-1])
+        before = self._growing.get(tray)
+        step_ns = t_ns - before.last_t_ns if before else -1
+        longest_ns = max(LONGEST_STEP_NS, LONGEST_PERIODS * score.period_ns)
+        if before is None or before.twin != twin or not 0 <= step_ns <= longest_ns:
+            self._growing[tray] = JudgedStretch(tray, twin, t_ns, t_ns, 0, declared_per_day)
+            self._saved_t_ns[tray] = t_ns
+            return [before] if before else []
+        fan_ns = before.fan_ns + step_ns * int(np.count_nonzero(score.valid[-1]))
+        self._growing[tray] = replace(before, last_t_ns=t_ns, fan_ns=fan_ns)
+        if t_ns - self._saved_t_ns[tray] < SAVED_EVERY_NS:
+            return []
+        self._saved_t_ns[tray] = t_ns
+        return [self._growing[tray]]
+
+    def growing(self) -> list[JudgedStretch]:
+        """Those that are not over."""
+        return list(self._growing.values())
+
 
 MOST_KEPT = 200_000
 """alarms, and stretches of judged time; those that are older are deleted"""

@@ -17,9 +17,9 @@ from fantwin.pipeline.site.trace import SILENT, state_codes, state_name
 from fantwin.schemas.enums import FanState, InvalidReason, Transition
 from fantwin.schemas.fields import LARGEST_ENUM_VALUE
 from fantwin.schemas.messages import Alarm, Array, Score
-from fantwin.scoring.alarms.alarm_flags import is_silenced
+from fantwin.scoring.alarms.alarm_state import is_silenced
+from fantwin.scoring.alarms.alarm_text import words_now
 from fantwin.scoring.alarms.unscored_monitor import JUDGED_AT_REST
-from fantwin.scoring.alarms.words_now import words_now
 
 NORMAL_LEVELS = 5
 """shades of a normal fan's cell, by its score"""

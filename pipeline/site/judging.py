@@ -12,9 +12,9 @@ from fantwin.pipeline.site.stage_states import StageState, Word
 from fantwin.schemas.enums import InvalidReason
 from fantwin.schemas.fan_numbers import fans_in_words
 from fantwin.schemas.messages import Alarm
+from fantwin.scoring.alarms.alarm_text import STARTING, STOPPED
 from fantwin.scoring.alarms.current_alarms import CurrentAlarm
 from fantwin.scoring.alarms.unscored_monitor import REASONS
-from fantwin.scoring.alarms.words_now import STARTING, STOPPED
 
 _LAST_JUDGE = "scorer"
 

@@ -20,9 +20,9 @@ from fantwin.schemas.enums import Feedback, Transition
 from fantwin.schemas.messages import Alarm, Array, ModelCard
 from fantwin.schemas.twin_card import CardError, TwinCard
 from fantwin.schemas.units import RAD_S_PER_UNIT
-from fantwin.scoring.alarms.alarm_flags import is_listed
+from fantwin.scoring.alarms.alarm_state import is_listed
 from fantwin.scoring.alarms.current_alarms import CurrentAlarm
-from fantwin.scoring.calibration.observed_rate import together
+from fantwin.scoring.calibration.calibration import together
 from fantwin.scoring.diagnosis.causes import (
     CANNOT_TELL,
     advice,

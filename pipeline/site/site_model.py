@@ -19,10 +19,9 @@ from fantwin.pipeline.config.registry import STAGES
 from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.site.alarm_book import AlarmBook
 from fantwin.pipeline.site.alarm_history import AlarmHistory
-from fantwin.pipeline.site.alarm_rates import AlarmRates
+from fantwin.pipeline.site.alarm_rates import LEARNED, AlarmRates, JudgedTime
 from fantwin.pipeline.site.fan_history import COLUMNS, Curves, FanHistory, channels_of, values_of
 from fantwin.pipeline.site.fleet import SHOWN_CLASSES, Fan, FanGroup, FanNow, Fleet, last_sample
-from fantwin.pipeline.site.judged_time import LEARNED, JudgedTime
 from fantwin.pipeline.site.stage_states import HeardHealth, StageState, stage_states
 from fantwin.schemas.codec import CodecError, decode
 from fantwin.schemas.enums import Feedback, InvalidReason, StageStatus, Transition
@@ -31,8 +30,8 @@ from fantwin.schemas.health import Health
 from fantwin.schemas.messages import Alarm, Array, ModelCard, Score, ScorerSnapshot
 from fantwin.scoring.alarms.current_alarms import CurrentAlarm
 from fantwin.scoring.alarms.unscored_monitor import JUDGED_AT_REST
-from fantwin.scoring.calibration.observed_rate import ObservedRate, declared_per_day
-from fantwin.scoring.wear.recorded_wear import wear_in, wear_rows
+from fantwin.scoring.calibration.calibration import ObservedRate, declared_per_day
+from fantwin.scoring.wear.wear_monitor import wear_in, wear_rows
 
 SILENT_AFTER_S = 5.0
 """a tray without a score for so long is silent; and so is a stage without a health message, which may have left the

@@ -11,13 +11,11 @@ from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.config.roles import Role, roles_of_stages
 from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.config.shards import StageProcess
-from fantwin.pipeline.runtime.believed_health import BelievedHealth
-from fantwin.pipeline.runtime.lost_sessions import LostSessions
-from fantwin.pipeline.runtime.sessions import Session, this_host
+from fantwin.pipeline.runtime.health import BelievedHealth
+from fantwin.pipeline.runtime.sessions import LostSessions, Session, this_host
 from fantwin.pipeline.site.known_sessions import KnownSessions
-from fantwin.pipeline.site.loss_accounting import Launched, label, losses
+from fantwin.pipeline.site.loss_accounting import Launched, label, losses, refused, unusable_lines
 from fantwin.pipeline.site.one_line import readable_alarm, readable_health
-from fantwin.pipeline.site.refused_input import refused, unusable_lines
 from fantwin.pipeline.site.site_model import SiteModel
 from fantwin.pipeline.site.stage_states import HeardHealth, StageState, StageView, stage_states
 from fantwin.schemas.codec import CodecError, decode
@@ -161,7 +159,7 @@ class SiteWatcher:
             return losses((each.health for each in self._believed()), launched, reads)
 
     def refused(self) -> dict[str, dict[str, int]]:
-        """What every stage has refused, over all its sessions; see `pipeline.site.refused_input`."""
+        """What every stage has refused, over all its sessions; see `pipeline.site.loss_accounting`."""
         with self._lock:
             return refused(each.health for each in self._believed())
 

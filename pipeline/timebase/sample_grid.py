@@ -25,11 +25,10 @@ from fantwin.pipeline.timebase.interpolation import (
 )
 from fantwin.pipeline.timebase.line_guard import LineGuard
 from fantwin.pipeline.timebase.stage_clock import is_of_replay
-from fantwin.schemas.blocks import cut, join
+from fantwin.schemas.blocks import cut, join, present_columns
 from fantwin.schemas.channels import CHANNELS, measured_columns
 from fantwin.schemas.enums import InvalidReason
 from fantwin.schemas.messages import Array, Grid, Raw
-from fantwin.schemas.side_by_side import present_columns
 from fantwin.schemas.tacho import Tacho
 from fantwin.schemas.topics import most_samples
 from fantwin.schemas.units import NS_PER_S

@@ -18,11 +18,10 @@ from typing import Protocol
 
 from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.prediction.new_samples import BEGINNING_NS, are_newer
-from fantwin.pipeline.prediction.onnx_metadata import without_metadata
-from fantwin.pipeline.prediction.tray_twin import TrayTwin, tray_twin
+from fantwin.pipeline.prediction.tray_twin import TrayTwin, tray_twin, without_metadata
 from fantwin.pipeline.runtime.stage import Core, StageError
-from fantwin.pipeline.tray_scoring.judged_share import JudgedShare
 from fantwin.pipeline.tray_scoring.snapshot_store import SnapshotStore
+from fantwin.pipeline.tray_scoring.tray_scorer import JudgedShare
 from fantwin.schemas.blocks import select
 from fantwin.schemas.messages import Message, ModelCard, Prediction, Request, ScorerSnapshot
 from fantwin.scoring.score_message import unscored

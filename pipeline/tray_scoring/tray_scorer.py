@@ -5,6 +5,8 @@ are brought up to date (scoring.model.decision), fans that stand or turn against
 (scoring.standing), and so is slow wear (scoring.wear). Whatever is wrong becomes one alarm of the fan, with a state
 after OPC UA Part 9 (scoring.alarms) and causes (scoring.diagnosis). They are built and connected here.
 See docs/explanation/deciding.md.
+
+Which share of the samples of all fans was scored, and why the others were not.
 """
 
 from __future__ import annotations
@@ -16,25 +18,58 @@ import numpy as np
 
 from fantwin.pipeline.tray_scoring.healthy_twin import HealthyTwin
 from fantwin.pipeline.tray_scoring.scorer_config import ScorerConfig
-from fantwin.schemas.enums import Severity, Statistic
+from fantwin.schemas.enums import InvalidReason, Severity, Statistic
 from fantwin.schemas.messages import Alarm, Array, Diagnosis, Prediction, Score
 from fantwin.schemas.units import NS_PER_S
 from fantwin.scoring.alarms.alarm_manager import AlarmManager, Measured
 from fantwin.scoring.alarms.alarm_state import ConditionSettings
 from fantwin.scoring.alarms.alarm_text import AlarmText
 from fantwin.scoring.alarms.alarms_of_tray import Decided
+from fantwin.scoring.alarms.unscored_monitor import REASONS
 from fantwin.scoring.diagnosis.causes import CANNOT_TELL, CAUSES, SENSOR_DROPOUT, SLOW_CHANGE, is_of_standstill
-from fantwin.scoring.diagnosis.ranked_causes import CauseWords, PossibleCause
+from fantwin.scoring.diagnosis.ranked_causes import KNOWN_SOON, CauseWords, PossibleCause, SeenSinceOnset
 from fantwin.scoring.diagnosis.standstill_causes import Standing, standstill_causes
-from fantwin.scoring.diagnosis.what_would_tell import KNOWN_SOON, SeenSinceOnset
 from fantwin.scoring.model.bins import Bin, Bins, bin_ns_of
 from fantwin.scoring.model.decision import Decision
 from fantwin.scoring.model.saved import as_json, from_json, part, within
 from fantwin.scoring.samples import IDLE, among, arrived
 from fantwin.scoring.score_message import ScoreColumns, score_of
 from fantwin.scoring.standing.against_command import KINDS, AgainstCommand
-from fantwin.scoring.standing.falls import Falls
+from fantwin.scoring.standing.stands_still import Falls
 from fantwin.scoring.wear.wear_monitor import WearMonitor
+
+SMALLEST_SHARE = 0.0005  # smaller ones are not named
+
+
+class JudgedShare:
+    """Counts the samples of one tray's fans since the start of a session."""
+
+    def __init__(self) -> None:
+        self._judged = 0
+        self._not_judged = np.zeros(256, np.int64)
+        """by reason"""
+
+    def add(self, valid: Array, invalid_reason: Array) -> None:
+        """Add the samples of a block. valid, invalid_reason: (n, fans)."""
+        judged = int(np.count_nonzero(valid))
+        self._judged += judged
+        if judged < valid.size:
+            self._not_judged += np.bincount(invalid_reason[~valid], minlength=256)
+
+    @property
+    def notes(self) -> list[str]:
+        """One line; none before the first sample."""
+        samples = self._judged + int(self._not_judged.sum())
+        if not samples:
+            return []
+        reasons = [
+            f"{100 * count / samples:.1f} % {REASONS.get(InvalidReason(reason), InvalidReason(reason).words)}"
+            for reason, count in sorted(enumerate(self._not_judged.tolist()), key=lambda found: -found[1])
+            if count >= SMALLEST_SHARE * samples
+        ]
+        because = f"; not judged: {', '.join(reasons)}" if reasons else ""
+        return [f"{100 * self._judged / samples:.1f} % of the fans' samples judged{because}"]
+
 
 WEAR_EVERY_S = 600.0
 """between two points of the wear of a fan, which takes days to months"""

@@ -12,8 +12,7 @@ from fantwin.schemas.enums import Feedback, Severity, Statistic, Transition
 from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Alarm, Array, Diagnosis, Request
 from fantwin.schemas.units import NS_PER_S
-from fantwin.scoring.alarms.alarm_flags import is_listed
-from fantwin.scoring.alarms.alarm_state import AlarmState, ConditionSettings
+from fantwin.scoring.alarms.alarm_state import AlarmState, ConditionSettings, is_listed
 from fantwin.scoring.alarms.alarm_text import AlarmText
 from fantwin.scoring.alarms.alarms_of_tray import AlarmsOfTray, Decided
 from fantwin.scoring.diagnosis.ranked_causes import says_more

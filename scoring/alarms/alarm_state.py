@@ -5,6 +5,10 @@ ConfirmedState of one occurrence (4.3, 5.7; the rows of table B.1 are a test), L
 timed and one-shot shelving (5.8.17), suppressed (5.8.8), out of service (5.8.12). Only the present occurrence is kept;
 there are no branches of earlier ones (as in B.1.2). What operators say of an alarm, that it was true or false, is not
 of Part 9. See docs/reference/alarms.md.
+
+Flags of an alarm that say whether it needs attention: retained, silenced, presented, listed (OPC UA Part 9).
+
+This is the only definition. The scorer's `AlarmState` and the `Alarm` message carry the same flags; both are accepted.
 """
 
 from __future__ import annotations
@@ -16,7 +20,31 @@ from typing import Any, Self
 import numpy as np
 
 from fantwin.schemas.enums import Action, Feedback, Severity, Transition
+from fantwin.schemas.messages import Alarm
 from fantwin.schemas.units import NS_PER_S
+
+
+def is_retained(alarm: Alarm | AlarmState) -> bool:
+    """Return whether the alarm still needs attention (Retain, 5.5.2): active, latched, unacknowledged or
+    unconfirmed."""
+    return alarm.active or alarm.latched or not (alarm.acknowledged and alarm.confirmed)
+
+
+def is_silenced(alarm: Alarm | AlarmState) -> bool:
+    """Return whether an operator has silenced the alarm (SuppressedOrShelved, 5.8.2): shelved, suppressed, out of
+    service."""
+    return bool(alarm.shelved_until_t_ns) or alarm.suppressed or alarm.out_of_service
+
+
+def is_presented(alarm: Alarm | AlarmState) -> bool:
+    """Return whether operators should see the alarm: retained and not silenced."""
+    return is_retained(alarm) and not is_silenced(alarm)
+
+
+def is_listed(alarm: Alarm | AlarmState) -> bool:
+    """Return whether the alarm belongs on a list of current alarms: retained or silenced."""
+    return is_retained(alarm) or is_silenced(alarm)
+
 
 UNTIL_IT_CLEARS_T_NS = 2**63 - 1
 """`shelved_until_t_ns` of a one-shot shelving: until the alarm clears or is unshelved."""

@@ -2,16 +2,34 @@
 
 The lines are part of a recording, and a replay that verifies it compares them. Only the line of a republished alarm,
 which says no more than its flags do, is not compared.
+
+Words for what a fan with an alarm does now: the alarm may go on although its newest samples have no deviation.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from fantwin.schemas.enums import Severity, Statistic, Transition
+from fantwin.schemas.enums import FanState, InvalidReason, Severity, Statistic, Transition
 from fantwin.schemas.messages import Alarm
 from fantwin.schemas.units import RAD_S_PER_UNIT, SpeedUnit
 from fantwin.scoring.diagnosis.causes import CANNOT_TELL, CAUSES, is_of_standstill
+
+RETURNING = "like a healthy fan again (the alarm clears after ten seconds of it)"
+STOPPED, STARTING = "stopped by its command", "starting"
+
+
+def words_now(state: int, invalid_reason: int = InvalidReason.NONE) -> str:
+    """Words after "now": that the fan is stopped, starting or like a healthy fan again; empty: none of these.
+
+    state and invalid_reason: `FanState` and `InvalidReason` of the newest sample.
+    """
+    if state == FanState.STOPPED or invalid_reason == InvalidReason.STOPPED:
+        return STOPPED
+    if state == FanState.STARTING or invalid_reason == InvalidReason.STARTING:
+        return STARTING
+    return RETURNING if state == FanState.RETURNING else ""
+
 
 TRANSITIONS = {
     Transition.CLEARED: "back to normal",

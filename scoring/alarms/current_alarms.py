@@ -14,8 +14,7 @@ from typing import Any
 from fantwin.schemas.enums import Feedback, Severity, Transition
 from fantwin.schemas.messages import Alarm, Diagnosis
 from fantwin.schemas.units import NS_PER_S
-from fantwin.scoring.alarms.alarm_flags import is_presented, is_retained, is_silenced
-from fantwin.scoring.alarms.alarm_state import UNTIL_IT_CLEARS_T_NS
+from fantwin.scoring.alarms.alarm_state import UNTIL_IT_CLEARS_T_NS, is_presented, is_retained, is_silenced
 
 _DESCRIBES_THE_FAN = {
     Transition.NONE,

@@ -2,10 +2,23 @@
 
 `cannot_tell` comes first where no cause is as probable as CLEAR. Its probability is that of naming the wrong one; those
 of the others add up to one without it.
+
+The torque balance of a healthy fan at a steady speed: what a change of the speed means for drag, friction and gain.
+
+A fault is known as a share of the top speed. The fan that it slows down settles where the torque of the same command
+is what it needs, so the change of one parameter follows:
+
+    command = friction + viscous w + drag w^2
+
+Advice on what would tell the cause of an alarm, if what was seen since its onset does not.
+
+Causes differ in how they change with the speed (docs/explanation/diagnosis.md), so what is missing is motion: a change
+of the speed by a third, beyond the speeds that were seen. The command for it follows from the healthy torque balance.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -20,8 +33,97 @@ from fantwin.scoring.diagnosis.causes import (
     is_of_standstill,
     short_name,
 )
-from fantwin.scoring.diagnosis.steady_fan import OF_BALANCE, SteadyFan
-from fantwin.scoring.diagnosis.what_would_tell import Advice, SeenSinceOnset
+
+OF_BALANCE = (Size.DRAG, Size.FRICTION, Size.TORQUE, Size.GAIN)
+LEAST_SPEED = 0.05
+"""share of the top speed: no fan is taken to turn slower"""
+LEAST_DRAG = 0.1
+"""share of the torque at the top speed: a smaller drag is not what a fault changes"""
+
+
+@dataclass(frozen=True)
+class SteadyFan:
+    """Fan of the twin's card at steady speed. Torque is in the unit of the command."""
+
+    viscous: float
+    drag: float
+    friction: float
+    top_rad_s: float
+    has_own_drive: bool = False
+    """true if it controls its speed by itself: its torque is then not known, and a fault is a share of the speed"""
+
+    def needed(self, speed_rad_s: float) -> float:
+        """Command that holds a speed."""
+        return max(self.friction + (self.viscous + self.drag * speed_rad_s) * speed_rad_s, 1e-9)
+
+    def tells(self, size: Size) -> bool:
+        """Return whether the balance gives this size."""
+        if size == Size.DRAG and self.drag * self.top_rad_s**2 < LEAST_DRAG * self.needed(self.top_rad_s):
+            return False
+        return not self.has_own_drive
+
+    def size_of(self, size: Size, share: float) -> float:
+        """Change that makes the top speed another by a share: relative to drag or gain, or to the torque at the top
+        speed."""
+        speed = max(1.0 + share, LEAST_SPEED) * self.top_rad_s
+        at_top = self.needed(self.top_rad_s)
+        taken = at_top - self.needed(speed)
+        if size == Size.DRAG:
+            return taken / (self.drag * speed**2)
+        return -taken / at_top if size == Size.GAIN else taken / at_top
+
+
+SLOWER, FASTER = 2.0 / 3.0, 4.0 / 3.0
+DIGITS = 2
+
+KNOWN_SOON = "more is known in a few seconds"
+
+
+@dataclass(frozen=True)
+class SeenSinceOnset:
+    """Summary of what a fan did since the onset of its alarm."""
+
+    lowest_rad_s: float
+    highest_rad_s: float
+    lowest_command: float
+    highest_command: float
+
+
+@dataclass(frozen=True)
+class Advice:
+    """Writes advice in the unit of the command; empty where the twin does not name it."""
+
+    command_unit: str = ""
+    lowest_command: float = 0.0
+    """the lowest one that turns a healthy fan: none below it is advised"""
+    highest_command: float = math.inf
+    """the highest one that the twin knows: none above it is advised"""
+
+    def added_to(self, unclear: str, seen: SeenSinceOnset, fan: SteadyFan) -> str:
+        """Why the cause is unclear, with what would tell."""
+        command = self._other_command(seen, fan)
+        if not math.isfinite(command):
+            return unclear
+        return f"{unclear}: move the command to {self._of(command)} for ten seconds, and back"
+
+    def _other_command(self, seen: SeenSinceOnset, fan: SteadyFan) -> float:
+        """Find a command that gives a lower speed or, where that turns no fan, a higher one; NaN where there is
+        neither."""
+        low, high = seen.lowest_rad_s, seen.highest_rad_s
+        if not 0.0 < low <= high < math.inf:
+            return math.nan
+        slower = seen.lowest_command * fan.needed(SLOWER * low) / fan.needed(low)
+        if slower >= self.lowest_command:
+            return slower
+        faster = seen.highest_command * fan.needed(FASTER * high) / fan.needed(high)
+        faster = min(faster, self.highest_command)
+        return faster if faster > seen.highest_command else math.nan
+
+    def _of(self, command: float) -> str:
+        size = abs(command)
+        digits = max(DIGITS - 1 - math.floor(math.log10(size)), 0) if size > 0.0 else 0
+        return f"{command:.{digits}f}{f' {self.command_unit}' if self.command_unit else ''}"
+
 
 CLEAR = 0.6
 """least probability of a cause that is named first: below it, the first cause is wrong too often"""

@@ -15,9 +15,9 @@ from fantwin.scoring.diagnosis.standstill_causes import Standing
 from fantwin.scoring.model.saved import Saved, part, within
 from fantwin.scoring.samples import arrived
 from fantwin.scoring.standing import runs_on, stands_still
-from fantwin.scoring.standing.durations import Durations
 from fantwin.scoring.standing.runs_on import RunsOn
 from fantwin.scoring.standing.stands_still import StandsStill
+from fantwin.scoring.standing.time_limits import Durations
 
 CERTAIN = 2.0
 """score of a fan that does not do as commanded"""

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from fantwin.pipeline.bus.credentials import of_role
+from fantwin.pipeline.bus.identity import of_role
 from fantwin.pipeline.config.loading import parse_config
 from fantwin.pipeline.config.registry import STAGES
 from tests.support.fantwin_words import parsed

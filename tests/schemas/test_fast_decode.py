@@ -7,10 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fantwin.schemas.codec import CodecError, encode
+from fantwin.schemas.codec import CodecError, decode_together, encode
 from fantwin.schemas.enums import TachoKind
 from fantwin.schemas.envelope import Envelope
-from fantwin.schemas.fast_decode import decode_together
 from fantwin.schemas.header import Header, InputPosition
 from fantwin.schemas.messages import Raw, StatedTacho
 

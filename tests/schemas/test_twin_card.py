@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from fantwin import pipeline
-from fantwin.pipeline.prediction.onnx_metadata import read_onnx_metadata
+from fantwin.pipeline.prediction.tray_twin import read_onnx_metadata
 from fantwin.pipeline.recordings.reading import read_recording
 from fantwin.schemas.messages import ModelCard
 from fantwin.schemas.twin_card import CARD_PROPERTY, CardError, TwinCard

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from fantwin.schemas.tacho import Tacho
+from fantwin.simulation.excitation import STEPS, Thermostat
 from fantwin.simulation.faults import CLOG_S, four_pin_damage, parse_fault
 from fantwin.simulation.four_pin import FourPinDamage, FourPinFans, FourPinParameters, four_pin_tray, wanted_speed_rad_s
 from fantwin.simulation.tacho import TachoSettings
-from fantwin.simulation.thermostat import STEPS, Thermostat
 from fantwin.simulation.tray import SimulatedTray, TraySettings
 
 FAN = FourPinParameters()

@@ -1,4 +1,4 @@
-"""simulation.surroundings: a supply that wanders and air that warms, and what is measured of them."""
+"""simulation.plant: a supply that wanders and air that warms, and what is measured of them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 
 from fantwin.simulation.errors import SimulationError
 from fantwin.simulation.faults import Fault
-from fantwin.simulation.surroundings import Surroundings
+from fantwin.simulation.plant import Surroundings
 from fantwin.simulation.tacho import NoisyTacho, TachoSettings
 from fantwin.simulation.tray import SimulatedTray, TraySample, TraySettings
 

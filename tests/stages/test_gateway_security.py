@@ -17,8 +17,8 @@ import pytest
 from starlette.requests import Request
 
 from fantwin.pipeline.errors import UserError
-from fantwin.pipeline.outputs.web.shared_answer import SharedAnswer
-from fantwin.pipeline.site import login_failures
+from fantwin.pipeline.outputs.web.live_feed import SharedAnswer
+from fantwin.pipeline.site import security_log
 from fantwin.pipeline.site.users import UserRole
 from tests.support.running_core import TRAY
 from tests.support.running_gateway import Client, RunningGateway
@@ -79,12 +79,12 @@ def test_a_login_holds_nobody_up_and_guesses_side_by_side_are_as_few_as_one_afte
     goes_on.set()
     for each in guesses:
         each.join()
-    assert sorted(answers) == [401] * login_failures.FAILURES + [429] * (12 - login_failures.FAILURES)
+    assert sorted(answers) == [401] * security_log.FAILURES + [429] * (12 - security_log.FAILURES)
 
 
 def test_logging_in_to_an_own_account_buys_no_guesses_and_guesses_from_elsewhere_lock_out_no_logged_in_user():
-    now_s, most = 0.0, login_failures.FAILURES
-    failures = login_failures.LoginFailures(lambda: now_s)
+    now_s, most = 0.0, security_log.FAILURES
+    failures = security_log.LoginFailures(lambda: now_s)
     failures.succeed("ann", "192.0.2.7")
     for number in range(most):
         assert failures.begin(f"user{number}", f"2001:db8::{number}") == 0
@@ -105,7 +105,7 @@ def test_logging_in_to_an_own_account_buys_no_guesses_and_guesses_from_elsewhere
 
 
 def test_a_new_password_and_another_login_end_the_session_of_before(gateway, users, monkeypatch):
-    monkeypatch.setattr("fantwin.pipeline.outputs.web.sessions.MOST_OF_A_USER", 2)
+    monkeypatch.setattr("fantwin.pipeline.outputs.web.access.MOST_OF_A_USER", 2)
     first, viewers = logged_in(gateway), [logged_in(gateway, "vic") for _ in range(3)]
     assert [each.ask("GET", "/api/v1/me")[1]["name"] for each in viewers] == ["", "vic", "vic"], "his own only"
     assert first.ask("GET", "/api/v1/me")[1]["name"] == "ann"

@@ -15,13 +15,13 @@ import pytest
 
 from fantwin.pipeline.config.loading import parse_config
 from fantwin.pipeline.runtime.building import build_parts
-from fantwin.pipeline.runtime.joint_step import step_together
 from fantwin.pipeline.runtime.stage import Context, Core, Joint, load_stage
+from fantwin.pipeline.runtime.steps import step_together
 from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Message, Raw
 from fantwin.schemas.units import NS_PER_S
 from fantwin.simulation.faults import Fault
-from fantwin.simulation.surroundings import Surroundings
+from fantwin.simulation.plant import Surroundings
 from fantwin.simulation.tray import SimulatedTray, TraySettings
 from tests.support.twin_files import small_hybrid, write_twin
 

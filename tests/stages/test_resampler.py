@@ -13,11 +13,10 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from fantwin.schemas.blocks import join
+from fantwin.schemas.blocks import join, present_columns
 from fantwin.schemas.enums import InvalidReason, TachoKind
 from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Grid, Raw, StatedTacho
-from fantwin.schemas.side_by_side import present_columns
 from fantwin.schemas.tacho import Tacho
 from fantwin.schemas.units import NS_PER_S
 from fantwin.stages.resampler import ResamplerConfig, ResamplerCore

@@ -21,7 +21,7 @@ from fantwin.schemas.fields import columns
 from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Alarm, Score, ScorerSnapshot
 from fantwin.schemas.units import NS_PER_S
-from fantwin.scoring.alarms.alarm_flags import is_listed, is_retained, is_silenced
+from fantwin.scoring.alarms.alarm_state import is_listed, is_retained, is_silenced
 from fantwin.scoring.alarms.current_alarms import CurrentAlarm
 from fantwin.scoring.wear.wear_monitor import WearMonitor
 from fantwin.stages.scorer import ScorerCore

@@ -14,7 +14,7 @@ import pytest
 from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.outputs.rerun.alarm_log import LogLine
 from fantwin.pipeline.outputs.rerun.rerun_sink import RerunSink
-from fantwin.pipeline.outputs.rerun.wear_points import WearPoints
+from fantwin.pipeline.outputs.rerun.rerun_wear import WearPoints
 from fantwin.pipeline.runtime.stage import Context, Core
 from fantwin.pipeline.site.fleet import Fan
 from fantwin.pipeline.site.trace import Trace

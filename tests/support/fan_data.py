@@ -6,7 +6,7 @@ import numpy as np
 from bench.training import published_fan
 from bench.training.published_fan import DRAG, INERTIA, NOISE_RAD_S, RATE_HZ, ROUGH_RANGE, VISCOUS
 from fantwin.schemas.tacho import Tacho
-from fantwin.twin.fitting.balance import balance_of, filtered_terms
+from fantwin.twin.fitting.balance_fit import balance_of, filtered_terms
 from fantwin.twin.runs import Array, Run
 
 __all__ = [
@@ -69,5 +69,5 @@ def counted_run(seed: int, tacho: Tacho, duration_s: float = 120.0, rate_hz: flo
 
 
 def torque_balance(command: Array, speed_rad_s: Array, period_s: float, coefficients: Array, lag_s: Array) -> Array:
-    """(n, fans) balance by coefficients (fans, 4), see twin.fitting.balance."""
+    """(n, fans) balance by coefficients (fans, 4), see twin.fitting.balance_fit."""
     return balance_of(filtered_terms(command, speed_rad_s, period_s, lag_s)[0], coefficients)

@@ -17,7 +17,7 @@ from fantwin.schemas.units import NS_PER_S
 from fantwin.scoring.alarms.alarm_state import GIVES_FEEDBACK
 from fantwin.scoring.calibration.calibration import Calibration
 from fantwin.twin.evaluation.resampling import thinned
-from fantwin.twin.export.card_entries import with_card_entries
+from fantwin.twin.export.onnx_export import with_card_entries
 from fantwin.twin.runs import Run
 from tests.support.fan_data import published_run
 from tests.support.written_recordings import write_run

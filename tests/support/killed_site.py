@@ -19,7 +19,7 @@ from fantwin.pipeline.config.loading import load_config
 from fantwin.pipeline.config.settings import Config
 from fantwin.pipeline.prediction.twin_file import TwinFile
 from fantwin.pipeline.recordings.writing import RecordingWriter
-from fantwin.pipeline.runtime.consumed import ConsumedReports
+from fantwin.pipeline.runtime.publishing import ConsumedReports
 from fantwin.pipeline.runtime.stage import Context, Core, load_stage
 from fantwin.schemas.blocks import join
 from fantwin.schemas.enums import Action

@@ -8,7 +8,7 @@ import numpy as np
 
 from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.learning.healthy_history import HealthyHistory, healthy_recordings, recordings_near_alarms
-from fantwin.pipeline.learning.learning_process import LearningProcess
+from fantwin.pipeline.learning.learning_schedule import LearningProcess
 from fantwin.pipeline.learning.ordinary_operation import OrdinaryOperation
 from fantwin.pipeline.learning.versions import Check, TwinVersions
 from fantwin.schemas.enums import FanState

@@ -20,8 +20,7 @@ from fantwin.schemas.messages import Alarm, Prediction, Request, Score, ScorerSn
 from fantwin.schemas.standstill import Standstill
 from fantwin.schemas.tacho import INSTANTANEOUS, Tacho, tacho_of_each_fan
 from fantwin.schemas.units import SpeedUnit
-from fantwin.scoring.diagnosis.steady_fan import SteadyFan
-from fantwin.scoring.diagnosis.what_would_tell import Advice
+from fantwin.scoring.diagnosis.ranked_causes import Advice, SteadyFan
 from fantwin.scoring.model.operation import Fans
 from fantwin.stages.scorer import ScorerCore
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fantwin.pipeline.recordings.rare_messages import rare_messages
+from fantwin.pipeline.recordings.indexed import rare_messages
 from fantwin.schemas.enums import FanState, Feedback, InvalidReason, Severity, Transition
 from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Alarm, Diagnosis, ModelCard, Request, Score

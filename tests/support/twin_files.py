@@ -20,7 +20,7 @@ from fantwin.schemas.twin_card import (
     ValidationCard,
 )
 from fantwin.twin.export.onnx_export import export_onnx
-from fantwin.twin.fitting.balance import FILTER_RATE_PER_S
+from fantwin.twin.fitting.balance_fit import FILTER_RATE_PER_S
 from fantwin.twin.models.hybrid import Hybrid
 from fantwin.twin.models.model import Model
 from fantwin.twin.models.network import Scaling, TanhNetwork

@@ -9,7 +9,7 @@ import pytest
 
 from bench.detection.tray_run import run_of
 from fantwin.schemas.reference_conditions import ReferenceConditions
-from fantwin.simulation.surroundings import Surroundings
+from fantwin.simulation.plant import Surroundings
 from fantwin.simulation.tacho import NoisyTacho, TachoSettings
 from fantwin.simulation.tray import TraySettings
 from fantwin.twin.build import evaluate, train_twin

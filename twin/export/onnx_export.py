@@ -9,11 +9,19 @@
 
 fans and n are dynamic. A graph has all four inputs, whether its model needs them or not, so that all kinds of model
 look the same to a reader.
+
+A twin file with other entries in its card: the graph and its weights are unchanged.
 """
 
+import json
+from collections.abc import Mapping
+from typing import Any
+
+import onnx
 from onnx import checker, helper
 
 from fantwin.schemas.twin_card import CARD_PROPERTY, TwinCard
+from fantwin.twin.errors import TwinError
 from fantwin.twin.models.model import Model
 from fantwin.twin.models.onnx_nodes import double
 
@@ -43,3 +51,18 @@ def export_onnx(model: Model, card: TwinCard) -> bytes:
     helper.set_model_props(file, {CARD_PROPERTY: card.to_json()})
     checker.check_model(file, full_check=True)
     return file.SerializeToString(deterministic=True)
+
+
+def with_card_entries(content: bytes, entries: Mapping[str, Any]) -> bytes:
+    """The same ONNX file with other entries in its card, such as its calibration or its name.
+
+    Raises:
+        TwinError: it is no twin.
+    """
+    model = onnx.load_model_from_string(content)
+    for entry in model.metadata_props:
+        if entry.key == CARD_PROPERTY:
+            card = json.loads(entry.value)
+            entry.value = json.dumps({**card, **entries}, allow_nan=False)
+            return model.SerializeToString()
+    raise TwinError(f"an ONNX file, but not a twin: it has no {CARD_PROPERTY}")

@@ -6,6 +6,13 @@ equations with ten bands, which LAPACK solves by substitution (dtbtrs).
 
 Residuals beyond three robust standard deviations count linearly (pseudo-Huber loss, by iteratively reweighted least
 squares); missing speeds do not count.
+
+Whether the free run of a NARX network is stable: it must forget where it started, and stay near the recorded speeds.
+
+A recursion that fits its data can have a second, false steady state where there were no data, and a start or a jump of
+the command that was not in the training data can take it there permanently. Probing detects this without measured
+speeds: the network runs under long held commands over the range of training, from below the lowest and from above the
+highest speed of training.
 """
 
 from collections.abc import Callable, Sequence
@@ -16,10 +23,10 @@ from scipy.linalg import cho_factor, cho_solve
 
 from fantwin.twin.fitting.damped_least_squares import Flags, minimise, pseudo_huber, pseudo_huber_weight
 from fantwin.twin.fitting.reading_errors import NORMAL_90_PERCENT
+from fantwin.twin.models.integration import dtbtrs
 from fantwin.twin.models.narx import INPUTS, ORDER, UNITS, Narx, regressor_rows
 from fantwin.twin.models.network import Scaling
 from fantwin.twin.models.physics import PARAMETER_NAMES
-from fantwin.twin.models.recursion import dtbtrs
 from fantwin.twin.runs import Array, Run, starting_speed_rad_s
 
 TOLERANCE = 1e-3
@@ -155,3 +162,29 @@ def free_run_sensitivities(model: Narx, speed_rad_s: Array, command: Array) -> A
         bands[lag + 1, : samples - 1 - lag] = -by_past[lag, lag:]
     solved, _ = dtbtrs(bands, forcing.T, uplo="L", diag="U", overwrite_b=1)
     return scaling.speed_scale_rad_s * solved.T
+
+
+LEVELS = 16
+# A fan without drive coasts far longer than its time constant at speed.
+PROBE_TIME_CONSTANTS, SHORTEST_PROBE_SAMPLES = 30.0, 1000
+# Beyond the range of training's speeds by a tenth of it on each side: a fan at rest may lie outside.
+REACH = 1.2
+# In shares of the range of speeds in training.
+FORGOTTEN, MARGIN = 0.1, 0.5
+
+
+def forgets_its_start(model: Narx, time_constant_samples: float) -> bool:
+    """Whether both runs of each level end at the same speed, at most half the training range of speeds outside it.
+
+    time_constant_samples: of the fan at speed, in samples.
+    """
+    scaling = model.scaling
+    samples = max(round(PROBE_TIME_CONSTANTS * time_constant_samples), SHORTEST_PROBE_SAMPLES)
+    level = scaling.command_offset + scaling.command_scale * np.tile(np.linspace(-1.0, 1.0, LEVELS), 2)
+    start = scaling.speed_offset_rad_s + scaling.speed_scale_rad_s * np.repeat((-REACH, REACH), LEVELS)
+    state = model.state_layout.initial_state(start, level)
+    unused = np.ones((2 * LEVELS, len(PARAMETER_NAMES)))
+    speed_rad_s, _ = model.advance(state, np.tile(level, (samples, 1)), np.ones(samples), unused)
+    relative = (speed_rad_s - scaling.speed_offset_rad_s) / (2.0 * scaling.speed_scale_rad_s)
+    from_low, from_high = relative[-1, :LEVELS], relative[-1, LEVELS:]
+    return bool(np.all(np.abs(from_low - from_high) < FORGOTTEN) and np.all(np.abs(relative) < 0.5 + MARGIN))

@@ -4,7 +4,7 @@ Fitting each next sample from measured ones (series-parallel, the published way)
 regressors, and a small one-step error does not imply a good free run. So the free run itself is fitted (parallel
 training: Narendra and Parthasarathy, IEEE Transactions on Neural Networks 1, 1990):
 
-1. The start is a layer that acts as the best first-order filter of the data (twin.fitting.narx_start).
+1. The start is a layer that acts as the best first-order filter of the data (twin.fitting.narx_training).
 2. A prior ties its 1151 weights to the start, those of old samples more strongly than those of recent ones. The prior
    is strong at first and relaxed by a factor of ten at a time, each fit starting from the previous one
    (twin.fitting.narx_fit).
@@ -12,27 +12,93 @@ training: Narendra and Parthasarathy, IEEE Transactions on Neural Networks 1, 19
    runs; if none are given, those of whole runs left out in turn; for a single run, those of blocks left out. Relaxing
    ends when it no longer helps.
 4. All speeds of the training runs are fitted at the chosen precision, or at the next stronger one whose free run
-   forgets its start (twin.fitting.narx_stability); if none does, at the strongest.
+   forgets its start (twin.fitting.narx_fit); if none does, at the strongest.
 
 The cost of a fit is proportional to its samples: from long recordings, stretches of MAX_SAMPLES in total are drawn at
 random.
+
+Where the training of NARX starts: tanh units that together act as the best first-order low-pass filter of the data.
+
+Small random weights keep each unit on the nearly straight part of its tanh, so the layer starts close to a linear model
+whose free run is stable and near the data; training adds the curvature. The filter is fitted by output error on a grid
+of time constants: with the time constant given, gain and offset are linear in the data, so noise on the speeds biases
+nothing, and missing ones are left out.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.signal import lfilter
 
 from fantwin.twin.errors import TwinError
 from fantwin.twin.evaluation.accuracy import evaluation_pieces, free_run_residuals, pooled_rmse_rad_s
-from fantwin.twin.fitting.narx_fit import OutputErrorFit
-from fantwin.twin.fitting.narx_stability import forgets_its_start
-from fantwin.twin.fitting.narx_start import lag_scale, starting_weights
-from fantwin.twin.models.narx import Narx
+from fantwin.twin.fitting.narx_fit import OutputErrorFit, forgets_its_start
+from fantwin.twin.models.narx import INPUTS, ORDER, UNITS, Narx, regressor_rows
 from fantwin.twin.models.network import Scaling
 from fantwin.twin.models.physics import PARAMETER_NAMES
 from fantwin.twin.progress import Progress, unreported
 from fantwin.twin.runs import STARTING_SAMPLES, Array, Run
+
+TIME_CONSTANTS_SAMPLES = np.geomspace(0.5, 2000.0, 40)
+# Older samples say less about the next one; a factor of 0.7 per lag leaves about 0.03 for the oldest of ten.
+LAG_DECAY = 0.7
+# Standard deviation of a unit's input when all its regressors have standard deviation one.
+UNIT_SLOPE = 0.2
+# Regressors of a linear filter lie in a plane. Scatter around it makes the layer linear off the plane as well.
+SCATTER = 0.1
+MAX_ROWS = 4000
+
+
+def lag_scale() -> Array:
+    """(1151,) relative size that is expected of each weight: it decays with the lag of its input."""
+    lags = np.concatenate((np.arange(ORDER), np.arange(ORDER + 1)))
+    return np.concatenate((np.repeat(LAG_DECAY**lags, UNITS), np.ones(2 * UNITS + 1)), dtype=np.float64)
+
+
+def starting_weights(
+    commands: Sequence[Array], speeds: Sequence[Array], rng: np.random.Generator
+) -> tuple[Array, float]:
+    """theta (1151,) of a layer that acts as a first-order filter, and the filter's time constant in samples.
+
+    commands, speeds: one (n,) each a stretch, scaled; a speed of NaN is missing.
+    """
+    linear, smooth = first_order_filter(commands, speeds)
+    regressors = np.concatenate([regressor_rows(*pair) for pair in zip(smooth, commands, strict=True)])
+    regressors = rng.choice(regressors, min(len(regressors), MAX_ROWS), replace=False)
+    regressors = regressors + rng.normal(scale=SCATTER, size=regressors.shape)
+    input_weights = rng.normal(size=(INPUTS, UNITS)) * lag_scale()[: INPUTS * UNITS].reshape(INPUTS, UNITS)
+    input_weights *= UNIT_SLOPE / np.linalg.norm(input_weights, axis=0).mean()
+    bias = rng.uniform(-1.0, 1.0, UNITS)
+    layer = np.column_stack((np.tanh(regressors @ input_weights + bias), np.ones(len(regressors))))
+    squares = layer.T @ layer
+    ridge = 1e-6 * np.trace(squares) / len(squares) * np.eye(len(squares))
+    output = np.linalg.solve(squares + ridge, layer.T @ (regressors @ linear[:-1] + linear[-1]))
+    return np.concatenate((input_weights.ravel(), bias, output)), float(-1.0 / np.log(linear[0]))
+
+
+def first_order_filter(commands: Sequence[Array], speeds: Sequence[Array]) -> tuple[Array, list[Array]]:
+    """The best low-pass filter from command to speed: coefficients (22,) of the 21 regressors and 1, and its speeds."""
+    measured = np.concatenate(speeds)
+    known = np.isfinite(measured)
+    candidates = []
+    for time_constant in TIME_CONSTANTS_SAMPLES:
+        kept = float(np.exp(-1.0 / time_constant))
+        smooth = np.concatenate([_low_pass(command, kept) for command in commands])
+        columns = np.column_stack((smooth, np.ones(len(smooth))))
+        gain_and_offset = np.linalg.lstsq(columns[known], measured[known])[0]
+        error = float(np.sum((measured - columns @ gain_and_offset)[known] ** 2))
+        candidates.append((error, kept, gain_and_offset))
+    _, kept, (gain, offset) = min(candidates, key=lambda candidate: candidate[0])
+    linear = np.zeros(INPUTS + 1)
+    linear[0], linear[ORDER], linear[-1] = kept, (1.0 - kept) * gain, (1.0 - kept) * offset
+    return linear, [gain * _low_pass(command, kept) + offset for command in commands]
+
+
+def _low_pass(command: Array, kept: float) -> Array:
+    """x[k+1] = kept x[k] + (1 - kept) command[k], at rest at the first command."""
+    return command[0] + np.asarray(lfilter([0.0, 1.0 - kept], [1.0, -kept], command - command[0]))
+
 
 MAX_SAMPLES, DRAWN_STRETCHES = 16_000, 16
 PRIOR_PRECISIONS = (1e5, 1e4, 1e3, 1e2, 1e1, 1e0)

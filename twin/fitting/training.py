@@ -8,7 +8,7 @@ iterations instead of thousands, because the model is small enough for second-or
 2. The same until it no longer improves.
 3. The free run itself, over stretches as long as practical, from their measured speeds.
 
-The readings of many fans are thinned for all this (twin.fitting.thinning), and the last iterations use all of them.
+The readings of many fans are thinned for all this (twin.fitting.trajectories), and the last iterations use all of them.
 
 Where several networks are asked for, as many of the best starts go on, each by itself, and the model is the mean of
 those that end about as well as the best (twin.fitting.mean_of_networks): then hardly anything depends on the seed.
@@ -33,8 +33,14 @@ from fantwin.twin.fitting.identification import Identification, inertia_anchor
 from fantwin.twin.fitting.initial_weights import PLACEMENTS, initial_weights
 from fantwin.twin.fitting.mean_of_networks import mean_model
 from fantwin.twin.fitting.reading_errors import counts, robust_scale
-from fantwin.twin.fitting.thinning import thinning_factor, windows_of
-from fantwin.twin.fitting.trajectories import MAX_SAMPLES, cut_into_trajectories, practical_samples, stretch_samples
+from fantwin.twin.fitting.trajectories import (
+    MAX_SAMPLES,
+    cut_into_trajectories,
+    practical_samples,
+    stretch_samples,
+    thinning_factor,
+    windows_of,
+)
 from fantwin.twin.models.fan_ode import NetworkOde
 from fantwin.twin.models.integration import WIDE_BATCH
 from fantwin.twin.models.network import Scaling

@@ -12,8 +12,7 @@ from fantwin.twin.evaluation.accuracy import Evaluation, Figures, evaluation_pie
 from fantwin.twin.evaluation.residual_analysis import ResidualAnalysis, analysis_of
 from fantwin.twin.export.fan_rows import drive_of_fans, fan_rows
 from fantwin.twin.export.onnx_twin import OnnxTwin
-from fantwin.twin.report.recording_sums import Extent, RecordingSums, extent_of, free_run_of_piece
-from fantwin.twin.report.speed_bins import SpeedBin
+from fantwin.twin.report.recording_sums import Extent, RecordingSums, SpeedBin, extent_of, free_run_of_piece
 from fantwin.twin.report.timeline import Timeline, timeline
 from fantwin.twin.runs import Array, Run
 

@@ -13,9 +13,8 @@ from fantwin.schemas.model_uncertainty import ModelUncertainty
 from fantwin.twin.evaluation.residual_analysis import SIGNIFICANCE
 from fantwin.twin.kinds import kind_title
 from fantwin.twin.report import figures
-from fantwin.twin.report.assessment import AS_DECLARED, LOOSER, Assessment, assess, level_of
+from fantwin.twin.report.assessment import AS_DECLARED, LOOSER, Assessment, assess, least_known, level_of
 from fantwin.twin.report.content import Content, FanContent
-from fantwin.twin.report.record_next import least_known
 from fantwin.twin.report.steady_states import StaticCurve, static_curve
 
 MOST_FANS_DRAWN = 12

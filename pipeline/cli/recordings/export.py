@@ -22,7 +22,7 @@ from fantwin.pipeline.files import make_folder
 from fantwin.pipeline.recordings.arrays import Block, read_topics
 from fantwin.pipeline.recordings.export_tables import Form, TableFile, open_table
 from fantwin.pipeline.recordings.left_out import left_out_hint
-from fantwin.pipeline.recordings.order import in_order
+from fantwin.pipeline.recordings.parts import in_order
 from fantwin.pipeline.recordings.reading import read_recording
 from fantwin.pipeline.recordings.records import ACTIVE_SUFFIX
 from fantwin.pipeline.recordings.run_recordings import run_metadata

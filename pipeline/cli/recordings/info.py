@@ -39,9 +39,8 @@ from fantwin.pipeline.recordings.repair import recover as recover_file
 from fantwin.pipeline.recordings.run_recordings import RECORDING_KEY, recorded_files
 from fantwin.pipeline.recordings.scan import Scan
 from fantwin.pipeline.recordings.sequence_ledger import StreamCounts, sum_by_key
-from fantwin.pipeline.site.loss_accounting import label, losses
-from fantwin.pipeline.site.refused_input import refused, refused_lines
-from fantwin.pipeline.site.stage_notes import note_lines, notes_as_json
+from fantwin.pipeline.site.loss_accounting import label, losses, refused, refused_lines
+from fantwin.pipeline.site.stage_states import note_lines, notes_as_json
 from fantwin.schemas.health import Health
 from fantwin.schemas.streams import StreamId
 from fantwin.schemas.units import NS_PER_S

@@ -21,8 +21,7 @@ from fantwin.pipeline.recordings.dates import format_utc
 from fantwin.pipeline.recordings.left_out import left_out_hint
 from fantwin.pipeline.recordings.remote import local_copies, matching, recording_path
 from fantwin.pipeline.replay.live.keyboard import Keys
-from fantwin.pipeline.replay.live.pace import Pace
-from fantwin.pipeline.replay.live.player import Progress
+from fantwin.pipeline.replay.live.player import Pace, Progress
 from fantwin.pipeline.replay.live.publishing import Outcome, publish
 from fantwin.pipeline.replay.live.recording_playback import RecordingPlayback
 from fantwin.pipeline.replay.resolve_config import resolve_config

@@ -27,14 +27,12 @@ from fantwin.pipeline.cli.progress import interruptible, show_part
 from fantwin.pipeline.errors import UsageError, UserError
 from fantwin.pipeline.files import make_folder
 from fantwin.pipeline.recordings.dates import format_utc, has_date
-from fantwin.pipeline.recordings.grouping import describe, recordings_of
 from fantwin.pipeline.recordings.records import MADE_BY_KEY, active_path, this_program
-from fantwin.pipeline.recordings.run_recordings import recorded_files
+from fantwin.pipeline.recordings.run_recordings import describe, recorded_files, recordings_of
 from fantwin.pipeline.replay.offline.alarm_episodes import AlarmDiff, compare_episodes, episodes
-from fantwin.pipeline.replay.offline.comparison import CannotCompareError
+from fantwin.pipeline.replay.offline.comparison import RELATIVE, CannotCompareError
 from fantwin.pipeline.replay.offline.replay_input import ReplayInput, open_replay_input
 from fantwin.pipeline.replay.offline.rescoring import RescoredTray, rescore
-from fantwin.pipeline.replay.offline.tolerance import RELATIVE
 from fantwin.schemas.messages import Diagnosis
 from fantwin.schemas.units import NS_PER_S
 from fantwin.scoring.alarms.alarm_text import deviation_in

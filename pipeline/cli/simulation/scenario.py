@@ -123,8 +123,7 @@ class Scenario(Section):
         """
         from fantwin.simulation.errors import SimulationError  # noqa: PLC0415  loaded only by the commands that need it
         from fantwin.simulation.faults import parse_fault  # noqa: PLC0415
-        from fantwin.simulation.plant import DeviceClock  # noqa: PLC0415
-        from fantwin.simulation.surroundings import Surroundings  # noqa: PLC0415
+        from fantwin.simulation.plant import DeviceClock, Surroundings  # noqa: PLC0415
         from fantwin.simulation.tacho import NoisyTacho, TachoSettings  # noqa: PLC0415
         from fantwin.simulation.tray import SimulatedTray, TraySettings  # noqa: PLC0415
 

@@ -18,8 +18,8 @@ from fantwin.pipeline.cli.progress import interruptible, show_part
 from fantwin.pipeline.cli.twins.data_options import FromOption, ToOption
 from fantwin.pipeline.errors import UsageError, UserError
 from fantwin.pipeline.files import write_whole
-from fantwin.pipeline.learning.calibrating import calibrated_on, with_calibration
 from fantwin.pipeline.learning.drops_found import drops_found
+from fantwin.pipeline.learning.fitting import calibrated_on, with_calibration
 from fantwin.pipeline.learning.healthy_evidence import Check, check_declared_rate, marked_running, outlier_warnings
 from fantwin.pipeline.recordings.remote import matching, recording_path
 from fantwin.pipeline.replay.offline.calibration_of_twin import (

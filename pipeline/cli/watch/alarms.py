@@ -17,8 +17,7 @@ import typer
 from fantwin.pipeline.bus.session import join_bus
 from fantwin.pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
 from fantwin.pipeline.cli.printing import show
-from fantwin.pipeline.cli.watch.alarm_history import show_history
-from fantwin.pipeline.cli.watch.alarm_list import show_list, word
+from fantwin.pipeline.cli.watch.alarm_list import show_history, show_list, word
 from fantwin.pipeline.cli.watch.scorers import ask, wait_for_stages
 from fantwin.pipeline.config.loading import load_config
 from fantwin.pipeline.config.roles import OPERATOR, roles_of

@@ -15,7 +15,7 @@ from typing import Annotated
 import typer
 from cryptography.hazmat.primitives.serialization import Encoding
 
-from fantwin.pipeline.bus.credentials import of_role, warning
+from fantwin.pipeline.bus.identity import of_role, warning
 from fantwin.pipeline.certificates import (
     LONGEST_NAME,
     Authority,

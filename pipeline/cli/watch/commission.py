@@ -31,10 +31,9 @@ from fantwin.pipeline.cli.watch.child_commands import Commands, Stopped
 from fantwin.pipeline.cli.watch.commissioning import Commissioning, Plan, TrayWork
 from fantwin.pipeline.cli.watch.doctor import running_sessions
 from fantwin.pipeline.cli.watch.sweep import range_within
-from fantwin.pipeline.config.loading import load_config
+from fantwin.pipeline.config.loading import load_config, with_twin
 from fantwin.pipeline.config.registry import RECORDER, STAGES
 from fantwin.pipeline.config.settings import Config, TrayConfig
-from fantwin.pipeline.config.twin_entry import with_twin
 from fantwin.pipeline.errors import UsageError, UserError
 from fantwin.pipeline.prediction.tray_twin import load_tray_twin
 from fantwin.pipeline.replay.offline.calibration_of_twin import calibration_in

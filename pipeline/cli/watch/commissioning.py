@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from fantwin.pipeline.cli.watch.child_commands import RECORDING_ONLY, Commands, RecordingSite, Stopped
+from fantwin.pipeline.config.loading import write_twin
 from fantwin.pipeline.config.settings import Config, TrayConfig
-from fantwin.pipeline.config.twin_entry import write_twin
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.learning.ordinary_operation import OrdinaryOperation
 from fantwin.pipeline.learning.training_data import Part, read_training_data

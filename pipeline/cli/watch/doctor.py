@@ -17,11 +17,11 @@ from typing import Annotated
 import typer
 from rich.text import Text
 
-from fantwin.pipeline.bus.access_rules import SiteRoles
-from fantwin.pipeline.bus.credentials import of_role
 from fantwin.pipeline.bus.endpoint import accepts_connections, endpoint_problem, foreign_program
 from fantwin.pipeline.bus.errors import BusError, NoAnswerError
+from fantwin.pipeline.bus.identity import of_role
 from fantwin.pipeline.bus.opening import credentials_of
+from fantwin.pipeline.bus.rights import SiteRoles
 from fantwin.pipeline.bus.session import join_bus
 from fantwin.pipeline.cli.exposure import exposure_problem, is_exposed
 from fantwin.pipeline.cli.options import DEFAULT_CONFIG, JsonOption, SetOption
@@ -36,8 +36,7 @@ from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.extras import how_to_install
 from fantwin.pipeline.launch.this_host import load_for_this_host
 from fantwin.pipeline.recordings.disk_room import usage_of
-from fantwin.pipeline.runtime.second_owner import GOSSIP_S
-from fantwin.pipeline.runtime.sessions import Session
+from fantwin.pipeline.runtime.sessions import GOSSIP_S, Session
 from fantwin.pipeline.runtime.stage import Context, load_stage
 from fantwin.pipeline.sources.hwmon.config import ROOT
 from fantwin.schemas.topics import sessions_key

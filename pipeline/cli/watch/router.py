@@ -8,8 +8,8 @@ from typing import Annotated
 
 import typer
 
-from fantwin.pipeline.bus.access_rules import SiteRoles
 from fantwin.pipeline.bus.opening import credentials_of
+from fantwin.pipeline.bus.rights import SiteRoles
 from fantwin.pipeline.bus.router import open_router
 from fantwin.pipeline.cli.exposure import InsecureOption, checked_exposure
 from fantwin.pipeline.cli.options import DEFAULT_CONFIG, JsonOption, SetOption

@@ -25,16 +25,15 @@ from fantwin.pipeline.launch.this_host import load_for_any_host
 from fantwin.pipeline.runtime.signals import stop_on_signals
 from fantwin.pipeline.site.fleet import Fan
 from fantwin.pipeline.site.judging import Unjudged, as_judged, at_rest, unjudged
-from fantwin.pipeline.site.refused_input import refused_lines
+from fantwin.pipeline.site.loss_accounting import refused_lines
 from fantwin.pipeline.site.site_model import SiteModel
 from fantwin.pipeline.site.site_watcher import SiteWatcher
-from fantwin.pipeline.site.stage_notes import note_lines, notes_as_json
-from fantwin.pipeline.site.stage_states import AT_WORK, StageState, StageView, Word
+from fantwin.pipeline.site.stage_states import AT_WORK, StageState, StageView, Word, note_lines, notes_as_json
 from fantwin.schemas.enums import Severity
 from fantwin.schemas.streams import LOSS_PREFIX
 from fantwin.schemas.topics import ALL_TRAYS
 from fantwin.schemas.units import NS_PER_S
-from fantwin.scoring.alarms.alarm_flags import is_listed, is_presented
+from fantwin.scoring.alarms.alarm_state import is_listed, is_presented
 from fantwin.scoring.alarms.current_alarms import CurrentAlarm, clock
 from fantwin.scoring.diagnosis.causes import most_probable
 

@@ -89,10 +89,10 @@ def _run_all(
     json_output: bool,
 ) -> None:
     # the process of a stage loads no launcher
-    from fantwin.pipeline.launch.event_log import EventLog  # noqa: PLC0415
     from fantwin.pipeline.launch.launcher import Launcher  # noqa: PLC0415
+    from fantwin.pipeline.launch.site_report import EventLog  # noqa: PLC0415
     from fantwin.pipeline.launch.this_host import load_for_this_host, page_addresses, with_free_port  # noqa: PLC0415
-    from fantwin.pipeline.site.refused_input import refused_lines  # noqa: PLC0415
+    from fantwin.pipeline.site.loss_accounting import refused_lines  # noqa: PLC0415
 
     loaded = load_for_this_host(config, overrides)
     of_host = chosen_trays(loaded.config, trays, shard)

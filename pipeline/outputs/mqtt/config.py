@@ -8,7 +8,7 @@ from pydantic import Field
 
 from fantwin.pipeline.config.settings import Name
 from fantwin.pipeline.runtime.stage import StageConfig
-from fantwin.pipeline.site.request_form import OperatorAction
+from fantwin.pipeline.site.request_desk import OperatorAction
 from fantwin.pipeline.sources.mqtt.settings import BrokerSettings
 
 

@@ -15,8 +15,7 @@ from pydantic import Field, ValidationError
 from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.outputs.mqtt.outbox import text_of
 from fantwin.pipeline.outputs.mqtt.topics import ALL_FANS, ANSWER, REQUEST, Topics
-from fantwin.pipeline.site.request_desk import ANSWERED_WITHIN_S, RequestDesk
-from fantwin.pipeline.site.request_form import LONGEST_COMMENT, OneLine, RequestForm
+from fantwin.pipeline.site.request_desk import ANSWERED_WITHIN_S, LONGEST_COMMENT, OneLine, RequestDesk, RequestForm
 from fantwin.pipeline.site.site_json import answers_json
 from fantwin.schemas.messages import Alarm, Request
 

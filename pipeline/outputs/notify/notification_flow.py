@@ -10,14 +10,23 @@ from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
 from fantwin.pipeline.outputs.notify.config import NotifierConfig, TargetConfig
-from fantwin.pipeline.outputs.notify.deciding import Announced, Happened, decide, hears_of
-from fantwin.pipeline.outputs.notify.gathering import DIGEST_ABOVE, Gathered, is_due, is_quiet, next_after
+from fantwin.pipeline.outputs.notify.deciding import (
+    DIGEST_ABOVE,
+    Announced,
+    Gathered,
+    Happened,
+    decide,
+    hears_of,
+    is_due,
+    is_quiet,
+    next_after,
+)
 from fantwin.pipeline.outputs.notify.wording import Place, Text, about_fan, about_many
 from fantwin.pipeline.site.alarm_book import AlarmBook
 from fantwin.pipeline.site.fleet import Fan
 from fantwin.schemas.messages import Alarm
 from fantwin.schemas.units import NS_PER_S
-from fantwin.scoring.alarms.alarm_flags import is_silenced
+from fantwin.scoring.alarms.alarm_state import is_silenced
 from fantwin.scoring.alarms.current_alarms import CurrentAlarm
 
 FIRST_LOOK_NS = 10 * NS_PER_S

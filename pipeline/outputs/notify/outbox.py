@@ -16,8 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fantwin.pipeline.errors import UserError
-from fantwin.pipeline.outputs.notify.deciding import Announced
-from fantwin.pipeline.outputs.notify.gathering import Gathered
+from fantwin.pipeline.outputs.notify.deciding import Announced, Gathered
 from fantwin.pipeline.outputs.notify.notification_flow import Basket, Changes, Saved
 from fantwin.pipeline.outputs.notify.wording import Level, Text
 from fantwin.pipeline.site.alarm_history import AlarmHistory

@@ -9,8 +9,7 @@ from datetime import datetime
 from enum import StrEnum
 from urllib.parse import quote
 
-from fantwin.pipeline.outputs.notify.deciding import Happened, Kind
-from fantwin.pipeline.outputs.notify.gathering import ranges
+from fantwin.pipeline.outputs.notify.deciding import Happened, Kind, ranges
 from fantwin.schemas.enums import Severity
 from fantwin.schemas.messages import Alarm, Diagnosis
 from fantwin.schemas.units import NS_PER_S
@@ -25,7 +24,7 @@ from fantwin.scoring.diagnosis.causes import (
     likely_evidence,
     likely_with_share,
 )
-from fantwin.scoring.diagnosis.what_would_tell import KNOWN_SOON
+from fantwin.scoring.diagnosis.ranked_causes import KNOWN_SOON
 
 MOST_TRAYS, MOST_RANGE_CHARACTERS, MOST_NAMED_CAUSES = 20, 120, 4
 """of a message about many fans"""

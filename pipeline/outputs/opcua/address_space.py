@@ -13,10 +13,9 @@ from asyncua import Node, Server, ua
 from asyncua.server.address_space import AddressSpace
 
 from fantwin.pipeline.config.settings import TrayConfig
-from fantwin.pipeline.outputs.opcua.conditions import OWN_FIELDS, condition_fields
-from fantwin.pipeline.outputs.opcua.encoding import STATUS, standard
+from fantwin.pipeline.outputs.opcua.encoding import COMMISSION, FAN_ALARM_TYPE, FAN_TYPE, SITE_FOLDER, STATUS, standard
+from fantwin.pipeline.outputs.opcua.events import OWN_FIELDS, condition_fields
 from fantwin.pipeline.outputs.opcua.fan_values import VARIABLES
-from fantwin.pipeline.outputs.opcua.identifiers import COMMISSION, FAN_ALARM_TYPE, FAN_TYPE, SITE_FOLDER
 from fantwin.pipeline.outputs.opcua.requests import FAN_METHODS
 from fantwin.pipeline.outputs.opcua.site_nodes import SiteNode, SiteNodes, ValueOf
 from fantwin.pipeline.site.fleet import Fan

@@ -12,9 +12,8 @@ from typing import Any
 from asyncua import ua
 from asyncua.server.history import HistoryDict
 
-from fantwin.pipeline.outputs.opcua.encoding import micros_of, time_of
+from fantwin.pipeline.outputs.opcua.encoding import fan_of, micros_of, time_of
 from fantwin.pipeline.outputs.opcua.events import SiteEvent, condition_event
-from fantwin.pipeline.outputs.opcua.identifiers import fan_of
 from fantwin.pipeline.site.site_model import SiteModel
 from fantwin.schemas.enums import Transition
 from fantwin.schemas.messages import Alarm

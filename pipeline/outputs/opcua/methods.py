@@ -14,10 +14,8 @@ from typing import Any
 
 from asyncua import Server, ua
 
-from fantwin.pipeline.outputs.opcua.conditions import event_id
-from fantwin.pipeline.outputs.opcua.encoding import STATUS, standard
-from fantwin.pipeline.outputs.opcua.events import EventDelivery
-from fantwin.pipeline.outputs.opcua.identifiers import ALARM, COMMISSION, SHELVING_STATE
+from fantwin.pipeline.outputs.opcua.encoding import ALARM, COMMISSION, SHELVING_STATE, STATUS, standard
+from fantwin.pipeline.outputs.opcua.events import EventDelivery, event_id
 from fantwin.pipeline.outputs.opcua.requests import (
     COMMENT,
     EVENT_ID,
@@ -34,12 +32,11 @@ from fantwin.pipeline.outputs.opcua.site_nodes import SiteNodes
 from fantwin.pipeline.outputs.opcua.templates import method_nodes
 from fantwin.pipeline.site.fleet import Fan
 from fantwin.pipeline.site.one_line import one_line
-from fantwin.pipeline.site.request_desk import RequestDesk
-from fantwin.pipeline.site.request_form import LONGEST_COMMENT, LONGEST_SHELVING_S
+from fantwin.pipeline.site.request_desk import LONGEST_COMMENT, LONGEST_SHELVING_S, RequestDesk
 from fantwin.pipeline.site.site_model import SiteModel
 from fantwin.schemas.enums import Action
 from fantwin.schemas.messages import Request
-from fantwin.scoring.alarms.alarm_flags import is_retained
+from fantwin.scoring.alarms.alarm_state import is_retained
 
 _SEARCHED = 200
 """transitions of a fan, among which an event is looked for"""

@@ -18,12 +18,11 @@ from asyncua import Server, ua
 
 from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.outputs.opcua.address_space import SiteAddressSpace, build_address_space
+from fantwin.pipeline.outputs.opcua.encoding import NAMESPACE
 from fantwin.pipeline.outputs.opcua.events import EventDelivery
 from fantwin.pipeline.outputs.opcua.history import EventHistory
-from fantwin.pipeline.outputs.opcua.identifiers import NAMESPACE
-from fantwin.pipeline.outputs.opcua.log_in import LogIn, Permissions, TrustedClients
 from fantwin.pipeline.outputs.opcua.methods import Methods
-from fantwin.pipeline.outputs.opcua.sessions import SiteServer
+from fantwin.pipeline.outputs.opcua.sessions import LogIn, Permissions, SiteServer, TrustedClients
 from fantwin.pipeline.outputs.opcua.site_values import SiteValues
 from fantwin.pipeline.runtime.stage import StageError
 from fantwin.pipeline.site.request_desk import RequestDesk

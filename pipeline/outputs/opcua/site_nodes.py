@@ -9,8 +9,7 @@ from collections.abc import Callable, Sequence
 from asyncua import ua
 
 from fantwin.pipeline.config.settings import TrayConfig
-from fantwin.pipeline.outputs.opcua.encoding import STATUS, SharedValue, standard
-from fantwin.pipeline.outputs.opcua.identifiers import SITE_FOLDER, fan_of
+from fantwin.pipeline.outputs.opcua.encoding import SITE_FOLDER, STATUS, SharedValue, fan_of, standard
 from fantwin.pipeline.outputs.opcua.templates import Template, templates
 from fantwin.pipeline.site.fleet import Fan
 

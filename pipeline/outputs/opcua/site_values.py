@@ -10,10 +10,9 @@ from datetime import UTC, datetime
 
 from asyncua import ua
 
-from fantwin.pipeline.outputs.opcua.conditions import condition_fields
-from fantwin.pipeline.outputs.opcua.encoding import SharedValue, data_value, value_of
+from fantwin.pipeline.outputs.opcua.encoding import ALARM, SharedValue, data_value, value_of
+from fantwin.pipeline.outputs.opcua.events import condition_fields
 from fantwin.pipeline.outputs.opcua.fan_values import GOOD, VARIABLE, FanValues
-from fantwin.pipeline.outputs.opcua.identifiers import ALARM
 from fantwin.pipeline.outputs.opcua.templates import UNIT_RPM
 from fantwin.pipeline.site.fleet import Fan
 from fantwin.pipeline.site.site_model import SiteModel

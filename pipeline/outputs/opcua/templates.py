@@ -11,10 +11,16 @@ from typing import Any
 
 from asyncua import ua
 
-from fantwin.pipeline.outputs.opcua.conditions import OWN_FIELDS, condition_fields
-from fantwin.pipeline.outputs.opcua.encoding import standard
+from fantwin.pipeline.outputs.opcua.encoding import (
+    ALARM,
+    COMMISSION,
+    FAN_ALARM_TYPE,
+    FAN_TYPE,
+    SHELVING_STATE,
+    standard,
+)
+from fantwin.pipeline.outputs.opcua.events import OWN_FIELDS, condition_fields
 from fantwin.pipeline.outputs.opcua.fan_values import VARIABLES, FanVariable
-from fantwin.pipeline.outputs.opcua.identifiers import ALARM, COMMISSION, FAN_ALARM_TYPE, FAN_TYPE, SHELVING_STATE
 from fantwin.pipeline.outputs.opcua.requests import METHODS, SHELVING_METHODS, ConditionMethod
 from fantwin.pipeline.site.fleet import Fan
 

@@ -1,7 +1,9 @@
-"""The lines of the alarm log: short enough to be read in a third of a window."""
+"""The lines of the alarm log, and the table of the fans whose alarm operators should see or have silenced."""
 
 from __future__ import annotations
 
+import re
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -10,9 +12,10 @@ from fantwin.pipeline.recordings.dates import has_date
 from fantwin.schemas.enums import Severity, Statistic, Transition
 from fantwin.schemas.messages import Alarm
 from fantwin.schemas.units import NS_PER_S
-from fantwin.scoring.alarms.alarm_state import UNTIL_IT_CLEARS_T_NS
+from fantwin.scoring.alarms.alarm_state import UNTIL_IT_CLEARS_T_NS, is_listed, is_silenced
 from fantwin.scoring.alarms.alarm_text import TRANSITIONS
-from fantwin.scoring.diagnosis.causes import CANNOT_TELL, with_share
+from fantwin.scoring.alarms.current_alarms import CurrentAlarm
+from fantwin.scoring.diagnosis.causes import CANNOT_TELL, most_probable, with_share
 
 LINE_LENGTH = 64
 """a longer line is cut"""
@@ -82,3 +85,52 @@ def clock_utc(t_ns: int, now_t_ns: int) -> str:
     day, clock = np.datetime_as_string(np.datetime64(t_ns, "ns"), unit="s").split("T")
     today = np.datetime_as_string(np.datetime64(now_t_ns, "ns"), unit="D")
     return clock if day == today else f"{day} {clock}"
+
+
+ALARMS_LISTED = 16
+NAME_LENGTH, CAUSE_LENGTH = 24, 40
+COLORS = (
+    "Violet: measured. Green: the twin and its band of ± 2σ, and the torque balance expected. Red: dots outside the "
+    "band, area in alarm, limit of the score. Grey: not scored. A hole: no samples."
+)
+
+
+def alarm_table(current: Sequence[CurrentAlarm], now_t_ns: int) -> str:
+    """The table in Markdown. now_t_ns: time of the newest sample."""
+    alarms = sorted((each for each in current if is_listed(each.newest)), key=_rank)
+    active = sum(each.newest.active for each in alarms)
+    lines = [f"#### {active:,} active, {len(alarms) - active:,} over" if alarms else "#### No alarms"]
+    if alarms:
+        rows = ["| tray/fan | alarm | since (UTC) | probable cause | seen by |", "|:--|:--|:--|:--|:--|"]
+        lines.append("\n".join([*rows, *(_row(each, now_t_ns) for each in alarms[:ALARMS_LISTED])]))
+    if alarms[ALARMS_LISTED:]:
+        lines.append(f"and {len(alarms) - ALARMS_LISTED:,} more: `fantwin alarms` lists them")
+    return "\n\n".join([*lines, COLORS])
+
+
+def _row(each: CurrentAlarm, now_t_ns: int) -> str:
+    alarm = each.newest
+    state = alarm.severity.words if alarm.active else "over"
+    state += ", silenced" if is_silenced(alarm) else ", no data" if alarm.stale and alarm.active else ""
+    cause = ", ".join(most_probable(each.causes)) if each.causes else exceeded(alarm) if alarm.active else ""
+    seen = each.acknowledged_by or ("yes" if alarm.acknowledged else "nobody")
+    name = markdown_literal(cut(f"{alarm.header.tray}/{alarm.fan}", NAME_LENGTH))
+    columns = (
+        f"**{name}**" if alarm.active else name,
+        state,
+        clock_utc(alarm.onset_t_ns, now_t_ns) if alarm.onset_t_ns else "",
+        markdown_literal(cut(cause, CAUSE_LENGTH)),
+        markdown_literal(cut(seen, NAME_LENGTH)),
+    )
+    return f"| {' | '.join(columns)} |"
+
+
+def _rank(each: CurrentAlarm) -> tuple[bool, bool, int, int]:
+    """Active first, then those that are not silenced, the most severe, the newest."""
+    alarm = each.newest
+    return (not alarm.active, is_silenced(alarm), -int(alarm.severity), -alarm.onset_t_ns)
+
+
+def markdown_literal(text: str) -> str:
+    """Text escaped for Markdown, on one line."""
+    return re.sub(r"([\\`*_\[\]<>|#~])", r"\\\1", " ".join(text.split()))

@@ -11,7 +11,7 @@ from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.outputs.rerun.rerun_sink import ViewOptions
 from fantwin.pipeline.outputs.rerun.view_of_site import view_of_site
 from fantwin.pipeline.recordings.left_out import left_out_hint
-from fantwin.pipeline.recordings.order import Seen, in_order
+from fantwin.pipeline.recordings.parts import Seen, in_order
 from fantwin.pipeline.recordings.reading import RecordingMetadata, read_recording
 from fantwin.pipeline.recordings.run_recordings import run_metadata
 from fantwin.schemas.codec import CodecError

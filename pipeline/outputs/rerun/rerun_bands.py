@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 import rerun as rr
 
-from fantwin.pipeline.outputs.rerun.rerun_paths import (
+from fantwin.pipeline.outputs.rerun.rerun_styles import (
     BALANCE,
     SCORE,
     TIMELINE,

@@ -17,30 +17,28 @@ import rerun.blueprint as rrb
 from rerun.blueprint.archetypes import TextLogColumns
 from rerun.blueprint.encodings import TextLogColumn, TimelineColumn
 
-from fantwin.pipeline.outputs.rerun.rerun_paths import (
+from fantwin.pipeline.outputs.rerun.rerun_styles import (
     ALARMS_PATH,
     BALANCE,
     DAYS,
     FAN_PARTS,
     FANS_ON_A_PAGE,
     FLEET_LOG,
+    LINE_WIDTH,
     SCORE,
     TIMELINE,
     auxiliary_path,
+    balance_style,
     fan_path,
     judged_path,
-    log_path,
-    pages_of,
-    state_path,
-    wear_path,
-)
-from fantwin.pipeline.outputs.rerun.rerun_styles import (
-    LINE_WIDTH,
-    balance_style,
     log_fan_styles,
+    log_path,
     log_state_styles,
+    pages_of,
     score_style,
     speed_style,
+    state_path,
+    wear_path,
 )
 from fantwin.pipeline.site.trace import state_names
 from fantwin.schemas.channels import Channel

@@ -22,8 +22,8 @@ from rerun.chunk import RrdReader
 from rerun.experimental import ViewerClient
 
 from fantwin.pipeline.errors import UserError
-from fantwin.pipeline.outputs.rerun.rerun_paths import DAYS, TIMELINE
 from fantwin.pipeline.outputs.rerun.rerun_sink import LOOPBACK, rerun_program
+from fantwin.pipeline.outputs.rerun.rerun_styles import DAYS, TIMELINE
 
 SIZE = "1920x1080"
 TIMEOUT_S, POLL_S = 60.0, 0.2

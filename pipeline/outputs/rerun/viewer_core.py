@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from fantwin.pipeline.config.settings import TrayConfig
-from fantwin.pipeline.outputs.rerun.alarm_log import LogLine, log_line
-from fantwin.pipeline.outputs.rerun.alarm_table import alarm_table
+from fantwin.pipeline.outputs.rerun.alarm_log import LogLine, alarm_table, log_line
 from fantwin.pipeline.outputs.rerun.fleet_view import FleetView
-from fantwin.pipeline.outputs.rerun.wear_points import WearPoints, wear_points
+from fantwin.pipeline.outputs.rerun.rerun_wear import WearPoints, wear_points
 from fantwin.pipeline.site.fleet import SILENT, Fan
 from fantwin.pipeline.site.site_core import SAMPLED_S, SiteCore
 from fantwin.pipeline.site.site_model import SiteModel

@@ -17,14 +17,12 @@ from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.outputs.web import answers as typed
 from fantwin.pipeline.outputs.web.access import Access, address_of, require_own_page, require_token
 from fantwin.pipeline.outputs.web.answers import JSON, LoginForm
-from fantwin.pipeline.outputs.web.live_feed import EventStream, LiveFeed, encoded
+from fantwin.pipeline.outputs.web.live_feed import EventStream, LiveFeed, SharedAnswer, encoded
 from fantwin.pipeline.outputs.web.metrics import metrics_text
-from fantwin.pipeline.outputs.web.shared_answer import SharedAnswer
 from fantwin.pipeline.recordings.clips.clip import Clip, kept_clips
 from fantwin.pipeline.site.fan_history import HISTORY_S
 from fantwin.pipeline.site.fleet import Fan, FanGroup
-from fantwin.pipeline.site.request_desk import RequestDesk
-from fantwin.pipeline.site.request_form import RequestForm
+from fantwin.pipeline.site.request_desk import RequestDesk, RequestForm
 from fantwin.pipeline.site.site_json import (
     alarms_json,
     answers_json,

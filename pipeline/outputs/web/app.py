@@ -18,7 +18,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from fantwin.pipeline.outputs.web.access import address_of
 from fantwin.pipeline.outputs.web.api import Api
 from fantwin.pipeline.outputs.web.config import GatewayConfig
-from fantwin.pipeline.outputs.web.shared_answer import COMPRESSION
+from fantwin.pipeline.outputs.web.live_feed import COMPRESSION
 
 PAGE = Path(__file__).parent / "page"
 PREFIX = "/api/v1"

@@ -28,7 +28,7 @@ from fantwin.schemas.channels import CHANNELS
 from fantwin.schemas.enums import Severity
 from fantwin.schemas.health import LatencyBucket
 from fantwin.schemas.units import RAD_S_PER_UNIT
-from fantwin.scoring.alarms.alarm_flags import is_presented
+from fantwin.scoring.alarms.alarm_state import is_presented
 
 _PER_RPM = RAD_S_PER_UNIT["rpm"]
 _TRAY = ["site", "tray"]

@@ -15,8 +15,7 @@ from fantwin.pipeline.recordings.clips.clip import NOT_A_LIST, Clip, clip_folder
 from fantwin.pipeline.recordings.clips.cutting import LEAD_NS, remove_unfinished
 from fantwin.pipeline.recordings.clips.tracker import LONGEST_NS, RETRY_NS, ClipTracker, CutResult
 from fantwin.pipeline.recordings.disk import refused
-from fantwin.pipeline.recordings.indexed import PartIndex
-from fantwin.pipeline.recordings.rare_messages import last_message_ns, rare_messages
+from fantwin.pipeline.recordings.indexed import PartIndex, last_message_ns, rare_messages
 from fantwin.pipeline.recordings.reading import RecordingError
 from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.messages import Alarm

@@ -14,7 +14,7 @@ from fantwin.pipeline.recordings.clips.clip import Clip, ClipAlarm, clip_name
 from fantwin.schemas.enums import Transition
 from fantwin.schemas.messages import Alarm
 from fantwin.schemas.units import NS_PER_S
-from fantwin.scoring.alarms.alarm_flags import is_silenced
+from fantwin.scoring.alarms.alarm_state import is_silenced
 
 BEFORE_S, AFTER_S = 60.0, 60.0
 """a clip begins so long before its alarm, and ends so long after"""

@@ -1,17 +1,159 @@
-"""Plays a recording: sends each message when it is due, handles keys, and publishes the time 20 times a second."""
+"""Plays a recording: sends each message when it is due, in the name of a producer of its own, and handles keys."""
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
+import numpy as np
+
+from fantwin.pipeline.bus.publisher import Publisher
+from fantwin.pipeline.bus.session import Bus
+from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.replay.live.keyboard import Key
-from fantwin.pipeline.replay.live.pace import Pace, faster, slower
-from fantwin.pipeline.replay.live.sender import Sender
+from fantwin.pipeline.runtime.health import HealthBuilder
+from fantwin.pipeline.timebase.stage_clock import REPLAY
+from fantwin.schemas.codec import encode, type_name
+from fantwin.schemas.enums import StageStatus
 from fantwin.schemas.envelope import Envelope
-from fantwin.schemas.messages import NewTwin, Raw
-from fantwin.schemas.topics import BY_NAME, TOPICS
+from fantwin.schemas.header import Header
+from fantwin.schemas.health import Output
+from fantwin.schemas.messages import Array, Clock, Grid, Message, NewTwin, Prediction, Raw, Score
+from fantwin.schemas.topics import ALL_TRAYS, BY_NAME, TOPICS, alive_key, health_key, tray_key, tray_of
+from fantwin.schemas.units import NS_PER_S
+
+
+def sample_times(message: Message) -> Array:
+    """(samples,) ns since the epoch; empty for a message without samples."""
+    if isinstance(message, Raw):
+        return message.host_receive_t_ns
+    return message.t_ns if isinstance(message, Grid | Prediction | Score) else np.zeros(0, np.int64)
+
+
+SLOWEST, FASTEST = 1 / 64, 1024.0
+"""limits of doubling and halving the rate; faster than FASTEST is only infinite: as fast as possible"""
+
+
+class Pace:
+    """Maps a monotonic clock, which the caller reads as `now_s`, to recorded time.
+
+    Deadlines count from the last change of the rate, so that delays between messages do not add up.
+    """
+
+    def __init__(self, rate: float, *, paused: bool = False) -> None:
+        """`rate`: seconds of the recording per second; infinite: as fast as possible."""
+        self.rate = rate
+        self.paused = paused
+        self.paused_s = 0.0
+        """time spent paused, up to the last change"""
+        self._at_ns = 0
+        self._since_s = 0.0
+
+    @property
+    def rate_now(self) -> float:
+        """The rate to publish: 0 while paused."""
+        return 0.0 if self.paused else self.rate
+
+    def start(self, at_ns: int, now_s: float) -> None:
+        """Set recorded time to `at_ns` now."""
+        self._at_ns, self._since_s = at_ns, now_s
+
+    def change(self, at_ns: int, now_s: float, *, rate: float | None = None, paused: bool | None = None) -> None:
+        """Continue from `at_ns` with another rate, or pause there."""
+        if self.paused:
+            self.paused_s += now_s - self._since_s
+        self.rate = self.rate if rate is None else rate
+        self.paused = self.paused if paused is None else paused
+        self.start(at_ns, now_s)
+
+    def position_ns(self, now_s: float, next_ns: int) -> int:
+        """Recorded time now, at most `next_ns`, the time of the next message."""
+        if self.paused:
+            return min(self._at_ns, next_ns)
+        if math.isinf(self.rate):
+            return next_ns
+        return min(self._at_ns + round((now_s - self._since_s) * self.rate * NS_PER_S), next_ns)
+
+    def due_in_s(self, t_ns: int, now_s: float) -> float:
+        """Seconds until recorded time is `t_ns`; zero or less: it is due. Infinite while paused."""
+        if self.paused:
+            return math.inf
+        return (t_ns - self._at_ns) / NS_PER_S / self.rate - (now_s - self._since_s)
+
+
+def faster(rate: float) -> float:
+    """Twice the rate."""
+    return math.inf if rate >= FASTEST else rate * 2
+
+
+def slower(rate: float) -> float:
+    """Half the rate."""
+    return FASTEST if math.isinf(rate) else max(rate / 2, SLOWEST)
+
+
+class Sender:
+    """Publishes recorded messages under the site's keys with new headers, the clock of each tray, and health."""
+
+    def __init__(self, bus: Bus, site: str, trays: Collection[str]) -> None:
+        """Join the bus; `trays` are the trays of the site."""
+        self.producer = f"{REPLAY}-all-{bus.id}"
+        self.sent: Counter[str] = Counter()
+        """messages sent, by topic"""
+        self._bus = bus
+        self._site = site
+        self._publishers: dict[str, Publisher] = {}
+        self._clocks = {tray: self._publisher(tray_key(site, tray, "clock"), "clock") for tray in trays}
+        self._health = self._publisher(health_key(site, REPLAY, ALL_TRAYS), "health")
+        self._builder = HealthBuilder(REPLAY, ALL_TRAYS, time.time_ns(), may_drop=False)
+        self.publish_health(StageStatus.STARTING)
+        bus.declare_alive(alive_key(site, REPLAY, ALL_TRAYS))
+        bus.require_rights()
+
+    def send(self, entry: Envelope) -> None:
+        """Publish a message; blocks while a reader is behind.
+
+        Raises:
+            UserError: the site has no such tray.
+        """
+        tray = tray_of(entry.key)
+        if tray not in self._clocks:
+            raise UserError(f"the recording has a tray {tray!r}, the configuration has none of that name: see -c")
+        key = tray_key(self._site, tray, entry.topic)
+        if key not in self._publishers:
+            self._publishers[key] = self._publisher(key, entry.topic)
+        self._put(self._publishers[key], entry.message, tray)
+        self.sent[entry.topic] += 1
+
+    def publish_clock(self, t_ns: int, rate: float) -> None:
+        """Publish recorded time and the rate at which it passes."""
+        for tray, publisher in self._clocks.items():
+            self._put(publisher, Clock(t_ns=t_ns, rate=rate), tray)
+
+    def publish_health(self, status: StageStatus = StageStatus.OK, problem: str = "") -> None:
+        """Publish health with the number of sent messages, so that a reader that missed the last ones asks for them."""
+        health = self._builder.build(
+            status=status,
+            problems=[problem],
+            inputs=(),
+            outputs=[Output(key=key, published=count) for key, count in self.published().items()],
+            counters={},
+            now_ns=time.time_ns(),
+        )
+        self._put(self._health, replace(health, is_last=status == StageStatus.STOPPED), "")
+
+    def published(self) -> Mapping[str, int]:
+        """Messages sent, by key."""
+        return {key: publisher.published for key, publisher in self._publishers.items()}
+
+    def _publisher(self, key: str, topic: str) -> Publisher:
+        return self._bus.publisher(key, BY_NAME[topic], type_name(BY_NAME[topic].message), self.producer)
+
+    def _put(self, publisher: Publisher, message: Message, tray: str) -> None:
+        publisher.put(encode(replace(message, header=Header(self.producer, publisher.published, tray))))
+
 
 BEAT_S = 0.05
 HEALTH_PERIOD_S = 1.0

@@ -13,10 +13,8 @@ from fantwin.pipeline.config.settings import Config
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.replay.live.keyboard import Key
 from fantwin.pipeline.replay.live.listeners import Listeners, conflict, made_by_stages
-from fantwin.pipeline.replay.live.pace import Pace
-from fantwin.pipeline.replay.live.player import Player, Progress, Stopped
+from fantwin.pipeline.replay.live.player import Pace, Player, Progress, Sender, Stopped
 from fantwin.pipeline.replay.live.recording_playback import RecordingPlayback
-from fantwin.pipeline.replay.live.sender import Sender
 from fantwin.pipeline.replay.resolve_config import trays_of
 from fantwin.schemas.enums import StageStatus
 from fantwin.schemas.topics import BY_NAME

@@ -11,9 +11,10 @@ from pydantic import ValidationError
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.prediction.tray_twin import TrayTwin
 from fantwin.pipeline.replay.offline.healthy_runs import DecidedRun, FreeLimit, HealthyRuns, LearnedRun, Limit
-from fantwin.scoring.calibration.alarm_rate import HOURS_PER_DAY, daily_interval
 from fantwin.scoring.calibration.calibration import (
+    HOURS_PER_DAY,
     Calibration,
+    daily_interval,
     expected_alarms,
     is_exceeded,
     least_per_day,

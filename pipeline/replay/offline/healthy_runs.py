@@ -15,11 +15,11 @@ from typing import Protocol, TypeVar
 from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.prediction.tray_twin import load_tray_twin
-from fantwin.pipeline.recordings.checksum import sha256_of
+from fantwin.pipeline.recordings.metadata import sha256_of
+from fantwin.pipeline.replay.offline.alarm_episodes import LeftOut, concerning, without
 from fantwin.pipeline.replay.offline.kept_bins import KeptBins, RecordedTray, TrayRun
-from fantwin.pipeline.replay.offline.marked_alarms import LeftOut, concerning, without
 from fantwin.pipeline.replay.offline.replay_input import ReplayInput, open_replay_input
-from fantwin.pipeline.tray_scoring.modelled_fans import modelled_fans
+from fantwin.pipeline.tray_scoring.healthy_twin import modelled_fans
 from fantwin.schemas.codec import CodecError
 from fantwin.schemas.messages import Prediction
 from fantwin.schemas.units import NS_PER_S

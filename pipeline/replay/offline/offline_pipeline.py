@@ -17,8 +17,7 @@ from typing import Any, Literal
 import numpy as np
 
 from fantwin.pipeline.replay.offline.plan import BEGINNING, RAW_MISSING, Limit, Session, TrayPlan, limit_through
-from fantwin.pipeline.replay.offline.raw_blocks import RawBlocks
-from fantwin.pipeline.replay.offline.sample_stream import SampleStream
+from fantwin.pipeline.replay.offline.raw_blocks import RawBlocks, SampleStream
 from fantwin.pipeline.replay.stage_chain import StageChain
 from fantwin.pipeline.runtime.stage import Context, Core, Stage
 from fantwin.schemas.blocks import cut

@@ -13,20 +13,17 @@ from typing import NamedTuple
 from fantwin.pipeline.config.loading import load_config
 from fantwin.pipeline.config.settings import Config, TrayConfig
 from fantwin.pipeline.recordings.clips.clip import CLIP_SNAPSHOT_KEY
-from fantwin.pipeline.recordings.grouping import deciding_overrides
 from fantwin.pipeline.recordings.metadata import CONFIGURATION
-from fantwin.pipeline.recordings.order import in_order
+from fantwin.pipeline.recordings.parts import in_order
 from fantwin.pipeline.recordings.reading import RecordingError, RecordingMetadata, read_metadata, read_recording
-from fantwin.pipeline.recordings.run_recordings import run_metadata
-from fantwin.pipeline.replay.default_config import default_config, first_raw
-from fantwin.pipeline.replay.offline.clip_plan import NOT_VERIFIED, plan_from_snapshot
+from fantwin.pipeline.recordings.run_recordings import deciding_overrides, run_metadata
 from fantwin.pipeline.replay.offline.offline_pipeline import OfflinePipeline
 from fantwin.pipeline.replay.offline.plan import TrayPlan, undisturbed_plan
-from fantwin.pipeline.replay.offline.plan_reader import PlanReader
+from fantwin.pipeline.replay.offline.plan_reader import NOT_VERIFIED, PlanReader, plan_from_snapshot
 from fantwin.pipeline.replay.offline.raw_blocks import RawBlocks
-from fantwin.pipeline.replay.resolve_config import attached_config
+from fantwin.pipeline.replay.resolve_config import attached_config, default_config, first_raw
 from fantwin.pipeline.replay.stage_chain import StageChain, decision_chain
-from fantwin.pipeline.runtime.consumed import CONSUMED
+from fantwin.pipeline.runtime.publishing import CONSUMED
 from fantwin.pipeline.runtime.stage import Context
 from fantwin.pipeline.timebase.stage_clock import is_of_replay
 from fantwin.schemas.envelope import Envelope

@@ -1,7 +1,7 @@
 """Comparison of replayed scores and alarms with the recorded ones; of snapshots if scores are not recorded.
 
 Decisions must be equal: states, statistics, validity and its reasons, times, and alarms with the order of their causes.
-Numbers may differ within a tolerance (pipeline.replay.offline.tolerance).
+Numbers may differ within a tolerance (pipeline.replay.offline.comparison).
 """
 
 from __future__ import annotations
@@ -14,14 +14,12 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 
 from fantwin.pipeline.recordings.dates import format_utc
-from fantwin.pipeline.replay.offline.compare_snapshots import SnapshotVerifier
-from fantwin.pipeline.replay.offline.comparison import Comparison
+from fantwin.pipeline.replay.offline.comparison import Apart, Comparison, SnapshotVerifier, differences, unequal
 from fantwin.pipeline.replay.offline.plan import UNLIMITED, Limit, Session
-from fantwin.pipeline.replay.offline.tolerance import Apart, differences, unequal
 from fantwin.schemas.blocks import cut
+from fantwin.schemas.codec import decode_together
 from fantwin.schemas.enums import Transition
 from fantwin.schemas.envelope import Envelope
-from fantwin.schemas.fast_decode import decode_together
 from fantwin.schemas.fields import columns
 from fantwin.schemas.messages import Alarm, Array, Grid, Message, Prediction, Score, ScorerSnapshot
 

@@ -5,24 +5,78 @@ driver is loaded again. A file that cannot be read is NaN; a chip that goes away
 
 How a pwm was found is kept in a file before it is written for the first time, until it has been given back: after a
 process that was killed, the next one finds it manual and would otherwise leave it so.
+
+Modes of the pwms of a chip before fantwin wrote them, in a file that outlives the process that writes them.
 """
 
 from __future__ import annotations
 
 import errno
+import json
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from pydantic import TypeAdapter, ValidationError
 
 from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.files import replace_file
 from fantwin.pipeline.sources.hwmon.chips import chip_of
 from fantwin.pipeline.sources.hwmon.config import HwmonConfig
-from fantwin.pipeline.sources.hwmon.modes import FoundModes, FoundPwm
 from fantwin.pipeline.sources.hwmon.tree import ChipFolder, chip_folders, device_words
 from fantwin.pipeline.sources.polling import DeviceError, PollingSource
 from fantwin.pipeline.sources.source import Reading, Rejected, SourceContext
 from fantwin.schemas.channels import CURRENT, SUPPLY_VOLTAGE, TEMPERATURE
 from fantwin.schemas.units import RAD_S_PER_UNIT
+
+
+@dataclass(frozen=True)
+class FoundPwm:
+    """mode: pwmN_enable, None if there is none. pwm: 0 to 255, None if it could not be read."""
+
+    mode: int | None
+    pwm: int | None
+
+
+@dataclass(frozen=True)
+class _Found:
+    """Content of the file. chip, device: whose pwms they are."""
+
+    chip: str
+    device: str
+    pwms: dict[int, FoundPwm]
+
+
+_FOUND = TypeAdapter(_Found)
+
+
+class FoundModes:
+    """The file, which is there as long as something has to be given back. Without a path nothing is kept."""
+
+    def __init__(self, path: Path | None) -> None:
+        self._path = path
+
+    def kept(self, chip: ChipFolder) -> dict[int, FoundPwm]:
+        """Modes that an earlier process has not given back, by the number of the pwm."""
+        try:
+            found = _FOUND.validate_json(self._path.read_bytes()) if self._path else None
+        except (OSError, ValidationError):
+            return {}
+        return found.pwms if found and (found.chip, found.device) == (chip.name, chip.device) else {}
+
+    def keep(self, chip: ChipFolder, pwms: Mapping[int, FoundPwm]) -> None:
+        """Replace what is kept. Raises OSError."""
+        if self._path is None:
+            return
+        replace_file(self._path, json.dumps(_FOUND.dump_python(_Found(chip.name, chip.device, dict(pwms)))).encode())
+
+    def forget(self) -> None:
+        """Note that all was given back. Raises OSError."""
+        if self._path is not None:
+            self._path.unlink(missing_ok=True)
+
 
 MANUAL = 1
 """value of pwmN_enable for commands by a program"""

@@ -9,9 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from fantwin.pipeline.bus.dead_links import UNACKNOWLEDGED_MS, limit_connections
-from fantwin.pipeline.bus.link import LEASE_MS
-from fantwin.pipeline.bus.opening import zenoh_config
+from fantwin.pipeline.bus.endpoint import LEASE_MS
+from fantwin.pipeline.bus.opening import UNACKNOWLEDGED_MS, limit_connections, zenoh_config
 from fantwin.pipeline.bus.router import open_router
 from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.config.settings import BusConfig

@@ -10,8 +10,8 @@ from dataclasses import replace
 import pytest
 from pydantic import ValidationError
 
-from fantwin.pipeline.bus.access_rules import SiteRoles
 from fantwin.pipeline.bus.errors import BusError
+from fantwin.pipeline.bus.rights import SiteRoles
 from fantwin.pipeline.bus.router import open_router
 from fantwin.pipeline.bus.session import Bus, join_bus
 from fantwin.pipeline.config.settings import BusConfig

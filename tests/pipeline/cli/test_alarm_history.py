@@ -12,12 +12,11 @@ import pytest
 
 from fantwin.pipeline.cli.main import expand_variadic
 from fantwin.pipeline.recordings.clips.clip import CLIP_KEY
-from fantwin.pipeline.recordings.rare_messages import rare_messages
+from fantwin.pipeline.recordings.indexed import rare_messages
 from fantwin.pipeline.recordings.reading import read_recording
 from fantwin.pipeline.recordings.writing import RecordingWriter
 from fantwin.pipeline.site.alarm_history import AlarmHistory
-from fantwin.pipeline.site.alarm_rates import AlarmRates
-from fantwin.pipeline.site.judged_time import JudgedStretch
+from fantwin.pipeline.site.alarm_rates import AlarmRates, JudgedStretch
 from fantwin.schemas.enums import Feedback, Transition
 from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Alarm, Score

@@ -12,7 +12,7 @@ import pytest
 from fantwin.pipeline.cli.in_parallel import RecordingsInParallel
 from fantwin.pipeline.cli.main import expand_variadic
 from fantwin.pipeline.learning.healthy_evidence import check_declared_rate
-from fantwin.pipeline.replay.offline.marked_alarms import alarms_in, marked_alarms
+from fantwin.pipeline.replay.offline.alarm_episodes import alarms_in, marked_alarms
 from fantwin.schemas.enums import Action
 from fantwin.schemas.messages import Alarm
 from fantwin.scoring.model.priors import Priors

@@ -8,7 +8,7 @@ import pytest
 
 from fantwin.pipeline.recordings.reading import read_metadata, read_recording
 from fantwin.pipeline.recordings.runs import read_runs
-from fantwin.pipeline.replay.default_config import default_config, first_raw
+from fantwin.pipeline.replay.resolve_config import default_config, first_raw
 from fantwin.schemas.messages import Array, Raw
 from fantwin.schemas.tacho import Tacho
 from fantwin.twin.models.physical import PhysicalModel

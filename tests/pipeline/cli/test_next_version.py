@@ -21,7 +21,7 @@ from fantwin.pipeline.learning.versions import TwinVersions, Version
 from fantwin.pipeline.prediction.tray_twin import load_tray_twin
 from fantwin.pipeline.replay.offline.calibration_of_twin import calibration_in
 from fantwin.schemas.units import NS_PER_S
-from fantwin.twin.export.card_entries import with_card_entries
+from fantwin.twin.export.onnx_export import with_card_entries
 from tests.support.fantwin_command import error_of, fantwin
 from tests.support.healthy_recordings import FANS, START_S, add_recording
 from tests.support.made_once import MadeOnce

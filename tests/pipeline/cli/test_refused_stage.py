@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import pytest
 
-from fantwin.pipeline.bus.access_rules import SiteRoles
+from fantwin.pipeline.bus.rights import SiteRoles
 from fantwin.pipeline.bus.router import open_router
 from tests.support.fantwin_command import as_typed
 from tests.support.fantwin_command import fantwin as called

@@ -1,4 +1,4 @@
-"""pipeline.config.twin_entry: a twin is added to a configuration, and nothing else changes."""
+"""pipeline.config.loading: a twin is added to a configuration, and nothing else changes."""
 
 from __future__ import annotations
 
@@ -7,9 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from fantwin.pipeline.config.loading import load_config
+from fantwin.pipeline.config.loading import load_config, with_twin, write_twin
 from fantwin.pipeline.config.settings import ConfigError
-from fantwin.pipeline.config.twin_entry import with_twin, write_twin
 
 PATH = Path("fantwin.toml")
 

@@ -8,15 +8,15 @@ from pathlib import Path
 
 import pytest
 
-from fantwin.pipeline.launch import event_log
-from fantwin.pipeline.launch.event_log import FOLD_S, QUEUE_SIZE, EventLog, RepeatedLines
+from fantwin.pipeline.launch import site_report
+from fantwin.pipeline.launch.site_report import FOLD_S, QUEUE_SIZE, EventLog, RepeatedLines
 from tests.support.running_chain import DEADLINE_S, eventually
 
 
 @pytest.fixture(autouse=True)
 def whole(monkeypatch: pytest.MonkeyPatch) -> None:
     """`close` writes all."""
-    monkeypatch.setattr(event_log, "_CLOSE_LIMIT_S", DEADLINE_S)
+    monkeypatch.setattr(site_report, "_CLOSE_LIMIT_S", DEADLINE_S)
 
 
 @pytest.fixture

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from fantwin.pipeline.launch.hang_detector import HangDetector
-from fantwin.pipeline.launch.notices import Notices
+from fantwin.pipeline.launch.processes import HangDetector, Notices
 from fantwin.pipeline.runtime.service_manager import Notifier, starting
 from fantwin.pipeline.site.stage_states import START_LIMIT_S
 from tests.support.running_chain import eventually

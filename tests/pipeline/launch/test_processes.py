@@ -15,8 +15,7 @@ import pytest
 from fantwin.pipeline.config.loading import load_config
 from fantwin.pipeline.config.shards import Shard, StageProcess
 from fantwin.pipeline.launch.launcher import Launcher
-from fantwin.pipeline.launch.notices import Notices
-from fantwin.pipeline.launch.processes import EXIT_CANNOT_START, Child
+from fantwin.pipeline.launch.processes import EXIT_CANNOT_START, Child, Notices
 from tests.support.running_chain import DEMO
 
 

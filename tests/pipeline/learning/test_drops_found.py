@@ -12,7 +12,7 @@ import pytest
 from fantwin.pipeline.learning import drops_found as module
 from fantwin.pipeline.learning.drops_found import dropping, drops_found
 from fantwin.pipeline.prediction.tray_twin import load_tray_twin
-from fantwin.pipeline.tray_scoring.modelled_fans import modelled_fans
+from fantwin.pipeline.tray_scoring.healthy_twin import modelled_fans
 from fantwin.schemas.messages import Array
 from fantwin.schemas.units import NS_PER_S
 from fantwin.scoring.calibration.calibration import Calibration

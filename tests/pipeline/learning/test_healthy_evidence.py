@@ -6,8 +6,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from fantwin.pipeline.learning.healthy_evidence import marked_running
+from fantwin.pipeline.replay.offline.alarm_episodes import LeftOut, alarms_in, concerning, marked_alarms
 from fantwin.pipeline.replay.offline.healthy_runs import in_this_process
-from fantwin.pipeline.replay.offline.marked_alarms import LeftOut, alarms_in, concerning, marked_alarms
 from fantwin.pipeline.site.alarm_history import AlarmHistory
 from fantwin.schemas.enums import Action
 from fantwin.schemas.units import NS_PER_S

@@ -14,7 +14,7 @@ from mcap.records import Chunk, DataEnd, Footer
 from mcap.writer import MCAP0_MAGIC
 
 from fantwin.pipeline.recordings.contents import contents_of, damage_of
-from fantwin.pipeline.recordings.rare_messages import last_messages, rare_messages
+from fantwin.pipeline.recordings.indexed import last_messages, rare_messages
 from fantwin.pipeline.recordings.reading import read_metadata, read_recording
 from fantwin.pipeline.recordings.records import RECORD, Record, RecordReader, record_bytes
 from fantwin.pipeline.recordings.repair import recover

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from fantwin.pipeline.recordings.grouping import describe, recordings_of
+from fantwin.pipeline.recordings.run_recordings import describe, recordings_of
 from fantwin.pipeline.recordings.writing import RecordingWriter
 
 ANOTHER_PLACE = ["gateway.port=8081", 'launcher.without=["viewer"]', "viewer={}", "run_folder='x'", "bus.endpoint='y'"]

@@ -8,7 +8,7 @@ import pytest
 from mcap.records import ChunkIndex
 
 from fantwin.pipeline.recordings import indexed
-from fantwin.pipeline.recordings.rare_messages import last_messages, rare_messages
+from fantwin.pipeline.recordings.indexed import last_messages, rare_messages
 from fantwin.pipeline.recordings.writing import RecordingWriter
 from fantwin.schemas.codec import decode
 from fantwin.schemas.header import Header
@@ -44,7 +44,7 @@ def test_they_are_found_by_the_index_without_reading_the_rest(recording, monkeyp
     def read(*_: object) -> None:
         raise AssertionError("the whole file is read")
 
-    monkeypatch.setattr("fantwin.pipeline.recordings.rare_messages.read_recording", read)
+    monkeypatch.setattr("fantwin.pipeline.recordings.indexed.read_recording", read)
     assert found(recording) == CARDS
     assert rare_messages(recording, "grid") == []
 

@@ -7,7 +7,7 @@ import pytest
 from mcap.writer import Writer
 
 from fantwin.pipeline.recordings.contents import contents_of
-from fantwin.pipeline.recordings.rare_messages import last_message_ns, last_messages, rare_messages
+from fantwin.pipeline.recordings.indexed import last_message_ns, last_messages, rare_messages
 from fantwin.pipeline.recordings.reading import RecordingError, read_metadata, read_recording
 from fantwin.pipeline.recordings.scan import scan
 from fantwin.pipeline.recordings.writing import RecordingWriter

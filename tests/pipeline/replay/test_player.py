@@ -9,8 +9,17 @@ from typing import Any, cast
 import pytest
 
 from fantwin.pipeline.replay.live.keyboard import Key
-from fantwin.pipeline.replay.live.pace import FASTEST, SLOWEST, Pace, faster, slower
-from fantwin.pipeline.replay.live.player import BEAT_S, Player, Progress, Stopped
+from fantwin.pipeline.replay.live.player import (
+    BEAT_S,
+    FASTEST,
+    SLOWEST,
+    Pace,
+    Player,
+    Progress,
+    Stopped,
+    faster,
+    slower,
+)
 from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.messages import NewTwin
 from tests.support import made_messages

@@ -16,11 +16,9 @@ import pytest
 from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.config.loading import load_config
 from fantwin.pipeline.recordings.writing import RecordingWriter
-from fantwin.pipeline.replay.live.pace import Pace
-from fantwin.pipeline.replay.live.player import Player
+from fantwin.pipeline.replay.live.player import Pace, Player
 from fantwin.pipeline.replay.live.publishing import publish
-from fantwin.pipeline.replay.live.recorded_versions import ComingVersions, read_versions
-from fantwin.pipeline.replay.live.recording_playback import RecordingPlayback
+from fantwin.pipeline.replay.live.recording_playback import ComingVersions, RecordingPlayback, read_versions
 from fantwin.pipeline.runtime.stage import Context, load_stage
 from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.header import Header

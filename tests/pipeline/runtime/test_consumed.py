@@ -9,7 +9,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fantwin.pipeline.runtime.consumed import PERIOD_NS, ConsumedReports
+from fantwin.pipeline.runtime.publishing import PERIOD_NS, ConsumedReports
 from fantwin.schemas.header import Header, InputPosition
 from fantwin.schemas.messages import Consumed, Grid
 from fantwin.schemas.streams import continues

@@ -8,7 +8,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fantwin.pipeline.runtime.due_messages import MOST_JOINED_VALUES, MOST_REQUESTS, DueMessages
+from fantwin.pipeline.runtime.inbox import MOST_JOINED_VALUES, MOST_REQUESTS, DueMessages
 from fantwin.schemas.blocks import can_join
 from fantwin.schemas.enums import Action
 from fantwin.schemas.envelope import Envelope

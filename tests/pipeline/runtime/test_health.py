@@ -6,8 +6,7 @@ import math
 
 import pytest
 
-from fantwin.pipeline.runtime.health import AWAITED_AFTER_NS, HealthBuilder
-from fantwin.pipeline.runtime.latencies import LATENCY_WINDOW_S
+from fantwin.pipeline.runtime.health import AWAITED_AFTER_NS, LATENCY_WINDOW_S, HealthBuilder
 from fantwin.schemas.codec import decode, encode
 from fantwin.schemas.enums import StageStatus
 from fantwin.schemas.health import AwaitedInput, Health
@@ -54,7 +53,7 @@ def test_row_01_the_times_of_the_newest_input_and_output_are_given(builder):
 
 def test_latencies_are_of_the_last_ten_seconds_and_the_histogram_is_of_the_session(builder, monkeypatch):
     now_s = [100.0]
-    monkeypatch.setattr("fantwin.pipeline.runtime.latencies.time.monotonic", lambda: now_s[0])
+    monkeypatch.setattr("fantwin.pipeline.runtime.health.time.monotonic", lambda: now_s[0])
     assert health(builder, START_NS).latencies == ()
     for latency_ms in (-1, 1, 2, 3, 700, 60_000):  # -1: the clock of another host is ahead
         now_s[0] += LATENCY_WINDOW_S + 1

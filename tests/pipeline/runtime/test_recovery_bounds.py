@@ -13,9 +13,15 @@ from fantwin.pipeline.bus.recovery import LAST_SEQUENCE, Answer, recovery_key
 from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.config.settings import BusConfig
 from fantwin.pipeline.runtime.inbox import INBOX_BYTES, FromBus, Inbox, Recovered
-from fantwin.pipeline.runtime.sequence_tracker import MOST_HELD_MESSAGES, Found, SequenceTracker
+from fantwin.pipeline.runtime.sequence_tracker import (
+    MOST_HELD_MESSAGES,
+    MOST_PRODUCERS,
+    SILENT_S,
+    Found,
+    Request,
+    SequenceTracker,
+)
 from fantwin.pipeline.runtime.sessions import Session, Sessions
-from fantwin.pipeline.runtime.tracked_streams import MOST_PRODUCERS, SILENT_S, Request
 from fantwin.schemas.codec import encode, type_name
 from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Grid, Raw

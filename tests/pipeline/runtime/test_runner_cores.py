@@ -10,9 +10,9 @@ from typing import Any, ClassVar
 import pytest
 
 from fantwin.pipeline.runtime.inbox import INBOX_SIZE
-from fantwin.pipeline.runtime.joint_step import step_together
 from fantwin.pipeline.runtime.runner import Runner
 from fantwin.pipeline.runtime.stage import Admitted, BuiltStage, Context, Core, StageError
+from fantwin.pipeline.runtime.steps import step_together
 from fantwin.schemas.enums import StageStatus
 from fantwin.schemas.header import Header, InputPosition
 from fantwin.schemas.health import Health

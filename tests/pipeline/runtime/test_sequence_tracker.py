@@ -6,9 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fantwin.pipeline.runtime.sequence_tracker import Found, SequenceTracker
+from fantwin.pipeline.runtime.sequence_tracker import Found, Request, SequenceTracker
 from fantwin.pipeline.runtime.sessions import Session, Sessions
-from fantwin.pipeline.runtime.tracked_streams import Request
 from fantwin.schemas.enums import StageStatus
 from fantwin.schemas.header import Header
 from fantwin.schemas.health import Health

@@ -8,8 +8,7 @@ from dataclasses import replace
 
 import pytest
 
-from fantwin.pipeline.runtime.lost_sessions import LostSessions
-from fantwin.pipeline.runtime.sessions import Session, Sessions, this_host
+from fantwin.pipeline.runtime.sessions import LostSessions, Session, Sessions, this_host
 from fantwin.pipeline.runtime.silences import BEGINS_NS, MOST_DELAY_S, RESTART_S, Silences
 from fantwin.schemas.enums import StageStatus
 from fantwin.schemas.header import Header

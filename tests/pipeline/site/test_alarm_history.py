@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from fantwin.pipeline.errors import UserError
-from fantwin.pipeline.outputs.mqtt.transition_queue import READER, TransitionQueue
+from fantwin.pipeline.outputs.mqtt.outbox import READER, TransitionQueue
 from fantwin.pipeline.site import alarm_history
 from fantwin.pipeline.site.alarm_history import AlarmHistory
 from fantwin.schemas.enums import Transition

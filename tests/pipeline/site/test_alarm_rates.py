@@ -9,8 +9,7 @@ import pytest
 
 from fantwin.pipeline.site import alarm_rates
 from fantwin.pipeline.site.alarm_history import AlarmHistory
-from fantwin.pipeline.site.alarm_rates import AlarmRates
-from fantwin.pipeline.site.judged_time import JudgedStretch, JudgedTime
+from fantwin.pipeline.site.alarm_rates import AlarmRates, JudgedStretch, JudgedTime
 from fantwin.schemas.enums import Transition
 from fantwin.schemas.units import NS_PER_S
 from tests.support.made_messages import alarm

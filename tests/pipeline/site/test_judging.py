@@ -19,8 +19,8 @@ from fantwin.schemas.enums import FanState, InvalidReason
 from fantwin.schemas.header import Header
 from fantwin.schemas.health import Output
 from fantwin.schemas.topics import tray_key
+from fantwin.scoring.alarms.alarm_text import RETURNING
 from fantwin.scoring.alarms.current_alarms import CurrentAlarm
-from fantwin.scoring.alarms.words_now import RETURNING
 from tests.support import made_messages
 from tests.support.score_data import one_sample
 from tests.support.stub_bus import SCORER, STRANGER, StubBus, health

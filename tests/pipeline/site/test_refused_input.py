@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from fantwin.pipeline.site.refused_input import refused, refused_lines, unusable_lines
+from fantwin.pipeline.site.loss_accounting import refused, refused_lines, unusable_lines
 from fantwin.schemas.enums import StageStatus
 from fantwin.schemas.health import Counter, Health
 from fantwin.schemas.wire import DEVICE_COUNTERS, FaultKind

@@ -1,4 +1,4 @@
-"""pipeline.tray_scoring.modelled_fans: what the card of a twin says of a fan's drive."""
+"""pipeline.tray_scoring.healthy_twin: what the card of a twin says of a fan's drive."""
 
 from __future__ import annotations
 

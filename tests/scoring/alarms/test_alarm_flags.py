@@ -1,4 +1,4 @@
-"""scoring.alarms.alarm_flags: retained, silenced, presented and listed, for a scorer's state and for a message."""
+"""scoring.alarms.alarm_state: retained, silenced, presented and listed, for a scorer's state and for a message."""
 
 from __future__ import annotations
 
@@ -6,8 +6,14 @@ import pytest
 
 from fantwin.schemas.enums import Severity
 from fantwin.schemas.messages import Alarm
-from fantwin.scoring.alarms.alarm_flags import is_listed, is_presented, is_retained, is_silenced
-from fantwin.scoring.alarms.alarm_state import UNTIL_IT_CLEARS_T_NS, AlarmState
+from fantwin.scoring.alarms.alarm_state import (
+    UNTIL_IT_CLEARS_T_NS,
+    AlarmState,
+    is_listed,
+    is_presented,
+    is_retained,
+    is_silenced,
+)
 
 ACTIVE = {"active": True, "acknowledged": False, "confirmed": True}
 OVER = {"active": False, "acknowledged": True, "confirmed": True}

@@ -12,8 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fantwin.schemas.enums import Action, Severity, Transition
-from fantwin.scoring.alarms.alarm_flags import is_retained, is_silenced
-from fantwin.scoring.alarms.alarm_state import UNTIL_IT_CLEARS_T_NS, ConditionSettings
+from fantwin.scoring.alarms.alarm_state import UNTIL_IT_CLEARS_T_NS, ConditionSettings, is_retained, is_silenced
 from fantwin.scoring.alarms.alarms_of_tray import AlarmEvent, AlarmsOfTray, Decided
 
 STEP_NS = 10

@@ -1,10 +1,10 @@
-"""scoring.calibration.observed_rate: the rate of false alarms that really was, with its exact interval."""
+"""scoring.calibration.calibration: the rate of false alarms that really was, with its exact interval."""
 
 from __future__ import annotations
 
 import pytest
 
-from fantwin.scoring.calibration.observed_rate import ObservedRate, together
+from fantwin.scoring.calibration.calibration import ObservedRate, together
 
 DAYS_100 = 2400.0
 

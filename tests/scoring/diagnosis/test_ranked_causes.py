@@ -10,9 +10,14 @@ import pytest
 from fantwin.schemas.messages import Diagnosis
 from fantwin.scoring.diagnosis import ranked_causes
 from fantwin.scoring.diagnosis.causes import CAUSES, ROWS, WHAT_TO_DO, CauseRow, Size, advice, likely_causes
-from fantwin.scoring.diagnosis.ranked_causes import CauseWords, PossibleCause, says_more
-from fantwin.scoring.diagnosis.steady_fan import SteadyFan
-from fantwin.scoring.diagnosis.what_would_tell import Advice, SeenSinceOnset
+from fantwin.scoring.diagnosis.ranked_causes import (
+    Advice,
+    CauseWords,
+    PossibleCause,
+    SeenSinceOnset,
+    SteadyFan,
+    says_more,
+)
 from fantwin.scoring.model.faults import FAULTS
 
 FAN = SteadyFan(viscous=2e-4, drag=3e-6, friction=0.04, top_rad_s=500.0)

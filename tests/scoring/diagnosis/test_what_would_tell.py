@@ -1,4 +1,4 @@
-"""scoring.diagnosis.what_would_tell: the command that would tell a cause."""
+"""scoring.diagnosis.ranked_causes: the command that would tell a cause."""
 
 from __future__ import annotations
 
@@ -7,8 +7,7 @@ from dataclasses import replace
 
 import pytest
 
-from fantwin.scoring.diagnosis.steady_fan import SteadyFan
-from fantwin.scoring.diagnosis.what_would_tell import Advice, SeenSinceOnset
+from fantwin.scoring.diagnosis.ranked_causes import Advice, SeenSinceOnset, SteadyFan
 
 FAN = SteadyFan(viscous=2e-4, drag=3e-6, friction=0.04, top_rad_s=500.0)
 SEEN = SeenSinceOnset(300.0, 300.0, FAN.needed(300.0), FAN.needed(300.0))

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import pytest
 
 from fantwin.scoring.model.operation import Operation
-from fantwin.scoring.standing.falls import Falls
+from fantwin.scoring.standing.stands_still import Falls
 from tests.support.made_bins import bin_of, with_reading
 from tests.support.scored_blocks import TWIN_SPEED, twin_of
 

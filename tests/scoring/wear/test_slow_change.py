@@ -1,8 +1,8 @@
-"""scoring.wear.slow_change: what is said in words."""
+"""scoring.wear.wear_monitor: what is said in words."""
 
 from __future__ import annotations
 
-from fantwin.scoring.wear.slow_change import is_of_slow_change, limit_ahead, own_change, shared_change
+from fantwin.scoring.wear.wear_monitor import is_of_slow_change, limit_ahead, own_change, shared_change
 
 HOUR_NS = 3600 * 10**9
 

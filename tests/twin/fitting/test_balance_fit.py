@@ -15,8 +15,7 @@ from fantwin.simulation.plant import FanParameters, advance, at_rest
 from fantwin.twin.errors import TwinError
 from fantwin.twin.evaluation.resampling import resampled
 from fantwin.twin.export.onnx_twin import OnnxTwin
-from fantwin.twin.fitting.balance import FILTER_RATE_PER_S
-from fantwin.twin.fitting.balance_fit import fit_balance
+from fantwin.twin.fitting.balance_fit import FILTER_RATE_PER_S, fit_balance
 from fantwin.twin.fitting.identification import Identification, identify
 from fantwin.twin.runs import Array, Run
 from tests.support.fan_data import NOISE_RAD_S, torque_balance

@@ -7,9 +7,9 @@ import pytest
 
 from fantwin.twin.build import evaluate, train_twin
 from fantwin.twin.evaluation.resampling import thinned
-from fantwin.twin.fitting import thinning
-from fantwin.twin.fitting.thinning import coarser, thinning_factor, windows_of
-from fantwin.twin.models.recursion import linear_recursion
+from fantwin.twin.fitting import trajectories
+from fantwin.twin.fitting.trajectories import coarser, thinning_factor, windows_of
+from fantwin.twin.models.integration import linear_recursion
 from fantwin.twin.runs import Run
 from tests.support import fan_data
 
@@ -26,15 +26,15 @@ def tray(fans: int, seconds: float) -> Run:
 def test_windows_show_every_moment_and_every_fan_and_few_fans_are_not_thinned() -> None:
     pieces = [tray(20, 40.0), tray(20, 90.0)]
     factor = thinning_factor(pieces, TIME_CONSTANT_S)
-    assert factor == 20 // thinning.LEAST_FANS, "as many fans as are needed in each window"
+    assert factor == 20 // trajectories.LEAST_FANS, "as many fans as are needed in each window"
     windows = windows_of(pieces, TIME_CONSTANT_S)
     shown = np.concatenate([np.isfinite(window.speed_rad_s) for window in windows])
     assert sum(window.samples for window in windows) == sum(piece.samples for piece in pieces)
-    assert np.all(shown.sum(axis=1) == thinning.LEAST_FANS)
+    assert np.all(shown.sum(axis=1) == trajectories.LEAST_FANS)
     assert np.all(np.abs(shown.mean(axis=0) - 1.0 / factor) < 0.1), "every fan in its share of them"
     whole = np.concatenate([piece.speed_rad_s for piece in pieces])
     np.testing.assert_array_equal(np.concatenate([each.speed_rad_s for each in windows])[shown], whole[shown])
-    assert thinning_factor([tray(64, 40.0)], TIME_CONSTANT_S) == 64 * 4000 // thinning.ENOUGH_READINGS
+    assert thinning_factor([tray(64, 40.0)], TIME_CONSTANT_S) == 64 * 4000 // trajectories.ENOUGH_READINGS
     for few in (tray(8, 80.0), tray(9, 1000.0), tray(64, 15.0), tray(64, 5.0)):
         assert windows_of([few], TIME_CONSTANT_S) == [few]
 
@@ -55,8 +55,8 @@ def test_a_network_comes_from_windows_and_the_physics_of_each_fan_from_all_its_r
 
     in_two, error, std = trained()
     assert not in_two
-    monkeypatch.setattr(thinning, "ENOUGH_READINGS", run.speed_rad_s.size // 2)
-    monkeypatch.setattr(thinning, "LEAST_FANS", 4)
+    monkeypatch.setattr(trajectories, "ENOUGH_READINGS", run.speed_rad_s.size // 2)
+    monkeypatch.setattr(trajectories, "LEAST_FANS", 4)
     in_two, of_thinned, std_of_thinned = trained()
     assert in_two
     assert of_thinned < 1.005 * error, "4 % more by windows alone, 1 % if the priors do not limit the steps"

@@ -7,8 +7,7 @@ import pytest
 
 from fantwin.twin.errors import TwinError
 from fantwin.twin.evaluation.accuracy import evaluation_pieces, free_run_residuals, pooled_rmse_rad_s
-from fantwin.twin.fitting.narx_fit import free_run_sensitivities
-from fantwin.twin.fitting.narx_stability import forgets_its_start
+from fantwin.twin.fitting.narx_fit import forgets_its_start, free_run_sensitivities
 from fantwin.twin.fitting.narx_training import train_narx
 from fantwin.twin.models.narx import ORDER, PARAMETER_COUNT, Narx
 from fantwin.twin.models.network import Scaling

@@ -1,4 +1,4 @@
-"""twin.report.record_next: what to record next is where a twin knows least, among what its fan can do."""
+"""twin.report.assessment: what to record next is where a twin knows least, among what its fan can do."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from fantwin.schemas.model_uncertainty import ModelUncertainty
 from fantwin.schemas.twin_card import DriveCard
-from fantwin.twin.report.record_next import least_known
+from fantwin.twin.report.assessment import least_known
 from fantwin.twin.report.steady_states import StaticCurve
 from tests.support.uncertainty_tables import by_speed
 

@@ -9,8 +9,7 @@ import pytest
 
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.outputs.notify import outbox as module
-from fantwin.pipeline.outputs.notify.deciding import Announced, Happened, Kind, Told
-from fantwin.pipeline.outputs.notify.gathering import Gathered
+from fantwin.pipeline.outputs.notify.deciding import Announced, Gathered, Happened, Kind, Told
 from fantwin.pipeline.outputs.notify.notification_flow import Basket, Changes, Outgoing, Saved
 from fantwin.pipeline.outputs.notify.outbox import Outbox
 from fantwin.pipeline.outputs.notify.wording import Level, Text

@@ -11,8 +11,7 @@ pytest.importorskip("asyncua")
 from asyncua import ua
 from asyncua.ua.ua_binary import variant_to_binary
 
-from fantwin.pipeline.outputs.opcua.conditions import condition_fields
-from fantwin.pipeline.outputs.opcua.events import condition_event, system_event
+from fantwin.pipeline.outputs.opcua.events import condition_event, condition_fields, system_event
 from fantwin.pipeline.site.fleet import Fan
 from fantwin.schemas.enums import Severity, Transition
 from fantwin.schemas.messages import Alarm

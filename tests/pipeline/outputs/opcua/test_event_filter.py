@@ -15,8 +15,7 @@ from asyncua import ua
 from asyncua.server.address_space import AddressSpace
 from asyncua.server.monitored_item_service import WhereClauseEvaluator
 
-from fantwin.pipeline.outputs.opcua.event_filter import as_the_library_evaluates
-from fantwin.pipeline.outputs.opcua.events import condition_event, system_event
+from fantwin.pipeline.outputs.opcua.events import as_the_library_evaluates, condition_event, system_event
 from fantwin.scoring.alarms.current_alarms import current_alarm
 from tests.support.site_messages import alarm
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from fantwin.pipeline.outputs.rerun.alarm_table import ALARMS_LISTED, alarm_table
+from fantwin.pipeline.outputs.rerun.alarm_log import ALARMS_LISTED, alarm_table
 from fantwin.pipeline.site.alarm_book import AlarmBook
 from fantwin.schemas.enums import Severity, Statistic, Transition
 from fantwin.schemas.header import Header

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from fantwin.pipeline.config.settings import TrayConfig
-from fantwin.pipeline.outputs.rerun import view_file
-from fantwin.pipeline.outputs.rerun.rerun_sink import RerunSink, ViewOptions
-from fantwin.pipeline.outputs.rerun.view_file import ViewFile
+from fantwin.pipeline.outputs.rerun import rerun_sink
+from fantwin.pipeline.outputs.rerun.rerun_sink import RerunSink, ViewFile, ViewOptions
 from fantwin.pipeline.outputs.rerun.viewer_core import ViewerCore
 from fantwin.schemas.units import NS_PER_S
 from tests.support.drawn_views import sent
@@ -65,8 +64,8 @@ def test_the_file_ends_before_it_exceeds_its_limit(tmp_path: Path) -> None:
 
 
 def test_row_09_a_disk_that_hangs_keeps_nobody_waiting(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(view_file, "HELD_BYTES", 1 << 20)
-    monkeypatch.setattr(view_file, "CLOSE_LIMIT_S", 0.2)
+    monkeypatch.setattr(rerun_sink, "HELD_BYTES", 1 << 20)
+    monkeypatch.setattr(rerun_sink, "CLOSE_LIMIT_S", 0.2)
     path = tmp_path / "view.rrd"
     os.mkfifo(path)  # nobody reads from it: a write of more than it holds never returns
     reader = os.open(path, os.O_RDONLY | os.O_NONBLOCK)

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fantwin.pipeline.outputs.rerun.wear_points import wear_points
+from fantwin.pipeline.outputs.rerun.rerun_wear import wear_points
 from fantwin.schemas.messages import ScorerSnapshot
 from tests.support.score_data import START_NS
 from tests.support.wear_data import LOSS, worn_snapshot

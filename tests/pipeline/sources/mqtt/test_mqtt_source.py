@@ -16,9 +16,8 @@ import pytest
 from paho.mqtt.enums import CallbackAPIVersion
 from pydantic import ValidationError
 
-from fantwin.pipeline.sources.fan_values import FanValues
 from fantwin.pipeline.sources.mqtt.config import MqttConfig
-from fantwin.pipeline.sources.mqtt.source import MqttSource
+from fantwin.pipeline.sources.mqtt.source import FanValues, MqttSource
 from fantwin.pipeline.sources.source import (
     LinkUp,
     Reading,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from fantwin.pipeline.sources.serial.counters import DeviceCounterSteps
+from fantwin.pipeline.sources.serial.source import DeviceCounterSteps
 from fantwin.schemas.wire import UINT32, DeviceCounters
 
 AT_100_HZ_S = UINT32 // 100
