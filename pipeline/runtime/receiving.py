@@ -87,6 +87,7 @@ class Receiver:
         reads = stage.reads_as_configured(config)
         self.keys = {tray_key(config.site, tray, topic) for topic in reads if topic != "health" for tray in shard.trays}
         """all that the stage reads, health apart"""
+        self._unhurried = {key for key in self.keys if topic_of(key).name in stage.undecoded}
         self.peers = Peers(self.keys)
         self._silences = Silences(
             {tray_key(config.site, tray, topic): tray for topic in stage.reads[:1] for tray in shard.trays}, sessions
@@ -107,7 +108,8 @@ class Receiver:
 
     def on_message(self, key: str, payload: bytes) -> None:
         """A message has come, in a thread of the bus: put it into the inbox."""
-        self._inbox.put(FromBus(key, payload, HOST_CLOCK.now_ns()), is_urgent=not self._is_patient)
+        is_urgent = not (self._is_patient or key in self._unhurried)
+        self._inbox.put(FromBus(key, payload, HOST_CLOCK.now_ns()), is_urgent=is_urgent)
 
     def _on_health(self, key: str, payload: bytes) -> None:
         self._inbox.put(FromBus(key, payload, HOST_CLOCK.now_ns()), is_urgent=False)

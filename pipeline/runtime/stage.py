@@ -228,7 +228,7 @@ class Stage:
         core_per_tray: a core for each tray, or one core that serves all trays of the process.
         wants_envelopes: whether `step` is given envelopes instead of messages.
         undecoded: topics whose messages `step` is given as envelopes, of which only the header has been decoded: for a
-            core that looks into few of them.
+            core that looks into few of them, at the next tick.
         is_patient: nobody waits for what it does with a message: messages are taken at the next tick, together.
         may_drop: a consumer that may drop messages: its missing messages do not count as losses.
         joint: for cores that process the blocks of several trays in one pass; None: each tray alone.

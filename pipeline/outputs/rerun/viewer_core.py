@@ -11,10 +11,10 @@ import numpy as np
 
 from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.outputs.rerun.alarm_log import LogLine, alarm_table, log_line
-from fantwin.pipeline.outputs.rerun.fleet_view import FleetView
+from fantwin.pipeline.outputs.rerun.fleet_view import ADDED_EVERY_NS, FleetView
 from fantwin.pipeline.outputs.rerun.rerun_wear import WearPoints, wear_points
 from fantwin.pipeline.site.fleet import SILENT, Fan
-from fantwin.pipeline.site.site_core import SAMPLED_S, SiteCore
+from fantwin.pipeline.site.site_core import SiteCore
 from fantwin.pipeline.site.site_model import SiteModel
 from fantwin.pipeline.site.trace import MEASURED_COLUMNS, Trace, state_changes, state_name, trace_of, with_holes
 from fantwin.schemas.envelope import Envelope
@@ -95,7 +95,8 @@ class ViewerCore(SiteCore):
 
     def needs_score(self, tray: str) -> bool:
         """Whether the score of a tray that has arrived is to be decoded: all, where fans of the tray are drawn."""
-        return not self._fleet or bool(self._views[tray].fans) or self._model.wants_score(tray, SAMPLED_S)
+        is_drawn = not self._fleet or bool(self._views[tray].fans)
+        return is_drawn or self._model.wants_score(tray, ADDED_EVERY_NS / NS_PER_S)
 
     def add_score(self, envelope: Envelope) -> None:
         """Keep it for the next flush."""
