@@ -3,9 +3,8 @@
 A message holds one sample or many (docs/reference/messages.md), and the output of a stage does not depend on how its
 input is cut. A stage that has many small messages at hand can therefore join them and save the cost per message.
 
-Messages of several trays put side by side into one with the fans of all, and one taken apart again.
-
-Messages with the same number of samples can be processed in one pass, which costs little more than one of them alone.
+Messages of several trays with the same number of samples can be put side by side, into one with the fans of all, and
+taken apart again. Processed in one pass they cost little more than one of them alone.
 """
 
 from __future__ import annotations

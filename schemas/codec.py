@@ -4,7 +4,7 @@ A packed field's bytes are the array's own little-endian bytes (enums and boolea
 appended to the serialised scalars as key, length and bytes. The result is standard protobuf, which any reader decodes
 with `fan.proto`.
 
-A shortcut for readers of hundreds of thousands of messages: many as one block.
+`decode_together` is a shortcut for readers of hundreds of thousands of messages: it decodes many as one block.
 """
 
 from __future__ import annotations

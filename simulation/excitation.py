@@ -3,13 +3,6 @@
 A profile is a function of time, `command(t_s) -> (fans,)`, within `low..high`. Each fan has its own; the same seed
 gives the same commands. Profiles are periodic; those made of steps, and the thermostat, jump where a period begins
 again.
-
-Commands of a thermostat, as cooling controllers give them: temperature wanders, jumps, and fans stop and start.
-
-Two neighbouring fans share a zone, whose load jumps between cold, where the fans stop, and hot. The temperature of each
-fan follows its zone with a lag; below `STOP_C` the fan is switched off, above `START_C` on again, and between them it
-keeps its state. The duty rises with the temperature from low to high, in steps of 1/255 as the registers of PWM
-controllers have it, ten times a second.
 """
 
 from __future__ import annotations
@@ -41,7 +34,13 @@ STOP_C, START_C, FULL_C = 29.0, 31.0, 65.0
 
 
 class Thermostat:
-    """Commands of fans for a time, then again from the beginning."""
+    """Commands as cooling controllers give them: temperature wanders, jumps, and fans stop and start.
+
+    Two neighbouring fans share a zone, whose load jumps between cold, where the fans stop, and hot. The temperature of
+    each fan follows its zone with a lag; below `STOP_C` the fan is switched off, above `START_C` on again, and between
+    them it keeps its state. The duty rises with the temperature from low to high, in steps of 1/255 as the registers of
+    PWM controllers have it, ten times a second. After a time, the commands begin again.
+    """
 
     def __init__(self, fans: int, seed: int, low: float, high: float, period_s: float = 3600.0) -> None:
         """Draw the commands. low, high: duty of a running fan, 0 to 1; a stopped one has 0."""

@@ -1,4 +1,4 @@
-"""Simulated fans: the equation of motion with friction, electrical lag, dead zone and saturation.
+"""Simulated fans: the equation of motion with friction, electrical lag, dead zone and saturation; their supply and air.
 
     J w' + alpha w + C_D w|w| = gain i - friction(w)       torques in V-equivalents
     lag i' + i = supply * drive(duty)                      current follows the bridge
@@ -11,12 +11,6 @@ curve is that of Armstrong-Helouvry, Dupont and Canudas de Wit (Automatica 30, 1
 Time stepping: the current is exact for a held command, the smooth part of the motion is a midpoint step (order two),
 and friction is an impulse that can stop the rotor but never reverse it (Moreau), so that a rotor below breakaway
 has exactly zero speed.
-
-What surrounds simulated fans and changes with time: the supply of the tray and the air; and what is measured of it.
-
-The supply wanders around its nominal voltage, as one that others load (a first-order process), and the temperature of
-the air swings around its mean. Air that is warmer than 20 degrees Celsius is thinner, and drags less. The temperature
-does not change the speed of a 4-pin fan, which controls it.
 """
 
 from __future__ import annotations
@@ -61,7 +55,12 @@ class Surroundings:
 
 
 class SurroundingsNow:
-    """The supply and the air of a tray, moment after moment."""
+    """The supply and the air of a tray, moment after moment, and what is measured of them.
+
+    The supply wanders around its nominal voltage, as one that others load (a first-order process), and the temperature
+    of the air swings around its mean. Air that is warmer than 20 degrees Celsius is thinner, and drags less. The
+    temperature does not change the speed of a 4-pin fan, which controls it.
+    """
 
     def __init__(self, settings: Surroundings, rng: np.random.Generator) -> None:
         self._settings = settings

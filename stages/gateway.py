@@ -23,11 +23,11 @@ from fantwin.pipeline.runtime.stage import BuiltStage, Context, Stage
 from fantwin.pipeline.site.alarm_history import FILE, AlarmHistory
 from fantwin.pipeline.site.fan_history import curves_of
 from fantwin.pipeline.site.fleet import Fan
+from fantwin.pipeline.site.other_stages import VIEWER, configured, recordings_of, viewer_urls
 from fantwin.pipeline.site.request_desk import RequestDesk
 from fantwin.pipeline.site.site_core import SiteCore
 from fantwin.pipeline.site.site_json import alarm_json, curves_json, fleet_json, stages_json
 from fantwin.pipeline.site.site_model import SiteModel
-from fantwin.pipeline.site.stage_states import VIEWER, configured, recordings_of, viewer_urls
 from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.messages import Alarm, Message
 from fantwin.schemas.units import NS_PER_S

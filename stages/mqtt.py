@@ -13,17 +13,10 @@ from collections.abc import Mapping, Sequence
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.extras import require
 from fantwin.pipeline.outputs.mqtt.config import MqttConfig
+from fantwin.pipeline.outputs.mqtt.fan_states import FanStates, shown_alarm
 from fantwin.pipeline.outputs.mqtt.home_assistant import OFFLINE, ONLINE, HomeAssistant
 from fantwin.pipeline.outputs.mqtt.link import BrokerLink
-from fantwin.pipeline.outputs.mqtt.outbox import (
-    REMOVED,
-    FanStates,
-    Outbox,
-    Outgoing,
-    TransitionQueue,
-    shown_alarm,
-    text_of,
-)
+from fantwin.pipeline.outputs.mqtt.outbox import REMOVED, Outbox, Outgoing, TransitionQueue, text_of
 from fantwin.pipeline.outputs.mqtt.requests import Requests
 from fantwin.pipeline.outputs.mqtt.topics import Topics, do_overlap
 from fantwin.pipeline.runtime.stage import BuiltStage, Context, Stage, StageError

@@ -1,13 +1,9 @@
-"""Messages of raw samples: what a source delivers within the time of one message, and what the device's sequence number
-says of losses.
+"""Messages of raw samples, made of what a source delivers within the time of one message; and what a device has lost.
 
-Samples that were refused are lost. The gap that they leave in the sequence shows it; until there is a gap, or where
-there is no sequence, they are counted as `lost_refused`.
-
-So a stage with a line of 100 samples a second is woken 20 times a second, not 100 times. The rule is the same for all
-sources. Readings are handed over as soon as the next ones, by the time between
-the last two arrivals, would come later than the time of a message: so a slow line is not delayed. If the next ones do
-not arrive, the stage takes the waiting ones at its next tick.
+A stage with a line of 100 samples a second is woken 20 times a second, not 100 times. The rule is the same for all
+sources. Readings are handed over as soon as the next ones, by the time between the last two arrivals, would come later
+than the time of a message: so a slow line is not delayed. If the next ones do not arrive, the stage takes the waiting
+ones at its next tick.
 """
 
 from __future__ import annotations
@@ -31,7 +27,11 @@ _RECENT_SAMPLES = 64  # how far back a repeated sample is recognised
 
 
 class DeviceSequence:
-    """Follows the sequence numbers of one device."""
+    """Follows the sequence numbers of one device: which samples were lost, repeated, or follow a restart of the device.
+
+    Samples that were refused are lost. The gap that they leave in the sequence shows it; until there is a gap, or where
+    there is no sequence, they are counted as `lost_refused`.
+    """
 
     def __init__(self) -> None:
         self.refused = 0

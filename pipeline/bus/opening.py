@@ -1,14 +1,15 @@
 """Opening a session on the bus, and closing links whose other end has vanished.
 
-If a client is cut off while its router has data to send, the kernel of the router retransmits for a quarter of an hour.
-Until then Zenoh closes neither the connection nor the session, and still shows the client's tokens. A client that
-connects again meanwhile reaches nobody with its messages. Zenoh has no setting for this.
-
 Processes are peers that need no router. The first to start on a host listens on the configured endpoint; the others
 connect there and discover each other. When the first dies, the rest stay connected, and the next process to start
 listens on the endpoint. (Retrying to listen would take the endpoint over at once, but a session that still retries
 takes at least ten seconds to close: measured with Zenoh 1.10.) A command that connects only briefly does not listen:
 after it left, a new process would find no listener at the endpoint and discover the others late.
+
+If a client is cut off while its router has data to send, the kernel of the router retransmits for a quarter of an hour.
+Until then Zenoh closes neither the connection nor the session, and still shows the client's tokens. A client that
+connects again meanwhile reaches nobody with its messages. Zenoh has no setting for this, so the kernel is told to give
+up sooner (`given_up_soon`, `limit_connections`).
 
 Zenoh's shared memory is off: it would copy messages of 3 kB or more into a pool, and watch the pool 20 times a second
 in every process. Over a socket they cost no more, and the processes of a small site take 60 MB less.
@@ -27,17 +28,10 @@ from typing import TYPE_CHECKING
 
 import zenoh
 
-from fantwin.pipeline.bus.endpoint import (
-    LEASE_MS,
-    OPEN_TIMEOUT_MS,
-    PEER_WAIT_US,
-    RETRY,
-    accepts_connections,
-    foreign_program,
-    require_tls_with_security,
-)
+from fantwin.pipeline.bus.endpoint import accepts_connections, foreign_program, require_tls_with_security
 from fantwin.pipeline.bus.errors import BusError, reason
 from fantwin.pipeline.bus.rights import SiteRoles, access_control
+from fantwin.pipeline.bus.router_link import LEASE_MS, OPEN_TIMEOUT_MS, PEER_WAIT_US, RETRY
 from fantwin.pipeline.bus.settings import Settings
 from fantwin.pipeline.config.settings import BusConfig
 

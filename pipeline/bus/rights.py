@@ -5,7 +5,9 @@ Rules of a router, or of a peer, are about what others send to it (`ingress`): w
 it sends on (`egress`) may go to everybody whose certificate the site knows, since nobody can subscribe to, or ask for,
 what it may not read.
 
-Where a site has two routers, that of the session counts: what other routers pass on, each accepts.
+Zenoh drops what is not allowed without a word to whoever sent it, so a session asks the router when it starts, which
+answers from the rules that it enforces; peers all have the same rules. Where a site has two routers, that of the
+session counts: what other routers pass on, each accepts.
 
 A role may only ask for its own rights. So no answer means that the router does not know the role, and refuses all; but
 only while the router is there: an answer is awaited for longer than a dead link goes unnoticed.
@@ -22,8 +24,8 @@ from typing import Any
 
 import zenoh
 
-from fantwin.pipeline.bus.endpoint import LEASE_MS
 from fantwin.pipeline.bus.recovery import ALL_PRODUCERS, recovery_key
+from fantwin.pipeline.bus.router_link import LEASE_MS
 from fantwin.pipeline.config.roles import OPERATOR, Role, roles_of
 from fantwin.pipeline.config.settings import Config
 from fantwin.schemas.topics import (

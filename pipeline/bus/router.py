@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import zenoh
 
-from fantwin.pipeline.bus.endpoint import LEASE_MS, RETRY
 from fantwin.pipeline.bus.errors import BusError, reason
 from fantwin.pipeline.bus.opening import given_up_soon
 from fantwin.pipeline.bus.rights import SiteRoles, access_control, answer_rights
+from fantwin.pipeline.bus.router_link import LEASE_MS, RETRY
 from fantwin.pipeline.bus.settings import Settings
 
 if TYPE_CHECKING:

@@ -18,6 +18,7 @@ import zenoh
 from fantwin.pipeline.bus.endpoint import endpoint_problem, somebody_listens
 from fantwin.pipeline.bus.errors import BusError, NoAnswerError
 from fantwin.pipeline.bus.identity import Forgeries, new_session_id, sender_of
+from fantwin.pipeline.bus.kept_messages import KeptQuery, answer_for_kept, ask_for_kept
 from fantwin.pipeline.bus.meeting import Meeting
 from fantwin.pipeline.bus.opening import (
     MEETING_LIMIT_S,
@@ -27,7 +28,7 @@ from fantwin.pipeline.bus.opening import (
     open_session,
     zenoh_config,
 )
-from fantwin.pipeline.bus.publisher import KeptBytes, KeptQuery, Publisher, answer_for_kept, ask_for_kept
+from fantwin.pipeline.bus.publisher import KeptBytes, Publisher
 from fantwin.pipeline.bus.recovery import ALL_PRODUCERS, LAST_SEQUENCE, Answer, OnAnswer, RecoveryRequest, recovery_key
 from fantwin.pipeline.bus.rights import (
     SiteRoles,

@@ -44,6 +44,8 @@ _HEADER = re.compile(r"^([ \t]*)\[\[[ \t]*tray[ \t]*\]\][^\r\n]*(\r?)$", re.MULT
 def with_twin(text: str, tray: str, twin: str, path: Path) -> str:
     """The text of a configuration in which the tray of this name gets this twin. path: the file, for the error.
 
+    All else stays as its user wrote it.
+
     Raises:
         ConfigError: there is no place for it that is certain to be right, so its user has to add it.
     """

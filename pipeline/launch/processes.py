@@ -1,8 +1,5 @@
-"""Child processes, one for each stage or shard of a stage: what they report by systemd's protocol, and which of them
-hangs.
-
-A stage that publishes to a hung stage is soon blocked itself. So only the stage that has been silent longest is named.
-All others get a new period, because they go on once it is gone.
+"""Child processes, one for each stage or shard of a stage: what they report by systemd's protocol
+(pipeline.runtime.service_manager), and which of them hangs.
 """
 
 from __future__ import annotations
@@ -36,7 +33,11 @@ class _Heard:
 
 
 class HangDetector:
-    """Notes when each stage was last at work, and names the one that hangs. Times: monotonic clock, s."""
+    """Notes when each stage was last at work, and names the one that hangs. Times: monotonic clock, s.
+
+    A stage that publishes to a hung stage is soon blocked itself. So only the stage that has been silent longest is
+    named. All others get a new period, because they go on once it is gone.
+    """
 
     def __init__(self, limit_s: float) -> None:
         """limit_s: how long a stage may be silent."""

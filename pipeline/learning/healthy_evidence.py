@@ -16,9 +16,9 @@ import numpy as np
 
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.prediction.tray_twin import TrayTwin, load_tray_twin
+from fantwin.pipeline.recordings.checksum import sha256_of
 from fantwin.pipeline.recordings.clips.clip import require_no_clip
 from fantwin.pipeline.recordings.contents import contents_of
-from fantwin.pipeline.recordings.metadata import sha256_of
 from fantwin.pipeline.replay.offline.alarm_episodes import (
     LeftOut,
     MarkedAlarm,

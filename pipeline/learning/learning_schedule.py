@@ -30,7 +30,10 @@ input open"""
 
 
 class LearningProcess:
-    """The command for one tray of a configuration."""
+    """`fantwin twins learn` for one tray of a configuration, as a child process.
+
+    It runs while nothing else does, one at a time in this process.
+    """
 
     def __init__(self, config: Path, overrides: Sequence[str], tray: str, log: Path) -> None:
         """log: file for the standard error of the last run."""

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 from pydantic import ValidationError
 
 from fantwin.pipeline.errors import UsageError, UserError
-from fantwin.pipeline.recordings.metadata import sha256_of
+from fantwin.pipeline.recordings.checksum import sha256_of
 from fantwin.pipeline.recordings.runs import RecordedRun, RecordedTray, read_runs
 from fantwin.pipeline.replay.offline.healthy_runs import MapRecordings
 from fantwin.pipeline.sources.tables.measured_table import RAD_S_PER_TABLE_UNIT
@@ -132,7 +132,7 @@ def training_data_of(
     Raises:
         UserError: their speed unit is not known.
     """
-    from fantwin.twin.fitting.reading_errors import without_outliers  # noqa: PLC0415  the command line loads twin only when it is needed
+    from fantwin.twin.fitting.outliers import without_outliers  # noqa: PLC0415
     from fantwin.twin.runs import Run  # noqa: PLC0415
 
     path = found.runs[0].path

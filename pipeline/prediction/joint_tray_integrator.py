@@ -1,6 +1,6 @@
 """Predicts blocks of several trays with one twin in one pass. Processed alone, each would differ only by rounding.
 
-The states of several trays as those of one tray that has the fans of all, and back.
+The states of the trays are put together as those of one tray that has the fans of all, and taken apart again.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """A recording read by its index: only the chunks that have messages of the topics asked for.
 
-The messages of a topic that a recording has few of, without reading the rest.
+Messages of a topic of which a recording has few are found so without reading the rest.
 """
 
 from __future__ import annotations

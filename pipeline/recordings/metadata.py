@@ -1,25 +1,14 @@
-"""The metadata and attachments of a recorder's recording: site and trays, the configuration, and the twins.
-
-The checksum by which a card names the recordings that it was made from.
-"""
+"""The metadata and attachments of a recorder's recording: site and trays, the configuration, and the twins."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 import logging
-from pathlib import Path
 
 from fantwin.pipeline.recordings.reading import TACHO_KEY
 from fantwin.pipeline.runtime.stage import Context
 from fantwin.schemas.tacho import INSTANTANEOUS, tachos_to_json
-
-
-def sha256_of(path: Path) -> str:
-    """The hash of a file, in hexadecimal. Raises OSError if it cannot be read."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
 
 CONFIGURATION = "configuration.toml"
 _LOG = logging.getLogger(__name__)

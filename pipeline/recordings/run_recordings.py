@@ -1,6 +1,6 @@
 """The recordings of one run: that of one recorder, or those of its shards, which each record some of the trays.
 
-Which files are parts of one recording, where files of many recordings are given at once.
+Where files of many recordings are given at once, their metadata say which are parts of one recording.
 """
 
 from __future__ import annotations

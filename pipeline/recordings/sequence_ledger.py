@@ -1,8 +1,6 @@
 """The sequence ledger of a recording: how many messages of each stream were recorded, are missing, or came twice.
 
 See schemas/streams.py for what a stream is and how its gaps are counted.
-
-Counts the messages of a file: its sequence ledger, and the last health of each session and card of each twin.
 """
 
 from __future__ import annotations
@@ -253,7 +251,10 @@ def _stream(name: str) -> StreamId:
 
 
 class MessageCounts:
-    """Counts of one file. Messages are added in file order."""
+    """Counts of one file: its sequence ledger, and the last health of each session and card of each twin.
+
+    Messages are added in file order.
+    """
 
     def __init__(self) -> None:
         self.ledger = SequenceLedger()

@@ -1,6 +1,6 @@
 """The configuration to replay a recording with: the one given, or the one that the recording contains.
 
-The configuration for a recording without one, such as an imported table: defaults, at the rate of its twin.
+A recording without one, such as an imported table, is replayed with defaults, at the rate of its twin.
 """
 
 from __future__ import annotations

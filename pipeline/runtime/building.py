@@ -1,71 +1,19 @@
-"""Builds what a process of a stage consists of, a core for each of its trays or one for all, and joins the bus.
-
-The sources of a stage: started with it, and stopped once, together, in a thread of their own.
-"""
+"""Builds what a process of a stage consists of, a core for each of its trays or one for all, and joins the bus."""
 
 from __future__ import annotations
 
 import threading
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 from fantwin.pipeline.bus.session import Bus, join_bus
 from fantwin.pipeline.config.roles import role_names
 from fantwin.pipeline.config.settings import Config
 from fantwin.pipeline.config.shards import Shard
-from fantwin.pipeline.runtime.ending import Step
-from fantwin.pipeline.runtime.inbox import FromSource, Inbox
 from fantwin.pipeline.runtime.kept_snapshots import KeptSnapshots, keeps_snapshots
-from fantwin.pipeline.runtime.sessions import Session, refuse_second
-from fantwin.pipeline.runtime.stage import BuiltStage, Context, Core, Kept, Source, Stage
-
-
-class Sources:
-    """The sources that have been started. What they deliver goes to the inbox, or is counted as lost."""
-
-    def __init__(self, inbox: Inbox) -> None:
-        self.lost = 0
-        """samples that were delivered too late to be processed"""
-        self._inbox = inbox
-        self._started: list[Source] = []
-        self._cores: dict[str, Core] = {}
-        self._lock = threading.Lock()
-        self._stopping: Step | None = None
-
-    def start(self, name: str, parts: BuiltStage) -> None:
-        """Start the source of the core called `name`, if it has one."""
-        if parts.source is None:
-            return
-
-        def deliver(item: Any) -> None:
-            if not self._inbox.put(FromSource(name, item)):
-                self.discard(FromSource(name, item))
-
-        self._cores[name] = parts.core
-        self._started.append(parts.source)
-        parts.source.start(deliver)
-
-    def discard(self, item: FromSource) -> None:
-        """Count an item that is no longer processed."""
-        with self._lock:
-            self.lost += self._cores[item.core].samples_in(item.item)
-
-    def stop(self) -> Step:
-        """Stop all sources; each first delivers what it still has. Further calls return the same step."""
-        if self._stopping is None:
-            self._stopping = Step(self._stop_each)
-        return self._stopping
-
-    def _stop_each(self) -> None:
-        errors: list[Exception] = []
-        for source in self._started:
-            try:
-                source.stop()
-            except Exception as error:  # noqa: BLE001  the others are stopped as well
-                errors.append(error)
-        if errors:
-            raise errors[0]
+from fantwin.pipeline.runtime.second_owner import refuse_second
+from fantwin.pipeline.runtime.sessions import Session
+from fantwin.pipeline.runtime.stage import BuiltStage, Context, Kept, Stage
 
 
 def build_and_join(

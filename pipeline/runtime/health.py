@@ -1,10 +1,4 @@
-"""Health messages: built by the runner, published once a second and once more at the end.
-
-How old the outputs of a stage were when they were sent: lately, and since the start.
-
-Removes from a health message the outputs that its stage may not write. If they were believed, the messages of the
-true producer would be those of a stranger, and messages that were never sent would count as lost.
-"""
+"""Health messages: built by the runner, published once a second and once more at the end."""
 
 from __future__ import annotations
 
@@ -14,16 +8,13 @@ import time
 from bisect import bisect_left
 from collections import deque
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
 from itertools import accumulate
 
 import numpy as np
 
-from fantwin.pipeline.config.roles import Role
 from fantwin.schemas.enums import StageStatus
 from fantwin.schemas.health import AcceptedSamples, AwaitedInput, Counter, Health, Input, LatencyBucket, Note, Output
-from fantwin.schemas.streams import MOST_PUBLISHED, stage_losses
-from fantwin.schemas.topics import topic_of, tray_of
+from fantwin.schemas.streams import stage_losses
 from fantwin.schemas.units import NS_PER_S
 
 LATENCY_WINDOW_S = 10.0
@@ -34,7 +25,10 @@ _MAX_IN_WINDOW = 2000
 
 
 class Latencies:
-    """Latencies of the outputs of one stage: the time, s, from the newest sample of an output until it is sent."""
+    """Latencies of the outputs of one stage: the time, s, from the newest sample of an output until it is sent.
+
+    Percentiles are those of the last LATENCY_WINDOW_S; the histogram and the sum are of all since the start.
+    """
 
     def __init__(self) -> None:
         self._newest_s: deque[tuple[float, float]] = deque(maxlen=_MAX_IN_WINDOW)
@@ -72,34 +66,6 @@ class Latencies:
         return tuple(
             LatencyBucket(upper_s=upper_s, count=count) for upper_s, count in zip(UPPER_S, counts, strict=True)
         )
-
-
-class BelievedHealth:
-    """Decides by the roles of a site."""
-
-    def __init__(self, roles: Mapping[str, Role]) -> None:
-        self._roles = {name: role for name, role in roles.items() if role.stage}
-
-    def of(self, health: Health) -> Health:
-        """The health with only those outputs that its process may write; the same object if these are all."""
-        believed = tuple(
-            output
-            for output in health.outputs
-            if output.published <= MOST_PUBLISHED and self._may_write(health, output.key)
-        )
-        return health if len(believed) == len(health.outputs) else replace(health, outputs=believed)
-
-    def _may_write(self, health: Health, key: str) -> bool:
-        """Whether the process of a health message may publish on a key. A stage that this version does not know may: no
-        certificate exists for such a stage."""
-        role = self._roles.get(f"{health.stage}.{health.instance}") or self._roles.get(health.stage)
-        if role is None:
-            return True
-        try:
-            topic = topic_of(key).name
-        except KeyError:
-            return False
-        return topic in role.writes and (not role.trays or tray_of(key) in role.trays)
 
 
 AWAITED_AFTER_NS = 2 * NS_PER_S

@@ -1,15 +1,4 @@
-"""The bounded inbox of a stage: everything a stage reacts to arrives here, in order.
-
-Messages in sequence that a stage has yet to process: those of a tray that differ only in samples come together.
-
-What a message costs hardly depends on the number of its samples, and the output of a core does not depend on how its
-input is cut (schemas.blocks). A stage that is behind joins what waits, so each sample costs it less. A stage that keeps
-up finds one message at a time. A stage that processes several trays in one pass takes what waits of many of them at
-once.
-
-Requests of people wait behind samples: one of them is due for each time that samples are taken, and the others when
-nothing else waits. So a flood of requests does not hold up what judges the fans.
-"""
+"""The bounded inbox of a stage: everything a stage reacts to arrives here, in order; and the messages that are due."""
 
 from __future__ import annotations
 
@@ -21,7 +10,7 @@ from dataclasses import dataclass
 from itertools import accumulate, islice
 from typing import Any, TypeAlias
 
-from fantwin.pipeline.bus.publisher import KeptQuery
+from fantwin.pipeline.bus.kept_messages import KeptQuery
 from fantwin.pipeline.bus.recovery import Answer
 from fantwin.pipeline.runtime.sequence_tracker import Request
 from fantwin.schemas.blocks import can_join, samples_of
@@ -37,7 +26,18 @@ MOST_REQUESTS = 64
 
 
 class DueMessages:
-    """A queue of messages. Those of a tray keep their order; trays take turns."""
+    """A queue of messages in sequence that a stage has yet to process.
+
+    Those of a tray keep their order, and come together where they differ only in samples; trays take turns.
+
+    What a message costs hardly depends on the number of its samples, and the output of a core does not depend on how
+    its input is cut (schemas.blocks). A stage that is behind joins what waits, so each sample costs it less. A stage
+    that keeps up finds one message at a time. A stage that processes several trays in one pass takes what waits of many
+    of them at once.
+
+    Requests of people wait behind samples: one of them is due for each time that samples are taken, and the others when
+    nothing else waits. So a flood of requests does not hold up what judges the fans.
+    """
 
     def __init__(self, trays: Iterable[str], *, joins: bool) -> None:
         """trays: those with a core of their own; all other messages keep their order among them. joins: whether

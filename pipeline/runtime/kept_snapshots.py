@@ -10,10 +10,10 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
-from fantwin.pipeline.bus.publisher import KeptQuery
+from fantwin.pipeline.bus.kept_messages import KeptQuery
 from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.config.registry import STAGES
-from fantwin.pipeline.runtime.sessions import GOSSIP_S
+from fantwin.pipeline.runtime.second_owner import GOSSIP_S
 from fantwin.schemas.codec import CodecError, decode
 from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.messages import ScorerSnapshot

@@ -1,17 +1,5 @@
-"""The outputs of a stage: messages returned by its cores are stamped, encoded and published here.
-
-Reports of what a session of a stage consumed, in as few messages as possible. With them its outputs can be made
-again without having been recorded.
-
-Each output carries its input position. From one output to the next it usually moves on without a break, and then the
-first and the last say all. A `Consumed` is due
-
-* for the first output of a session,
-* for the two outputs on each side of a break: input is missing, or another producer follows,
-* for an output that a timer triggered, since no input says when that was,
-* for an output PERIOD_NS after the last one reported, by the time of the samples: a session that is killed reports no
-  more,
-* for the last output of a session that ends in order.
+"""The outputs of a stage: messages returned by its cores are stamped, encoded and published here, with reports of
+what a session consumed.
 """
 
 from __future__ import annotations
@@ -45,7 +33,19 @@ class _Reported:
 
 
 class ConsumedReports:
-    """The reports of one session of a stage, of all its trays."""
+    """Reports of what a session of a stage consumed, of all its trays, in as few messages as possible.
+
+    With them its outputs can be made again without having been recorded. Each output carries its input position. From
+    one output to the next it usually moves on without a break, and then the first and the last say all. A `Consumed` is
+    due
+
+    * for the first output of a session,
+    * for the two outputs on each side of a break: input is missing, or another producer follows,
+    * for an output that a timer triggered, since no input says when that was,
+    * for an output PERIOD_NS after the last one reported, by the time of the samples: a session that is killed reports
+      no more,
+    * for the last output of a session that ends in order.
+    """
 
     def __init__(self) -> None:
         self._outputs: dict[tuple[str, str], _Reported] = {}

@@ -13,7 +13,8 @@ from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.config.roles import roles_of
 from fantwin.pipeline.config.settings import Config
 from fantwin.pipeline.config.shards import Shard
-from fantwin.pipeline.runtime.health import BelievedHealth, HealthBuilder
+from fantwin.pipeline.runtime.believed_health import BelievedHealth
+from fantwin.pipeline.runtime.health import HealthBuilder
 from fantwin.pipeline.runtime.inbox import DueMessages, FromBus, Inbox, Liveness, Recovered
 from fantwin.pipeline.runtime.missed_messages import Recovery
 from fantwin.pipeline.runtime.peers import Peers

@@ -16,12 +16,12 @@ from dataclasses import replace
 from itertools import chain
 
 from fantwin.pipeline.bus.identity import new_session_id
-from fantwin.pipeline.bus.publisher import KeptQuery
+from fantwin.pipeline.bus.kept_messages import KeptQuery
 from fantwin.pipeline.config.registry import STAGES
 from fantwin.pipeline.config.settings import Config
 from fantwin.pipeline.config.shards import Shard, chosen_shard
 from fantwin.pipeline.errors import UserError
-from fantwin.pipeline.runtime.building import Sources, abort, build_and_join
+from fantwin.pipeline.runtime.building import abort, build_and_join
 from fantwin.pipeline.runtime.ending import Ending, Step
 from fantwin.pipeline.runtime.health import HealthBuilder
 from fantwin.pipeline.runtime.inbox import INBOX_SIZE, DueMessages, FromBus, FromSource, Inbox, Item, Liveness
@@ -31,6 +31,7 @@ from fantwin.pipeline.runtime.receiving import Receiver
 from fantwin.pipeline.runtime.service_manager import Notifier
 from fantwin.pipeline.runtime.sessions import Session, Sessions, trays_in_words
 from fantwin.pipeline.runtime.stage import BuiltStage, Core, Stage, StageError
+from fantwin.pipeline.runtime.started_sources import Sources
 from fantwin.pipeline.runtime.steps import Steps
 from fantwin.pipeline.timebase.host_clock import HOST_CLOCK
 from fantwin.pipeline.timebase.stage_clock import StageClock

@@ -1,9 +1,8 @@
 """Puts arriving messages in sequence: requests missing messages, drops duplicates, and counts what remains missing.
 
 Nothing here waits. While the missing messages of a stream are on their way, its later messages are held; all other
-streams go on. What is held and remembered is bounded: docs/reference/bounds.md.
-
-The streams that a stage remembers: a bounded number, however many producers publish, and however much.
+streams go on. What is held, and the number of streams that are remembered, are bounded, however many producers publish,
+and however much: docs/reference/bounds.md.
 """
 
 from __future__ import annotations

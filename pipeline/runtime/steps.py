@@ -1,6 +1,6 @@
 """The steps of a process: its cores process what is due, and what they make is published.
 
-Steps of the cores of several trays at once: blocks that can be processed in one pass are.
+Blocks of several trays are processed in one pass where that is possible.
 """
 
 from __future__ import annotations

@@ -1,10 +1,7 @@
 """The observed rate of alarms: for how long fans were judged, which alarms were raised then, and what operators said of
 them.
 
-Of a large site some scores of each tray are decoded, and not every one; so a score stands for the time since the one
-before.
-
-It is kept in the file of the history of alarms, and goes on after a restart.
+The rate is kept in the file of the history of alarms, and goes on after a restart.
 """
 
 from __future__ import annotations
@@ -50,7 +47,11 @@ class JudgedStretch:
 
 
 class JudgedTime:
-    """The stretch of each tray that is growing."""
+    """The stretch of each tray that is growing.
+
+    Of a large site some scores of each tray are decoded, and not every one; so a score stands for the time since the
+    one before.
+    """
 
     def __init__(self) -> None:
         self._growing: dict[str, JudgedStretch] = {}

@@ -1,4 +1,4 @@
-"""What a site has lost, over all sessions of its stages, computed from the last health of each session.
+"""What a site has lost and refused, over all sessions of its stages, computed from the last health of each session.
 
 A stage counts what it misses while it runs. The health messages of all sessions together show what it cannot know: what
 was published before it first heard a producer, while it was dead, or after it had stopped. There is one rule: of every
@@ -16,10 +16,9 @@ missed after its first message, up to as many as there are numbers that no earli
 stage that had to end may count too low: it is among what the stage never had, or comes on top, and the larger of the
 two counts.
 
-What stages have refused, over all their sessions: messages of others, and input of devices that is no usable sample.
-Also what devices themselves have refused or lost, if they send their counters.
-
-Refused input is shown apart from losses. A stage that has refused all that its device sent has failed.
+Refused input is shown apart from losses: messages of others, and input of devices that is no usable sample. It includes
+what devices themselves have refused or lost, if they send their counters. A stage that has refused all that its device
+sent has failed.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""Requests of operators on their way: from a page to the scorer of a tray, and its answers back.
-
-A request of an operator as a client sends it in JSON, checked.
-"""
+"""Requests of operators on their way: from a page to the scorer of a tray, and its answers back."""
 
 from __future__ import annotations
 
@@ -43,7 +40,7 @@ OneLine = Annotated[str, AfterValidator(one_line)]
 
 
 class RequestForm(BaseModel):
-    """What an operator asks of a fan, or of all fans of a tray.
+    """What an operator asks of a fan, or of all fans of a tray, as a client sends it in JSON, checked.
 
     Attributes:
         action: what is asked.

@@ -1,7 +1,4 @@
-"""Who logs in, who is refused, and what fails unexpectedly: a line each on standard error, as JSON after `event:`.
-
-Wrong passwords, counted: who guesses must wait.
-"""
+"""Who logs in, who is refused, and what fails unexpectedly: a line each on standard error, as JSON after `event:`."""
 
 from __future__ import annotations
 
@@ -25,7 +22,7 @@ _NETWORK_BITS = 64
 
 
 class LoginFailures:
-    """Used in the thread of one server only."""
+    """Counts wrong passwords: who guesses must wait. Used in the thread of one server only."""
 
     def __init__(self, now_s: Callable[[], float] = time.monotonic) -> None:
         self._now_s = now_s

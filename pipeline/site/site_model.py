@@ -31,11 +31,10 @@ from fantwin.schemas.messages import Alarm, Array, ModelCard, Score, ScorerSnaps
 from fantwin.scoring.alarms.current_alarms import CurrentAlarm
 from fantwin.scoring.alarms.unscored_monitor import JUDGED_AT_REST
 from fantwin.scoring.calibration.calibration import ObservedRate, declared_per_day
-from fantwin.scoring.wear.wear_monitor import wear_in, wear_rows
+from fantwin.scoring.wear.recorded_wear import wear_in, wear_rows
 
 SILENT_AFTER_S = 5.0
-"""a tray without a score for so long is silent; and so is a stage without a health message, which may have left the
-bus. A fan is judged now if it was this recently"""
+"""a tray without a score for so long is silent; a fan is judged now if it was this recently"""
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,7 @@ from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.config.roles import Role, roles_of_stages
 from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.config.shards import StageProcess
-from fantwin.pipeline.runtime.health import BelievedHealth
+from fantwin.pipeline.runtime.believed_health import BelievedHealth
 from fantwin.pipeline.runtime.sessions import LostSessions, Session, this_host
 from fantwin.pipeline.site.known_sessions import KnownSessions
 from fantwin.pipeline.site.loss_accounting import Launched, label, losses, refused, unusable_lines

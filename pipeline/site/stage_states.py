@@ -4,26 +4,17 @@ A stage's own report is not enough: a stage that hangs reports nothing, and one 
 wrong. So a stage's state also depends on when it was last heard, on what its producers say they have sent, and on the
 age of its outputs.
 
-What other stages have on this host by the same configuration: recordings, and Rerun's viewer.
-
-What stages say that they work with and have done: the rate of a grid, gaps, what was not judged and why.
+Stages also note what they work with and have done: the rate of a grid, gaps, what was not judged and why.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from pathlib import Path
-from urllib.parse import quote
 
-from fantwin.pipeline.config.loading import parse_config
-from fantwin.pipeline.config.registry import RECORDER, STAGES
-from fantwin.pipeline.config.settings import Config
-from fantwin.pipeline.config.shards import StageProcess, own_file, shards_of
-from fantwin.pipeline.errors import UserError
-from fantwin.pipeline.runtime.stage import Context
-from fantwin.pipeline.site.loopback import LOOPBACK
+from fantwin.pipeline.config.registry import STAGES
+from fantwin.pipeline.config.shards import StageProcess
 from fantwin.pipeline.site.loss_accounting import label, trays_of
 from fantwin.pipeline.timebase.stage_clock import REPLAY
 from fantwin.schemas.enums import StageStatus
@@ -31,42 +22,6 @@ from fantwin.schemas.health import Health
 from fantwin.schemas.streams import input_streams, output_streams
 from fantwin.schemas.topics import ALL_TRAYS, HEALTH_CHUNK, key_in_words
 from fantwin.schemas.units import NS_PER_S
-
-VIEWER = "viewer"
-
-
-def configured(context: Context, stage: str) -> Config | None:
-    """The configuration with the section of another stage; None: that stage is not enabled, or its section is wrong."""
-    if context.configuration_path is None:
-        return None
-    try:
-        found = parse_config(context.configuration_text, context.configuration_path, context.overrides, (stage,))
-    except UserError:
-        return None
-    return found if stage in found.stages else None
-
-
-def recordings_of(config: Config) -> Sequence[Path]:
-    """The first part of the recording of each recorder of the site, as far as they are on this host."""
-    file: Path = config.sections[RECORDER].file  # pyright: ignore[reportAttributeAccessIssue]
-    return [config.run_folder / own_file(shard.name, file) for shard in shards_of(RECORDER, config)]
-
-
-def viewer_urls(config: Config) -> Mapping[str, str]:
-    """By tray, the address of Rerun's viewer for browsers, which only this host reaches; empty: it is not served.
-
-    A live viewer of Rerun 0.41 takes neither a time nor a fan in its address.
-    """
-    section = config.sections[VIEWER]
-    grpc_port, web_port = (getattr(section, name) for name in ("grpc_port", "web_port"))
-    if not (grpc_port and web_port):
-        return {}
-    return {
-        tray: f"http://{LOOPBACK}:{web_port + shard.number - 1}/?url="
-        + quote(f"rerun+http://{LOOPBACK}:{grpc_port + shard.number - 1}/proxy", safe="")
-        for shard in shards_of(VIEWER, config)
-        for tray in shard.trays
-    }
 
 
 def note_lines(healths: Iterable[Health]) -> list[str]:

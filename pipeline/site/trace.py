@@ -1,4 +1,4 @@
-"""The data drawn for a tray: scores joined in time, in the tray's display unit. Shared by viewer and plots.
+"""Traces of a tray: its scores joined in time, in its display unit, and the words for the state of a fan.
 
 Where no samples came, lines and bands have a hole: nothing was judged there, and a line across it would say so.
 """

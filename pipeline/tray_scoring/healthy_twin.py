@@ -1,7 +1,4 @@
-"""Facts about the twin of a tray that its scorer uses.
-
-What the model of a healthy fan takes from the card of its twin.
-"""
+"""Facts about the twin of a tray that its scorer uses, and what the model of a healthy fan takes from its card."""
 
 from __future__ import annotations
 

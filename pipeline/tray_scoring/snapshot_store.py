@@ -2,8 +2,6 @@
 
 The file may be missing, or old, where the stage ran on another host since. So what other stages keep is looked at as
 well, and the newest snapshot counts.
-
-Times in a scorer's snapshot, moved together: as after the host clock was set back while the site was stopped.
 """
 
 from __future__ import annotations
@@ -28,7 +26,7 @@ NEVER_NS = 1 << 62  # times from here on, and those up to 0, are marks and no ti
 def with_times_moved(state: Any, by_ns: int, *, is_time: bool = False) -> Any:
     """A snapshot's state, as JSON values, with all absolute times moved by `by_ns`.
 
-    Durations, values and arrays stay.
+    It is for a host clock that was set back while the site was stopped. Durations, values and arrays stay.
     """
     if isinstance(state, dict):
         return {

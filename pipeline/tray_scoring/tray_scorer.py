@@ -5,8 +5,6 @@ are brought up to date (scoring.model.decision), fans that stand or turn against
 (scoring.standing), and so is slow wear (scoring.wear). Whatever is wrong becomes one alarm of the fan, with a state
 after OPC UA Part 9 (scoring.alarms) and causes (scoring.diagnosis). They are built and connected here.
 See docs/explanation/deciding.md.
-
-Which share of the samples of all fans was scored, and why the others were not.
 """
 
 from __future__ import annotations
@@ -42,7 +40,7 @@ SMALLEST_SHARE = 0.0005  # smaller ones are not named
 
 
 class JudgedShare:
-    """Counts the samples of one tray's fans since the start of a session."""
+    """Counts the samples of one tray's fans since the start of a session: the share scored, and why others were not."""
 
     def __init__(self) -> None:
         self._judged = 0

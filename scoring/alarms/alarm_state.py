@@ -6,9 +6,8 @@ timed and one-shot shelving (5.8.17), suppressed (5.8.8), out of service (5.8.12
 there are no branches of earlier ones (as in B.1.2). What operators say of an alarm, that it was true or false, is not
 of Part 9. See docs/reference/alarms.md.
 
-Flags of an alarm that say whether it needs attention: retained, silenced, presented, listed (OPC UA Part 9).
-
-This is the only definition. The scorer's `AlarmState` and the `Alarm` message carry the same flags; both are accepted.
+Whether an alarm needs attention is defined here alone: `is_retained`, `is_silenced`, `is_presented`, `is_listed`. The
+scorer's `AlarmState` and the `Alarm` message carry the same flags; both are accepted.
 """
 
 from __future__ import annotations

@@ -2,8 +2,6 @@
 
 The lines are part of a recording, and a replay that verifies it compares them. Only the line of a republished alarm,
 which says no more than its flags do, is not compared.
-
-Words for what a fan with an alarm does now: the alarm may go on although its newest samples have no deviation.
 """
 
 from __future__ import annotations
@@ -21,6 +19,8 @@ STOPPED, STARTING = "stopped by its command", "starting"
 
 def words_now(state: int, invalid_reason: int = InvalidReason.NONE) -> str:
     """Words after "now": that the fan is stopped, starting or like a healthy fan again; empty: none of these.
+
+    An alarm may go on although the newest samples of its fan have no deviation.
 
     state and invalid_reason: `FanState` and `InvalidReason` of the newest sample.
     """

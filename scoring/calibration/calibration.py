@@ -7,11 +7,7 @@ beyond chance do not raise it: they are faults.
 A rate can be shown only by enough running: at the declared rate, SHOWN_BY false alarms must be expected. If none
 occurs, the true rate is no higher than declared, with 95 % confidence (the rule of three). With less it is a target.
 
-Confidence interval of a rate of alarms that were counted (Garwood, Biometrika 28 (1936) 437).
-
-Observed rate of false alarms, beside the declared one.
-
-Operators say which alarms were false. An alarm that is not marked may be either, so it is counted apart.
+In service, the observed rate of false alarms stands beside the declared one (`ObservedRate`).
 """
 
 from __future__ import annotations
@@ -33,7 +29,10 @@ HOURS_PER_DAY = 24.0
 
 
 def daily_interval(count: float, fan_hours: float) -> tuple[float, float]:
-    """Compute the 95 % interval of the rate per fan and day from the count in `fan_hours`."""
+    """Compute the 95 % interval of the rate per fan and day from the count in `fan_hours`.
+
+    The interval is that of Garwood, Biometrika 28 (1936) 437.
+    """
     from scipy.special import gammaincinv  # noqa: PLC0415  scipy takes long to import, and stages do without
 
     outside = (1.0 - COVERAGE) / 2
@@ -45,6 +44,8 @@ def daily_interval(count: float, fan_hours: float) -> tuple[float, float]:
 @dataclass(frozen=True)
 class ObservedRate:
     """The alarms that were raised while fans were judged, and for how long they were.
+
+    Operators say which alarms were false. An alarm that is not marked may be either, so it is counted apart.
 
     Attributes:
         since_t_ns: the first judged sample; 0: there was none.

@@ -2,18 +2,6 @@
 
 `cannot_tell` comes first where no cause is as probable as CLEAR. Its probability is that of naming the wrong one; those
 of the others add up to one without it.
-
-The torque balance of a healthy fan at a steady speed: what a change of the speed means for drag, friction and gain.
-
-A fault is known as a share of the top speed. The fan that it slows down settles where the torque of the same command
-is what it needs, so the change of one parameter follows:
-
-    command = friction + viscous w + drag w^2
-
-Advice on what would tell the cause of an alarm, if what was seen since its onset does not.
-
-Causes differ in how they change with the speed (docs/explanation/diagnosis.md), so what is missing is motion: a change
-of the speed by a third, beyond the speeds that were seen. The command for it follows from the healthy torque balance.
 """
 
 from __future__ import annotations
@@ -43,7 +31,15 @@ LEAST_DRAG = 0.1
 
 @dataclass(frozen=True)
 class SteadyFan:
-    """Fan of the twin's card at steady speed. Torque is in the unit of the command."""
+    """Torque balance of a healthy fan at steady speed: what a change of speed means for drag, friction and gain.
+
+    A fault is known as a share of the top speed. The fan that it slows down settles where the torque of the same
+    command is what it needs, so the change of one parameter follows:
+
+        command = friction + viscous w + drag w^2
+
+    The balance is that of the twin's card. Torque is in the unit of the command.
+    """
 
     viscous: float
     drag: float
@@ -91,7 +87,12 @@ class SeenSinceOnset:
 
 @dataclass(frozen=True)
 class Advice:
-    """Writes advice in the unit of the command; empty where the twin does not name it."""
+    """Writes what would tell the cause of an alarm, if what was seen since its onset does not.
+
+    Causes differ in how they change with the speed (docs/explanation/diagnosis.md), so what is missing is motion: a
+    change of the speed by a third, beyond the speeds that were seen. The command for it follows from the healthy torque
+    balance. It is in the unit of the command; the advice is empty where the twin does not name it.
+    """
 
     command_unit: str = ""
     lowest_command: float = 0.0

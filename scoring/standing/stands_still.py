@@ -4,8 +4,6 @@ It needs no prediction: what commands do to healthy fans, and how long starts an
 (schemas.standstill). While a fan starts it may read as standing for three times the longest healthy start. Once it has
 turned, only lapses of its tacho explain a reading of a fan that stands. A tacho may give no reading for its reach plus
 `MISSING_S`.
-
-Falls of speed: what distinguishes a rotor that is held from one that has no power.
 """
 
 from __future__ import annotations
@@ -36,7 +34,10 @@ STEADY = 0.1
 
 
 class Falls(Saved):
-    """Follows the fans of one tray from bin to bin."""
+    """Falls of speed: what distinguishes a rotor that is held from one that has no power.
+
+    It follows the fans of one tray from bin to bin.
+    """
 
     KEPT = (
         *("_share", "_lasted_s", "_rest_s", "_is_first", "_passed_s", "_has_stood", "stands", "is_falling"),

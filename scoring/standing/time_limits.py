@@ -1,7 +1,4 @@
-"""Limits in s on starts, coasts and lapses of a healthy fan, from the twin's card.
-
-Durations for which conditions have held.
-"""
+"""Limits in s on starts, coasts and lapses of a healthy fan, from the twin's card; and how long conditions last."""
 
 from __future__ import annotations
 

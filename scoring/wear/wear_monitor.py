@@ -3,129 +3,22 @@
 The scorer's model of a healthy fan has slow states: by how much a fan turns faster or slower than its twin. A point of
 each fan is taken from them at regular intervals. Its change is the difference from the first day. The first point by
 another twin continues where the series by the twin before it ended. See docs/explanation/wear.md.
-
-The wear of the fans of a tray for people: what a scorer's snapshots carry of it.
-
-Slow change of one fan, and the notices about it before it reaches the limit.
 """
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from fantwin.schemas.messages import Array, ScorerSnapshot
+from fantwin.schemas.messages import Array
 from fantwin.schemas.units import NS_PER_S
+from fantwin.scoring.wear.recorded_wear import shown
+from fantwin.scoring.wear.slow_change import LIMIT_SHARE, SlowChange, limit_ahead, own_change, shared_change
 from fantwin.scoring.wear.trend import NS_PER_DAY, REACHED, LimitForecast, Point, Trend, WearSeries, forecast_limit
-
-_SHOWN = ("seen_t_ns", "change", "change_std_error", "beside", "per_day", "days", "reached_t_ns", "unknown_reason")
-
-
-def shown(found: SlowChange | None) -> dict[str, Any]:
-    """The change of a fan as JSON values, shares of the speed; null where something is not known."""
-    if found is None:
-        return dict.fromkeys(_SHOWN)
-    trend, forecast = found.trend, found.forecast
-    reached = {"earliest": forecast.earliest_ns, "likely": forecast.likely_ns, "latest": forecast.latest_ns}
-    values = (
-        found.t_ns,
-        found.change,
-        found.std_error,
-        found.beside,
-        trend and {"value": trend.slope_per_day, "low": trend.low, "high": trend.high},
-        trend and trend.days,
-        reached if forecast.likely_ns else None,
-        forecast.unknown_reason,
-    )
-    return dict(zip(_SHOWN, values, strict=True))
-
-
-def wear_in(snapshot: ScorerSnapshot) -> dict[str, Any] | None:
-    """The state of the wear monitor in a snapshot; None if there is none that can be read."""
-    try:
-        wear = json.loads(snapshot.state_json)["wear"]
-        wear_rows("", 0, wear)
-    except (ValueError, KeyError, TypeError, AttributeError):
-        return None
-    return wear
-
-
-def wear_rows(tray: str, t_ns: int, wear: dict[str, Any]) -> list[dict[str, Any]]:
-    """A row for each fan with a point, for machines. t_ns: of the snapshot; its seen_t_ns: at which the values hold."""
-    return [
-        {"tray": tray, "fan": number, "parameter": "speed", "unit": "relative", "limit": LIMIT_SHARE, "t_ns": t_ns}
-        | {name: fan[name] for name in _SHOWN}
-        for number, fan in enumerate(wear["fans"])
-        if fan["seen_t_ns"]
-    ]
-
-
-LIMIT_SHARE = 0.1
-"""share of the speed; an alarm is raised where a change has surely reached it"""
-WEAR_HINT = "see fantwin wear"
-"""each notice about one fan ends with it"""
-MOST_FANS = "most fans turn"
-"""a notice about what the fans of a tray share begins with it"""
-
-
-@dataclass(frozen=True)
-class SlowChange:
-    """Change of a fan's speed since commissioning, at its newest point.
-
-    change, std_error: shares of the speed. beside: the median change of the other fans since then; None without any.
-    trend: of the points. forecast: of a change by LIMIT_SHARE.
-    """
-
-    t_ns: int
-    change: float
-    std_error: float
-    beside: float | None
-    trend: Trend | None
-    forecast: LimitForecast
-
-
-def is_of_slow_change(note: str) -> bool:
-    """Return whether a note of a scorer is about fans that change slowly, one of them or most of a tray."""
-    return note.endswith(WEAR_HINT) or note.startswith(MOST_FANS)
-
-
-def own_change(fan: int, change: float, age_ns: int, beside: float | None) -> str:
-    """The notice about a fan that has changed against the fans beside it. Changes are shares of the speed."""
-    hours = age_ns / (3600.0 * NS_PER_S)
-    age = f"{hours:.0f} h" if hours < 48.0 else f"{hours / 24.0:.0f} days"
-    compared = f", the fans beside it {100 * beside:+.1f} %" if beside is not None else ""
-    return f"fan {fan}: speed {100 * change:+.1f} % in {age}{compared}: {WEAR_HINT}"
-
-
-def shared_change(share: float) -> str:
-    """The notice about a change that most fans of a tray share, as a share of the speed."""
-    direction = "slower" if share < 0.0 else "faster"
-    return (
-        f"{MOST_FANS} {100 * abs(share):.0f} % {direction} than when they were commissioned: the air, the supply, or a "
-        "filter in front of them all"
-    )
-
-
-def limit_ahead(fan: int, others: Sequence[int], change: float, days: Sequence[float]) -> str:
-    """The line about the fan that reaches its limit first, and the others that will.
-
-    change: so far. days: until the limit is likely reached, at the earliest and at the latest; zeros: it may have been.
-    """
-    likely, earliest, latest = days
-    limit = f"{100 * LIMIT_SHARE:.0f} %"
-    reached = f"it will have lost {limit} of its speed" if change < 0.0 else f"it will turn {limit} faster"
-    unit = "day" if round(likely) == 1 else "days"
-    when = f"in about {likely:.0f} {unit} ({earliest:.0f} to {latest:.0f})" if likely > 0.5 else "within a day"
-    if not latest:
-        reached, when = "it has lost" if change < 0.0 else "it turns faster by", f"about {limit} of its speed"
-    more = f", and fan {', '.join(map(str, others))}" if others else ""
-    return f"fan {fan} is wearing: {reached} {when}; inspect it{more}"
-
 
 SETTLING_INTERVALS = 6
 """intervals from the first sample by a twin to the first point: the slow states are hardly known before"""
@@ -305,7 +198,7 @@ class WearMonitor:
         return found
 
     def snapshot(self) -> dict[str, Any]:
-        """The whole state as JSON values, and with it the present changes for people (scoring.wear.wear_monitor)."""
+        """The whole state as JSON values, and with it the present changes for people (scoring.wear.recorded_wear)."""
         state = {name: getattr(self, name).tolist() for name in KEPT}
         fans = [{**shown(self.of(fan)), "series": series.snapshot()} for fan, series in enumerate(self._series)]
         return {"state": state, "fans": fans}

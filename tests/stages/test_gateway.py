@@ -22,7 +22,7 @@ from fantwin.pipeline.site.site_json import alarms_json, curves_json, fan_in_ful
 from fantwin.schemas.enums import Action, FanState, Severity, Transition
 from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Diagnosis, ScorerSnapshot
-from fantwin.scoring.wear.wear_monitor import shown
+from fantwin.scoring.wear.recorded_wear import shown
 from tests.support.running_chain import eventually
 from tests.support.running_core import FANS, SITE, TRAY
 from tests.support.running_gateway import Client, RunningGateway

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fantwin.pipeline.bus.endpoint import LEASE_MS
+from fantwin.pipeline.bus.router_link import LEASE_MS
 from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.config.settings import BusConfig
 from fantwin.pipeline.recordings.reading import read_recording

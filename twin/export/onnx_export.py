@@ -9,8 +9,6 @@
 
 fans and n are dynamic. A graph has all four inputs, whether its model needs them or not, so that all kinds of model
 look the same to a reader.
-
-A twin file with other entries in its card: the graph and its weights are unchanged.
 """
 
 import json
@@ -55,6 +53,8 @@ def export_onnx(model: Model, card: TwinCard) -> bytes:
 
 def with_card_entries(content: bytes, entries: Mapping[str, Any]) -> bytes:
     """The same ONNX file with other entries in its card, such as its calibration or its name.
+
+    The graph and its weights are unchanged.
 
     Raises:
         TwinError: it is no twin.

@@ -1,9 +1,4 @@
-"""An exported twin, run by onnxruntime like a model in memory, so that the file itself is evaluated.
-
-The model that a twin file holds: the inverse of the export, for hybrids.
-
-The graph holds the weights of the network for rad/s and command units, so the network that is read has no scaling.
-"""
+"""An exported twin, run by onnxruntime like a model in memory, so that the file itself is evaluated."""
 
 import os
 from pathlib import Path
@@ -24,7 +19,9 @@ UNSCALED = Scaling(0.0, 1.0, 0.0, 1.0, 1.0)
 
 
 def stored_hybrid(path: Path, card: TwinCard) -> Hybrid:
-    """The hybrid in a file. card: that of the file.
+    """The hybrid that a twin file holds: the inverse of the export. card: that of the file.
+
+    The graph holds the weights of the network for rad/s and command units, so the network that is read has no scaling.
 
     Raises:
         TwinError: the twin is of another kind.

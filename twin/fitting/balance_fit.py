@@ -1,10 +1,28 @@
-"""The coefficients of the torque balance (twin.fitting.balance_fit), and its healthy variation, from healthy runs.
+"""The torque balance of each fan: its definition, and its coefficients and healthy variation from healthy runs.
 
-There are two candidates for each fan. *physics*: J, alpha, C_D and lag_s of the identification, and the friction by
-least squares. A noisy tacho does not bias them, but the physics lack dry friction, and a speed loop can bias them.
-*least-squares*: all four coefficients by least squares on the filtered balance, none of the first three below zero; the
-lag is that of the physics. It includes friction and works under a loop, but noise in the speeds makes its inertia too
-small.
+The balance is the command given minus the command that a healthy fan needs for the measured motion.
+
+    needed = inertia w' + viscous w + drag w|w| + friction          friction: constant, against the rotation
+
+It is in units of the command; positive where the fan needs more than a healthy one. Under a speed loop a fault shows
+here and hardly in the speed. Both sides go through lambda / (s + lambda), so that nothing is differentiated. On a
+uniform grid of period h, with a = exp(-lambda h), v_k the command that acts from k to k + 1 (after its lag,
+twin.models.lag) and m_k the mean of w_k and w_k+1,
+
+    x_k = v_k - inertia (w_k+1 - w_k) / h - viscous m_k - drag m_k |m_k| - friction
+    f_k+1 = a f_k + (1 - a) x_k,    f_0 = 0,        balance_k = f_k / (1 - a^k)
+
+The readings of a tacho that averages take the place of the speed, and v_k is then what that tacho would show of the
+command (twin.measurement): v_k = (M v(t_k) + M v(t_k+1)) / 2.
+
+The filter weighs the difference quotient by (1 - a) / h, which is about lambda: white tacho noise of standard deviation
+s makes a balance of about inertia lambda s, whatever the rate.
+
+There are two candidates for the coefficients of each fan. *physics*: J, alpha, C_D and lag_s of the identification, and
+the friction by least squares. A noisy tacho does not bias them, but the physics lack dry friction, and a speed loop can
+bias them. *least-squares*: all four coefficients by least squares on the filtered balance, none of the first three
+below zero; the lag is that of the physics. It includes friction and works under a loop, but noise in the speeds makes
+its inertia too small.
 
 The candidates are compared by the *residual standard deviation*: that of the balance about the mean of each run.
 (Commissioning removes constant differences between runs.) Least squares is cross-validated: each group of samples uses
@@ -21,27 +39,9 @@ squares must lower the variance by more. (On simulated racks least squares reach
 the physics, and a balance at held speeds that was off by twice as much.)
 
 A fan that stands, starts or stops is left out, and so is the first second of each stretch; with a tacho that averages
-also as long as a reading shows any of that. Errors are those of the
-identification where coefficients come from there, otherwise of the jackknife over the groups, which allows for errors
-that are correlated within a group and for runs that differ.
-
-The torque balance: the command given minus the command that a healthy fan needs for the measured motion.
-
-    needed = inertia w' + viscous w + drag w|w| + friction          friction: constant, against the rotation
-
-In units of the command; positive where the fan needs more than a healthy one. Under a speed loop a fault shows here and
-hardly in the speed. Both sides go through lambda / (s + lambda), so that nothing is differentiated. On a uniform grid
-of period h, with a = exp(-lambda h), v_k the command that acts from k to k + 1 (after its lag, twin.models.lag) and m_k
-the mean of w_k and w_k+1,
-
-    x_k = v_k - inertia (w_k+1 - w_k) / h - viscous m_k - drag m_k |m_k| - friction
-    f_k+1 = a f_k + (1 - a) x_k,    f_0 = 0,        balance_k = f_k / (1 - a^k)
-
-The readings of a tacho that averages take the place of the speed, and v_k is then what that tacho would show of the
-command (twin.measurement): v_k = (M v(t_k) + M v(t_k+1)) / 2.
-
-The filter weighs the difference quotient by (1 - a) / h, which is about lambda: white tacho noise of standard deviation
-s makes a balance of about inertia lambda s, whatever the rate. twin.fitting.balance_fit finds the coefficients.
+also as long as a reading shows any of that. Errors are those of the identification where coefficients come from there,
+otherwise of the jackknife over the groups, which allows for errors that are correlated within a group and for runs that
+differ.
 """
 
 from collections.abc import Sequence
@@ -59,9 +59,9 @@ from fantwin.twin.evaluation.resampling import resampled
 from fantwin.twin.evaluation.residual_analysis import analyse_residual
 from fantwin.twin.fitting.identification import Identification
 from fantwin.twin.measurement import Measurement, measurement_of
-from fantwin.twin.models.integration import linear_recursion
 from fantwin.twin.models.lag import effective_command
 from fantwin.twin.models.physics import LAG
+from fantwin.twin.models.recursion import linear_recursion
 from fantwin.twin.runs import GAP_IN_MEDIAN_PERIODS, Array, Run
 
 FILTER_RATE_PER_S = 3.0

@@ -16,8 +16,8 @@ from dataclasses import replace
 import numpy as np
 
 from fantwin.twin.measurement import with_measured_command
-from fantwin.twin.models.integration import linear_recursion
 from fantwin.twin.models.lag import effective_command
+from fantwin.twin.models.recursion import linear_recursion
 from fantwin.twin.runs import Array, Run
 
 Basis = Callable[[Array, Array], Array]

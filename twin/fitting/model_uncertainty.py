@@ -9,11 +9,6 @@ Held for long, an error of the acceleration becomes that error times the fan's t
 The error of a fan is the sum of a part that all fans of the twin have in common, known from the runs of all, and a
 part of that fan alone, known from its own runs only. Errors are larger while a fan changes its speed, so samples in
 motion get less weight than held ones.
-
-How far the twin of placed fans may be wrong at each speed and command.
-
-Where the fans of its type were trained, the error is theirs: the largest of them, for a fan that was never seen. To it
-comes what is not known of the fan's own physics, as an error of the speed at which it settles.
 """
 
 from collections.abc import Iterator, Sequence
@@ -227,7 +222,12 @@ def placed_uncertainty(
     top_speed_rad_s: float,
     friction: Array,
 ) -> ModelUncertainty:
-    """The tables of placed fans. parameters: (fans, 4). covariance: (fans, 4, 4) of their unknowns. friction: (fans,)
+    """How far the twin of placed fans may be wrong at each speed and command.
+
+    Where the fans of its type were trained, the error is theirs: the largest of them, for a fan that was never seen. To
+    it comes what is not known of the fan's own physics, as an error of the speed at which it settles.
+
+    Returns their tables. parameters: (fans, 4). covariance: (fans, 4, 4) of their unknowns. friction: (fans,)
     what a drive takes of the command before it acts.
     """
     speeds_rad_s = SETTLES_TO * top_speed_rad_s * np.linspace(-1.0, 1.0, SETTLING_SPEEDS)

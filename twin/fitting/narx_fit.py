@@ -7,12 +7,7 @@ equations with ten bands, which LAPACK solves by substitution (dtbtrs).
 Residuals beyond three robust standard deviations count linearly (pseudo-Huber loss, by iteratively reweighted least
 squares); missing speeds do not count.
 
-Whether the free run of a NARX network is stable: it must forget where it started, and stay near the recorded speeds.
-
-A recursion that fits its data can have a second, false steady state where there were no data, and a start or a jump of
-the command that was not in the training data can take it there permanently. Probing detects this without measured
-speeds: the network runs under long held commands over the range of training, from below the lowest and from above the
-highest speed of training.
+`forgets_its_start` checks whether the free run is stable.
 """
 
 from collections.abc import Callable, Sequence
@@ -23,10 +18,10 @@ from scipy.linalg import cho_factor, cho_solve
 
 from fantwin.twin.fitting.damped_least_squares import Flags, minimise, pseudo_huber, pseudo_huber_weight
 from fantwin.twin.fitting.reading_errors import NORMAL_90_PERCENT
-from fantwin.twin.models.integration import dtbtrs
 from fantwin.twin.models.narx import INPUTS, ORDER, UNITS, Narx, regressor_rows
 from fantwin.twin.models.network import Scaling
 from fantwin.twin.models.physics import PARAMETER_NAMES
+from fantwin.twin.models.recursion import dtbtrs
 from fantwin.twin.runs import Array, Run, starting_speed_rad_s
 
 TOLERANCE = 1e-3
@@ -175,6 +170,11 @@ FORGOTTEN, MARGIN = 0.1, 0.5
 
 def forgets_its_start(model: Narx, time_constant_samples: float) -> bool:
     """Whether both runs of each level end at the same speed, at most half the training range of speeds outside it.
+
+    A stable free run forgets where it started, and stays near the recorded speeds. A recursion that fits its data can
+    have a second, false steady state where there were no data, and a start or a jump of the command that was not in the
+    training data can take it there permanently. Probing detects this without measured speeds: the network runs under
+    long held commands over the range of training, from below the lowest and from above the highest speed of training.
 
     time_constant_samples: of the fan at speed, in samples.
     """

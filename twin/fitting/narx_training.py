@@ -4,7 +4,7 @@ Fitting each next sample from measured ones (series-parallel, the published way)
 regressors, and a small one-step error does not imply a good free run. So the free run itself is fitted (parallel
 training: Narendra and Parthasarathy, IEEE Transactions on Neural Networks 1, 1990):
 
-1. The start is a layer that acts as the best first-order filter of the data (twin.fitting.narx_training).
+1. The start is a layer that acts as the best first-order filter of the data (`starting_weights`).
 2. A prior ties its 1151 weights to the start, those of old samples more strongly than those of recent ones. The prior
    is strong at first and relaxed by a factor of ten at a time, each fit starting from the previous one
    (twin.fitting.narx_fit).
@@ -16,13 +16,6 @@ training: Narendra and Parthasarathy, IEEE Transactions on Neural Networks 1, 19
 
 The cost of a fit is proportional to its samples: from long recordings, stretches of MAX_SAMPLES in total are drawn at
 random.
-
-Where the training of NARX starts: tanh units that together act as the best first-order low-pass filter of the data.
-
-Small random weights keep each unit on the nearly straight part of its tanh, so the layer starts close to a linear model
-whose free run is stable and near the data; training adds the curvature. The filter is fitted by output error on a grid
-of time constants: with the time constant given, gain and offset are linear in the data, so noise on the speeds biases
-nothing, and missing ones are left out.
 """
 
 from collections.abc import Sequence
@@ -60,6 +53,11 @@ def starting_weights(
     commands: Sequence[Array], speeds: Sequence[Array], rng: np.random.Generator
 ) -> tuple[Array, float]:
     """theta (1151,) of a layer that acts as a first-order filter, and the filter's time constant in samples.
+
+    Small random weights keep each unit on the nearly straight part of its tanh, so the layer starts close to a linear
+    model whose free run is stable and near the data; training adds the curvature. The filter is fitted by output error
+    on a grid of time constants: with the time constant given, gain and offset are linear in the data, so noise on the
+    speeds biases nothing, and missing ones are left out.
 
     commands, speeds: one (n,) each a stretch, scaled; a speed of NaN is missing.
     """

@@ -4,16 +4,7 @@ Time is the only axis that has to be processed in order, so fitting cuts runs in
 treats stretches and fans alike as one batch. Each stretch has its own initial speed. A tacho that averages shows at
 first the time before: a stretch that continues another begins earlier by that time, which is not compared again.
 
-Fewer readings of many fans, for what does not need all of them.
-
-A network of a few dozen weights is as well determined by the readings of a few fans as by those of many. So the runs of
-many fans are cut into windows, and of each window only the readings of every so-many-th fan are kept, of the next one
-in the next window. Whatever happens in a run is still seen at some fans, and every fan is seen in some windows. (Fans
-of a tray are often commanded alike: with whole runs of some fans, or the same moments of all, a start or a level might
-be missing.)
-
-What is known of a single fan cannot come from its few windows. Where a share of a time constant is enough between two
-samples, all of its readings are averaged over such shares instead (`coarser`).
+Not everything needs all readings of many fans: `windows_of` and `coarser` give fewer.
 """
 
 from collections.abc import Sequence
@@ -193,7 +184,11 @@ def thinning_factor(pieces: Sequence[Run], time_constant_s: float) -> int:
 def windows_of(pieces: Sequence[Run], time_constant_s: float) -> list[Run]:
     """Windows of pieces of runs, or the pieces themselves where the factor is 1. Arguments as of thinning_factor.
 
-    The readings that a window does not show are NaN.
+    A network of a few dozen weights is as well determined by the readings of a few fans as by those of many. So the
+    runs of many fans are cut into windows, and of each window only the readings of every n-th fan are kept, n the
+    factor; of the next fan in the next window. The readings that a window does not show are NaN. Whatever happens in a
+    run is still seen at some fans, and every fan is seen in some windows. (Fans of a tray are often commanded alike:
+    with whole runs of some fans, or the same moments of all, a start or a level might be missing.)
     """
     every = thinning_factor(pieces, time_constant_s)
     if every == 1:
@@ -214,6 +209,7 @@ def _window_samples(pieces: Sequence[Run], time_constant_s: float) -> int:
 def coarser(piece: Run, time_constant_s: float) -> Run:
     """The piece with a sample for each share of a time constant, or as it is where its samples are that far apart.
 
+    What is known of a single fan comes from this, since it cannot come from the few windows of that fan.
     A sample is the mean of the readings of its share, at the time of the middle one, and the mean of the commands from
     there to the next.
     """

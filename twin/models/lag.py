@@ -7,7 +7,7 @@ its whole impulse reaches the rotor. With lag_s = 0 the effective command is the
 
 import numpy as np
 
-from fantwin.twin.models.integration import linear_recursion
+from fantwin.twin.models.recursion import linear_recursion
 from fantwin.twin.runs import Array
 
 

@@ -1,7 +1,4 @@
-"""The assessment of a report in sentences: one headline, and a warning for each thing a reader should know.
-
-What to record next, so that more data narrow the error of a twin most.
-"""
+"""The assessment of a report in sentences: one headline, and a warning for each thing a reader should know."""
 
 from __future__ import annotations
 
@@ -32,6 +29,8 @@ class LeastKnown:
 
 def least_known(known: ModelUncertainty, curve: StaticCurve, drive: DriveCard | None) -> LeastKnown | None:
     """The held command, or else the step from one settled speed, at which the twin may be most wrong.
+
+    It is what to record next: there more data narrow the error of the twin most.
 
     known, curve, drive: of the fan; curve over the commands that are possible. None: nothing within these commands is
     much less known than what training has seen.

@@ -1,8 +1,7 @@
 """What is known of a twin on some recordings, as sums: recordings are summed one by one, wherever they are.
 
-All sums have the extent of the runs in common, which must be known before.
-
-The mean error of a twin over its range of speeds.
+All sums have the extent of the runs in common, which must be known before. `SpeedSums` gives the mean error of the twin
+over its range of speeds.
 """
 
 from collections.abc import Sequence

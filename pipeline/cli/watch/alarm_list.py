@@ -1,4 +1,4 @@
-"""The lists of `fantwin alarms`: current alarms, transitions with `--watch`, and with `--history` those that were and
+"""The lists of `fantwin alarms`: current alarms, their transitions with `--watch`, and with `--history` past alarms and
 the rate of false alarms.
 """
 
@@ -44,7 +44,7 @@ from fantwin.scoring.alarms.alarm_state import is_listed, is_presented
 from fantwin.scoring.alarms.current_alarms import CurrentAlarm, clock, current_alarm
 from fantwin.scoring.calibration.calibration import ObservedRate, declared_per_day, together
 from fantwin.scoring.diagnosis.causes import CANNOT_TELL, CAUSES, MIN_PROBABILITY, with_share
-from fantwin.scoring.wear.wear_monitor import is_of_slow_change
+from fantwin.scoring.wear.slow_change import is_of_slow_change
 
 _SCORES_S = 3.0  # a score of every tray arrives in this time
 _POLL_S = 0.02

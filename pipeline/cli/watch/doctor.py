@@ -36,7 +36,8 @@ from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.extras import how_to_install
 from fantwin.pipeline.launch.this_host import load_for_this_host
 from fantwin.pipeline.recordings.disk_room import usage_of
-from fantwin.pipeline.runtime.sessions import GOSSIP_S, Session
+from fantwin.pipeline.runtime.second_owner import GOSSIP_S
+from fantwin.pipeline.runtime.sessions import Session
 from fantwin.pipeline.runtime.stage import Context, load_stage
 from fantwin.pipeline.sources.hwmon.config import ROOT
 from fantwin.schemas.topics import sessions_key

@@ -29,7 +29,8 @@ from fantwin.schemas.codec import CodecError, decode
 from fantwin.schemas.messages import ScorerSnapshot
 from fantwin.schemas.topics import tray_key
 from fantwin.schemas.units import NS_PER_S
-from fantwin.scoring.wear.wear_monitor import LIMIT_SHARE, wear_in, wear_rows
+from fantwin.scoring.wear.recorded_wear import wear_in, wear_rows
+from fantwin.scoring.wear.slow_change import LIMIT_SHARE
 
 NS_PER_DAY = 86_400 * NS_PER_S
 _NEEDED = "a fan has its first point about an hour after commissioning, while it turns without an alarm"

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 WINDOW = 200
 MOST_REQUESTS = 256
 """that wait for the core; of more, the newest are dropped"""
-SILENT_AFTER_S = 10.0
+HANGS_AFTER_S = 10.0
 STOPPED_WITHIN_S = 3.0
 CONNECT_TIMEOUT_S = 3.0
 QOS = 1
@@ -134,7 +134,7 @@ class BrokerLink:
             return f"the broker {self._address} is away: what is new is published when it is back"
         with self._lock:
             since_s = next(iter(self._under_way.values()), None)
-        if since_s is not None and time.monotonic() - since_s > SILENT_AFTER_S:
+        if since_s is not None and time.monotonic() - since_s > HANGS_AFTER_S:
             return f"the broker {self._address} acknowledges nothing: it hangs, or is overloaded"
         return self._refused_subscription
 

@@ -1,15 +1,9 @@
 """What has to be sent to the broker: the newest state of each fan, answers once, and every transition in order, also
 over a restart.
-
-They are in the history of alarms on disk. What the broker has acknowledged without a gap is done; the rest is sent
-again after a restart, with the same number.
-
-It holds one text a topic, however long the broker is away or slow.
 """
 
 from __future__ import annotations
 
-import math
 import sqlite3
 from collections import deque
 from collections.abc import Sequence
@@ -19,79 +13,18 @@ from typing import Any, NamedTuple
 from pydantic_core import to_json
 
 from fantwin.pipeline.errors import UserError
-from fantwin.pipeline.recordings.dates import format_utc
 from fantwin.pipeline.site.alarm_history import AlarmHistory
-from fantwin.pipeline.site.fleet import Fan, FanNow
-from fantwin.pipeline.site.site_json import alarm_json
-from fantwin.pipeline.site.site_model import SiteModel, TrayNow
 from fantwin.schemas.messages import Alarm
-from fantwin.schemas.units import RAD_S_PER_UNIT
-from fantwin.scoring.alarms.alarm_state import is_listed
-from fantwin.scoring.alarms.current_alarms import CurrentAlarm
-
-AT_ONCE = ("state", "in_alarm", "judged")
-"""what of a state is published at once when it changes"""
-
-
-class FanStates:
-    """What was published last about each fan."""
-
-    def __init__(self, model: SiteModel) -> None:
-        self._model = model
-        self._published: dict[Fan, dict[str, Any]] = {}
-
-    def changed(self, *, is_full: bool, with_silent: bool) -> dict[Fan, dict[str, Any]]:
-        """The states that are to be published now.
-
-        is_full: also those of which only a number has changed. with_silent: also of trays that were never heard.
-        """
-        trays = {each.tray: each for each in self._model.trays_now()}
-        found: dict[Fan, dict[str, Any]] = {}
-        for now in self._model.every_fan():
-            tray = trays.get(now.fan.tray)
-            if tray is None and not with_silent and not now.is_in_alarm:
-                continue
-            state, before = self._state(now, tray), self._published.get(now.fan)
-            if before is None or any(state[name] != before[name] for name in (state if is_full else AT_ONCE)):
-                self._published[now.fan] = state
-                found[now.fan] = state | {"time": format_utc(tray.t_ns) if tray else None}
-        return found
-
-    def _state(self, now: FanNow, newest: TrayNow | None) -> dict[str, Any]:
-        tray = self._model.tray(now.fan.tray)
-        assert tray is not None
-        measured = predicted = math.nan
-        judged = False
-        if newest is not None and newest.is_heard:
-            measured, predicted = newest.values[now.fan.number, :2].tolist()
-            judged = bool(newest.is_judged[now.fan.number])
-        unit = RAD_S_PER_UNIT[tray.speed_unit]
-        return {
-            "state": now.state,
-            "in_alarm": now.is_in_alarm and not now.is_silenced,
-            "judged": judged,
-            "score": _number(now.score),
-            "speed": _number(measured / unit),
-            "predicted_speed": _number(predicted / unit),
-            "speed_unit": tray.speed_unit,
-            "since": format_utc(now.since_t_ns) if now.since_t_ns else None,
-        }
-
-
-def shown_alarm(current: CurrentAlarm) -> dict[str, Any] | None:
-    """A current alarm; None: it is over and nothing is left to do about it."""
-    return alarm_json(current) if is_listed(current.newest) else None
-
-
-def _number(value: float) -> float | None:
-    return float(f"{value:.4g}") if math.isfinite(value) else None
-
 
 READER = "mqtt"
 
 
 class TransitionQueue:
-    """lost: how many were dropped because too many waited."""
+    """Transitions to be sent, from the history of alarms on disk.
+
+    What the broker has acknowledged without a gap is done; the rest is sent again after a restart, with the same
+    number. lost: how many were dropped because too many waited.
+    """
 
     def __init__(self, history: AlarmHistory, most_waiting: int) -> None:
         """Raises:
@@ -173,7 +106,10 @@ class Outgoing(NamedTuple):
 
 
 class Outbox:
-    """Urgent topics are sent first, each kind in the order in which its topics changed."""
+    """Texts that wait for the broker: one a topic, however long the broker is away or slow.
+
+    Urgent topics are sent first, each kind in the order in which its topics changed.
+    """
 
     def __init__(self) -> None:
         self._texts: dict[str, str] = {}

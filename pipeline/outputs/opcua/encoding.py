@@ -1,4 +1,7 @@
-"""Identifiers of nodes, and values as the OPC UA library wants them."""
+"""Identifiers of nodes, and values as the OPC UA library wants them.
+
+Identifiers are numbers for what exists once, `TRAY/FAN/...` for what a site has.
+"""
 
 from __future__ import annotations
 

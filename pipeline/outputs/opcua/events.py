@@ -1,8 +1,5 @@
 """Events of conditions: the alarm of a fan as an AlarmCondition of Part 9, what a subscription gets of it, and to whom
 it goes.
-
-The library compares types of events for equality, knows no field below another one, and filters the events of a
-refresh too, which every client needs (Part 9, 5.5.7).
 """
 
 from __future__ import annotations
@@ -154,7 +151,11 @@ def path_of(clause: ua.SimpleAttributeOperand) -> str:
 
 def as_the_library_evaluates(clause: ua.ContentFilter, namespace: int) -> ua.ContentFilter:
     """The same filter: a field has its path as its name, a type is the list of those of its subtypes that this server
-    sends, and the events of a refresh pass. namespace: of the server's own types."""
+    sends, and the events of a refresh pass. namespace: of the server's own types.
+
+    The library compares types of events for equality, knows no field below another one, and filters the events of a
+    refresh too, which every client needs (Part 9, 5.5.7).
+    """
     if not clause.Elements:
         return clause
     types = _types(namespace)

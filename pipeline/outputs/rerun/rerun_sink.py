@@ -1,8 +1,4 @@
-"""The viewer's sink: a Rerun recording that goes to a file and to live viewers on this host.
-
-The file of a view. Rerun writes into a pipe and this module writes to the disk: Rerun's own file sink stops for ever
-when the disk refuses a write, and every later flush then waits without end.
-"""
+"""The viewer's sink: a Rerun recording that goes to a file and to live viewers on this host."""
 
 from __future__ import annotations
 
@@ -50,6 +46,9 @@ _PIECE_BYTES = 1 << 16
 
 class ViewFile:
     """Copies what is written to `pipe` into a file until the other end is closed.
+
+    Rerun writes into the pipe and this class writes to the disk: Rerun's own file sink stops for ever when the disk
+    refuses a write, and every later flush then waits without end.
 
     When the disk refuses, or falls too far behind, the file ends there and everything later is discarded: a gap would
     make it unreadable. Whoever writes into the pipe never waits for the disk.

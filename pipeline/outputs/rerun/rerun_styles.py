@@ -1,4 +1,7 @@
-"""The entities and timelines of a view, and the colours, widths and names of its series."""
+"""The entities and timelines of a view, and the colours, widths and names of its series.
+
+The colours are legible on Rerun's dark and on its light background.
+"""
 
 from __future__ import annotations
 

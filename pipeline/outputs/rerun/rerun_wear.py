@@ -1,6 +1,5 @@
-"""The wear of fans in a recording: the change of each with its band of ± 2 standard errors, on its timeline.
-
-The wear of fans as it is drawn: the points in a scorer's snapshot, on a timeline of days.
+"""The wear of fans in a view: the points in a scorer's snapshot, on a timeline of days, each change with its band of
+± 2 standard errors.
 """
 
 from __future__ import annotations

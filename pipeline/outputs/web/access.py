@@ -3,8 +3,6 @@
 A page is read without a login on loopback; whoever acts is a user, by a session or by the header of a proxy. What
 changes something must come from a page of this server: the browser says so (Sec-Fetch-Site, Origin), and the page sends
 the token of its session, which no other page can read.
-
-Who is logged in: sessions that only the server knows, found by a random cookie.
 """
 
 from __future__ import annotations
@@ -52,7 +50,10 @@ class Session:
 
 
 class LoginSessions:
-    """Used in the thread of the web server only."""
+    """Sessions of users who are logged in, known to the server alone and found by a random cookie.
+
+    Used in the thread of the web server only.
+    """
 
     def __init__(self, now_s: Callable[[], float] = time.monotonic) -> None:
         self._now_s = now_s

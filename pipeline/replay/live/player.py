@@ -1,4 +1,7 @@
-"""Plays a recording: sends each message when it is due, in the name of a producer of its own, and handles keys."""
+"""Plays a recording: sends each message when it is due, handles keys, and publishes the time 20 times a second.
+
+The replay is a producer of its own on the bus, with its own sequence numbers, health and liveliness token.
+"""
 
 from __future__ import annotations
 

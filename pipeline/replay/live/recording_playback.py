@@ -1,13 +1,12 @@
 """The messages to play: a stretch of the recordings of a run, their parts in order, each message once.
 
-The learned versions of a recording's twins, published again for stages that judge the replay.
+The learned versions of a recording's twins are published again for stages that judge the replay. The integrator of a
+recorded site said on topic `twin` which version it had changed to, and at which sample. A replay turns this into
+messages of topic `new_twin`, as the learner sends them, which also name that sample.
 
-The integrator of a recorded site said on topic `twin` which version it had changed to, and at which sample. A replay
-turns this into messages of topic `new_twin`, as the learner sends them, which also name that sample.
-
-A message must arrive before its sample, and from `raw` that comes by way of the resampler. So each version is published
-in advance: as soon as the one before it takes over. What the replay keeps for stages that start later is then the
-version in force and the next one.
+A message must arrive before its sample, and samples from `raw` come by way of the resampler. So each version is
+published in advance: as soon as the one before it takes over. What the replay keeps for stages that start later is then
+the version in force and the next one.
 """
 
 from __future__ import annotations

@@ -1,9 +1,8 @@
-"""Alarm episodes, each from raised to cleared, and the comparison of two lists of them.
+"""Alarm episodes, each from raised to cleared, the comparison of two lists of them, and what operators said of them.
 
-What operators said of the alarms in healthy recordings: which running may be learned from, and which not.
-
-An alarm that was false is healthy running. One that was true is not: it is left out, with the time before it in which
-the fault began. An alarm on which nobody has said anything counts as healthy, since whoever names a recording says so.
+What operators said of the alarms in healthy recordings decides which running may be learned from. An alarm that was
+false is healthy running. One that was true is not: it is left out, with the time before it in which the fault began. An
+alarm on which nobody has said anything counts as healthy, since whoever names a recording says so.
 """
 
 from __future__ import annotations

@@ -1,13 +1,9 @@
-"""The result of comparing a replay with what was recorded, within a tolerance; snapshots show it where scores are not
-recorded.
+"""The comparison of a replay with what was recorded, within a tolerance; by snapshots where scores are not recorded.
 
 Decisions are compared exactly. The last digits of numbers depend on the processor: matrix products and functions such
 as tanh are computed in another order, or with another rounding, by each kernel of BLAS, NumPy and ONNX Runtime. Scores
 are recorded with seven digits, so one unit in the last of them is a relative difference of up to 1.2e-7.
 docs/how-to/replay.md has the differences that were measured.
-
-A scorer takes snapshots at the end of a block of samples. A replay has other blocks, so it takes its own at the samples
-of the recorded ones.
 """
 
 from __future__ import annotations
@@ -210,7 +206,12 @@ class Comparison:
 
 
 class SnapshotVerifier:
-    """Compares what a replay of one tray makes, session by session, in order."""
+    """Compares the snapshots of a replay of one tray with the recorded ones, session by session, in order.
+
+    Where scores are not recorded, they show that every statistic and alarm was the same, and all that was learned of
+    the fans. A scorer takes snapshots at the end of a block of samples. A replay has other blocks, so it takes its own
+    at the samples of the recorded ones.
+    """
 
     def __init__(
         self, read: Callable[[], Iterable[Envelope]], limit_of: Callable[[str], Limit], found: Comparison
@@ -280,7 +281,7 @@ def first_difference(
 ) -> str:
     """The first place in which two snapshots differ by more than the tolerance; empty if none.
 
-    note: see `tolerance.differences`.
+    note: see `differences`.
     """
     if made.twin_sha256 != recorded.twin_sha256:
         return "twin_sha256"

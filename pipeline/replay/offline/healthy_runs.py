@@ -15,7 +15,7 @@ from typing import Protocol, TypeVar
 from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.prediction.tray_twin import load_tray_twin
-from fantwin.pipeline.recordings.metadata import sha256_of
+from fantwin.pipeline.recordings.checksum import sha256_of
 from fantwin.pipeline.replay.offline.alarm_episodes import LeftOut, concerning, without
 from fantwin.pipeline.replay.offline.kept_bins import KeptBins, RecordedTray, TrayRun
 from fantwin.pipeline.replay.offline.replay_input import ReplayInput, open_replay_input

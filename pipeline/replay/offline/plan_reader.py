@@ -2,12 +2,6 @@
 
 Where a recorder left outputs out, the stages' own reports of what they had consumed (`pipeline.runtime.publishing`)
 take their place.
-
-The plan of a replay of an alarm clip that begins in the middle of a scorer's session, with the scorer's snapshot.
-
-Such a clip lacks what the stages before the scorer had in memory. A replay runs them over the clip's raw samples, which
-begin early enough for them to settle; the scorer continues from the snapshot. The same alarms are raised, perhaps a few
-samples earlier or later: so a clip is not verified, but the recording from which it was cut.
 """
 
 from __future__ import annotations
@@ -42,8 +36,14 @@ NOT_VERIFIED = (
 def plan_from_snapshot(
     chain: StageChain, snapshot: ScorerSnapshot, twins: Sequence[ModelCard], requests: Sequence[tuple[int, Request]]
 ) -> TrayPlan:
-    """One session of each stage; the scorer continues from the snapshot. requests: each with the time after which it
-    was answered."""
+    """The plan of an alarm clip that begins in the middle of a scorer's session: one session of each stage.
+
+    Such a clip lacks what the stages before the scorer had in memory. A replay runs them over the clip's raw samples,
+    which begin early enough for them to settle; the scorer continues from the snapshot. The same alarms are raised,
+    perhaps a few samples earlier or later: so a clip is not verified, but the recording from which it was cut.
+
+    requests: each with the time after which it was answered.
+    """
     plan = undisturbed_plan(chain, twins)
     (scorer,) = plan.last
     scorer.snapshot = snapshot

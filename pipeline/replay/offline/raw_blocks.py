@@ -1,7 +1,4 @@
-"""A tray's recorded raw samples, in blocks, as each session of the first stage consumed them.
-
-The samples that one session of a stage makes, for the sessions of the next stage that consume them.
-"""
+"""A tray's recorded raw samples, in blocks, as each session of the first stage consumed them."""
 
 from __future__ import annotations
 
@@ -23,7 +20,10 @@ Samples = TypeVar("Samples", bound=Grid | Prediction | Score)
 
 
 class SampleStream(Generic[Samples]):
-    """Blocks that are made when they are asked for; those that a later span contains as well are kept until then."""
+    """The samples that one session of a stage makes, for the sessions of the next stage that consume them.
+
+    Blocks are made when they are asked for; those that a later span contains as well are kept until then.
+    """
 
     def __init__(self, blocks: Iterator[Samples]) -> None:
         self._blocks = blocks

@@ -1,6 +1,6 @@
 """Scoring a recording again: the stages of every tray run over its raw samples, in one process and without a bus.
 
-The recording that `fantwin replay --offline -o` writes: the raw samples used and everything computed from them, each
+`fantwin replay --offline -o` writes a recording of it: the raw samples used and everything computed from them, each
 sample once.
 """
 

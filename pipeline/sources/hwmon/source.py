@@ -5,8 +5,6 @@ driver is loaded again. A file that cannot be read is NaN; a chip that goes away
 
 How a pwm was found is kept in a file before it is written for the first time, until it has been given back: after a
 process that was killed, the next one finds it manual and would otherwise leave it so.
-
-Modes of the pwms of a chip before fantwin wrote them, in a file that outlives the process that writes them.
 """
 
 from __future__ import annotations
@@ -53,7 +51,10 @@ _FOUND = TypeAdapter(_Found)
 
 
 class FoundModes:
-    """The file, which is there as long as something has to be given back. Without a path nothing is kept."""
+    """Modes of the pwms of a chip before fantwin wrote them, in a file that outlives the process that writes them.
+
+    The file is there as long as something has to be given back. Without a path nothing is kept.
+    """
 
     def __init__(self, path: Path | None) -> None:
         self._path = path

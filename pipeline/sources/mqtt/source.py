@@ -3,12 +3,6 @@
 All runs in the thread of paho's client, which also connects again when the broker was away. While acquisition is
 behind, that thread waits, so that the broker keeps what comes (with QoS 1 or 2). What the broker had retained is no new
 sample: it is counted and left out, but for the commands of fans, which hold until the next one.
-
-Single numbers of fans that arrive one by one, put together to readings of a tray.
-
-A command is held until the next one. A reading is complete when each fan has a new speed; if a fan gives the next one
-before all others have theirs, the reading ends without these: they have none in it. So a fan that is silent does not
-keep the others.
 """
 
 from __future__ import annotations
@@ -41,7 +35,12 @@ if TYPE_CHECKING:
 
 
 class FanValues:
-    """The newest numbers of a tray's fans."""
+    """Single numbers of a tray's fans that arrive one by one, put together to readings of the tray.
+
+    A command is held until the next one. A reading is complete when each fan has a new speed; if a fan gives the next
+    one before all others have theirs, the reading ends without these: they have none in it. So a fan that is silent
+    does not keep the others.
+    """
 
     def __init__(self, fans: int) -> None:
         self._command = [math.nan] * fans

@@ -1,7 +1,4 @@
-"""The serial line as a source of samples: the wire protocol of docs/reference/wire-protocol.md on a serial port.
-
-Counters of a device, such as that of damaged frames: how far they advanced while the host read its line.
-"""
+"""The serial line as a source of samples: the wire protocol of docs/reference/wire-protocol.md on a serial port."""
 
 from __future__ import annotations
 
@@ -33,7 +30,9 @@ the earliest: some frames before the wrap may be lost"""
 
 
 class DeviceCounterSteps:
-    """Follows the counters of one device, which wrap, and start again at 0 when it restarts.
+    """Follows the counters of one device, such as that of damaged frames: how far they advanced as it was read.
+
+    They wrap, and start again at 0 when the device restarts.
 
     A device has restarted if its uptime is smaller than before, and is not one that may have wrapped; or if a counter
     went back: by less than half its range, since a step forward of more than that within a second or two is no count.

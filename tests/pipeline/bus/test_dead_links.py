@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from fantwin.pipeline.bus.endpoint import LEASE_MS
 from fantwin.pipeline.bus.opening import UNACKNOWLEDGED_MS, limit_connections, zenoh_config
 from fantwin.pipeline.bus.router import open_router
+from fantwin.pipeline.bus.router_link import LEASE_MS
 from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.config.settings import BusConfig
 from tests.support.running_chain import eventually

@@ -5,7 +5,7 @@ from __future__ import annotations
 from queue import SimpleQueue
 
 from fantwin.pipeline.bus import publisher as publisher_module
-from fantwin.pipeline.bus.publisher import KeptQuery, answer_for_kept, ask_for_kept
+from fantwin.pipeline.bus.kept_messages import KeptQuery, answer_for_kept, ask_for_kept
 from fantwin.pipeline.bus.recovery import Answer
 from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.config.settings import BusConfig

@@ -18,8 +18,8 @@ from fantwin.pipeline.runtime.stage import Core
 from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Message, ScorerSnapshot
 from fantwin.schemas.topics import tray_key
+from fantwin.scoring.wear.recorded_wear import shown
 from fantwin.scoring.wear.trend import NS_PER_DAY, WearSeries
-from fantwin.scoring.wear.wear_monitor import shown
 from tests.support.fantwin_command import error_of, fantwin
 from tests.support.running_chain import SITE, TRAY
 from tests.support.running_scorer import RunningScorer

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Mapping
 
 import pytest
 
-from fantwin.pipeline.bus.publisher import KeptQuery
+from fantwin.pipeline.bus.kept_messages import KeptQuery
 from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.config.settings import BusConfig
 from fantwin.pipeline.runtime.kept_snapshots import KeptForOthers, KeptSnapshots

@@ -107,8 +107,8 @@ def test_row_07_only_sessions_with_a_common_tray_have_successors():
 
 
 def test_row_07_a_shard_with_a_tray_that_another_one_has_is_refused_in_one_line(config, monkeypatch):
-    monkeypatch.setattr("fantwin.pipeline.runtime.sessions.LEAVING_LIMIT_S", 0.0)
-    monkeypatch.setattr("fantwin.pipeline.runtime.sessions.GOSSIP_S", 60.0)  # the first one is found before
+    monkeypatch.setattr("fantwin.pipeline.runtime.second_owner.LEAVING_LIMIT_S", 0.0)
+    monkeypatch.setattr("fantwin.pipeline.runtime.second_owner.GOSSIP_S", 60.0)  # the first one is found before
     stop = threading.Event()
     stop.set()
     with Bus(config.bus) as bus:
@@ -123,7 +123,7 @@ def test_row_07_a_shard_with_a_tray_that_another_one_has_is_refused_in_one_line(
 
 
 def test_row_07_a_second_process_of_a_stage_is_refused_in_one_line_that_names_the_first(config, monkeypatch):
-    monkeypatch.setattr("fantwin.pipeline.runtime.sessions.LEAVING_LIMIT_S", 0.0)
+    monkeypatch.setattr("fantwin.pipeline.runtime.second_owner.LEAVING_LIMIT_S", 0.0)
     aborted: list[bool] = []
 
     class Aborts(Passer):
@@ -131,7 +131,7 @@ def test_row_07_a_second_process_of_a_stage_is_refused_in_one_line_that_names_th
             aborted.append(True)
 
     bench = Bench(toy(), config)
-    monkeypatch.setattr("fantwin.pipeline.runtime.sessions.GOSSIP_S", 60.0)  # the first one is found before
+    monkeypatch.setattr("fantwin.pipeline.runtime.second_owner.GOSSIP_S", 60.0)  # the first one is found before
     first = os.getpid()
     monkeypatch.setattr("fantwin.pipeline.runtime.sessions.os.getpid", lambda: first + 1)
     with pytest.raises(
@@ -147,8 +147,8 @@ def test_row_07_a_second_process_of_a_stage_is_refused_in_one_line_that_names_th
 def test_row_07_a_stage_with_a_device_is_refused_where_a_replay_presents_the_site_and_others_are_not(
     config, monkeypatch
 ):
-    monkeypatch.setattr("fantwin.pipeline.runtime.sessions.LEAVING_LIMIT_S", 0.0)
-    monkeypatch.setattr("fantwin.pipeline.runtime.sessions.GOSSIP_S", 60.0)  # the first one is found before
+    monkeypatch.setattr("fantwin.pipeline.runtime.second_owner.LEAVING_LIMIT_S", 0.0)
+    monkeypatch.setattr("fantwin.pipeline.runtime.second_owner.GOSSIP_S", 60.0)  # the first one is found before
     with Bus(config.bus) as replay:
         replay.declare_alive(alive_key("s", "replay", "all"))
         with pytest.raises(StageError) as refused:
@@ -163,7 +163,7 @@ def test_row_07_a_stage_with_a_device_is_refused_where_a_replay_presents_the_sit
 
 @pytest.mark.parametrize("process_id", [2**22 + 1, os.getpid()], ids=["ended", "our number, as in a container"])
 def test_row_07_the_token_of_a_process_of_this_host_that_has_ended_refuses_nobody(config, monkeypatch, process_id):
-    monkeypatch.setattr("fantwin.pipeline.runtime.sessions.LEAVING_LIMIT_S", 0.0)
+    monkeypatch.setattr("fantwin.pipeline.runtime.second_owner.LEAVING_LIMIT_S", 0.0)
     ours = Session.of_this_process("resampler", Shard("all", (TRAY_A, TRAY_B)), 1, "resampler-all-1")
     with Bus(config.bus) as bus:
         bus.declare_alive(replace(ours, process_id=process_id).key("s"))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from fantwin.scoring.wear.wear_monitor import is_of_slow_change, limit_ahead, own_change, shared_change
+from fantwin.scoring.wear.slow_change import is_of_slow_change, limit_ahead, own_change, shared_change
 
 HOUR_NS = 3600 * 10**9
 

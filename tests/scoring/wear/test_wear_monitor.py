@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from fantwin.schemas.messages import Array
+from fantwin.scoring.wear.slow_change import LIMIT_SHARE, MOST_FANS, WEAR_HINT
 from fantwin.scoring.wear.trend import NS_PER_DAY
-from fantwin.scoring.wear.wear_monitor import LIMIT_SHARE, MOST_FANS, SETTLING_INTERVALS, WEAR_HINT, WearMonitor
+from fantwin.scoring.wear.wear_monitor import SETTLING_INTERVALS, WearMonitor
 from tests.support.wear_data import (
     DAYS_OF_WEAR,
     EVERY_S,

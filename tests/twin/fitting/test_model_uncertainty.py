@@ -9,8 +9,8 @@ from fantwin.twin.evaluation.accuracy import compared_readings, free_run_reading
 from fantwin.twin.finishing import TrainedTwin
 from fantwin.twin.fitting.identification import identify
 from fantwin.twin.fitting.model_uncertainty import model_uncertainty
-from fantwin.twin.models.integration import linear_recursion
 from fantwin.twin.models.physical import PhysicalModel
+from fantwin.twin.models.recursion import linear_recursion
 from fantwin.twin.runs import Array, Run
 from tests.support import fan_data
 from tests.support.driven_fan import DRIVE, run_of

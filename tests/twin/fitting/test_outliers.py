@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fantwin.twin.fitting.reading_errors import without_outliers
+from fantwin.twin.fitting.outliers import without_outliers
 from fantwin.twin.runs import Run
 from tests.support import fan_data
 

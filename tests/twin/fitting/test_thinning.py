@@ -9,7 +9,7 @@ from fantwin.twin.build import evaluate, train_twin
 from fantwin.twin.evaluation.resampling import thinned
 from fantwin.twin.fitting import trajectories
 from fantwin.twin.fitting.trajectories import coarser, thinning_factor, windows_of
-from fantwin.twin.models.integration import linear_recursion
+from fantwin.twin.models.recursion import linear_recursion
 from fantwin.twin.runs import Run
 from tests.support import fan_data
 

@@ -9,7 +9,7 @@ from fantwin.twin.evaluation.resampling import thinned
 from fantwin.twin.finishing import TrainedTwin
 from fantwin.twin.fitting import training
 from fantwin.twin.fitting.identification import identify
-from fantwin.twin.fitting.reading_errors import without_outliers
+from fantwin.twin.fitting.outliers import without_outliers
 from fantwin.twin.fitting.training import data_scaling
 from fantwin.twin.models.hybrid import Hybrid
 from fantwin.twin.models.network import TanhNetwork

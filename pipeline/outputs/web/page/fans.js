@@ -14,6 +14,7 @@ const GROUPS = [
 const LARGE_UP_TO = 64;
 const LARGE_GROUPS = 2;
 const SLICE = 1250;
+// levels of cells, as pipeline/site/site_json.py makes them
 export const HIGHEST_LEVEL = 250;
 export const NO_LEVEL = 255;
 const NORMAL = GROUPS.length - 1;

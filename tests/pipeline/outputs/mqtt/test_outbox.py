@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from fantwin.pipeline.config.settings import TrayConfig
-from fantwin.pipeline.outputs.mqtt.outbox import READER, FanStates, Outbox, Outgoing, TransitionQueue
+from fantwin.pipeline.outputs.mqtt.fan_states import FanStates
+from fantwin.pipeline.outputs.mqtt.outbox import READER, Outbox, Outgoing, TransitionQueue
 from fantwin.pipeline.outputs.mqtt.topics import do_overlap
 from fantwin.pipeline.site.alarm_history import AlarmHistory
 from fantwin.pipeline.site.site_model import SiteModel
