@@ -7,10 +7,8 @@ the end ends with the run; the times of one that never began are null.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any
 
 from fantwin.schemas.units import NS_PER_S
@@ -64,14 +62,3 @@ def _fault(tray: SimulatedTray, number: int, start_ns: int | None, complete: boo
 
 def _at(start_ns: int | None, t_s: float | None) -> int | None:
     return None if start_ns is None or t_s is None else start_ns + round(t_s * NS_PER_S)
-
-
-def write_truth(path: Path, content: Mapping[str, Any]) -> None:
-    """Replace the file in one step, so that a reader never sees half of it.
-
-    Raises:
-        OSError: the file cannot be written.
-    """
-    unfinished = path.with_name(path.name + ".part")
-    unfinished.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
-    unfinished.replace(path)

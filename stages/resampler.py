@@ -164,10 +164,10 @@ class ResamplerCore(Core):
         is_known = self._line_hz is not None and math.isfinite(self._line_hz)
         line = f" (the line sends {self._line_hz:.3g} samples a second)" if is_known else ""
         counts = self._grid.counters()
-        samples, in_gaps = counts.get("grid_samples", 0), counts.get("grid_samples_in_gaps", 0)
-        share = 100 * min(in_gaps / samples, 1) if samples else 0.0
+        samples = counts.get("grid_samples", 0) + counts.get("grid_samples_skipped", 0)
+        share = 100 * counts.get("grid_samples_in_gaps", 0) / samples if samples else 0.0
         gaps = f"gaps longer than {self._timing.gap_limit_ns / NS_PER_S:g} s: {counts.get('gaps', 0)}"
-        return [f"grid of {self._timing.rate_hz:g} Hz{line}; {gaps}, {share:.1f} % of the grid"]
+        return [f"grid of {self._timing.rate_hz:g} Hz{line}; {gaps}, {share:.1f} % of the time"]
 
     def problem(self) -> str:
         """Problem: no samples, those of another number of fans or other tachos, a line that does not fit the grid, or a

@@ -51,14 +51,14 @@ class TrainedTwin:
     identification: Identification
     validation: Evaluation
 
-    def save(self, path: str | Path) -> Path:
-        """Write the ONNX file; returns its path. Raises TwinError when it cannot be written."""
-        target = Path(path)
-        try:
-            target.write_bytes(export_onnx(self.model, self.card))
-        except OSError as error:
-            raise TwinError(f"{target}: cannot be written ({error.strerror}); choose another path") from error
-        return target
+    def onnx(self) -> bytes:
+        """The ONNX file."""
+        return export_onnx(self.model, self.card)
+
+    def save(self, path: Path) -> Path:
+        """Write the ONNX file; return its path. Raises OSError where it cannot be written."""
+        path.write_bytes(self.onnx())
+        return path
 
 
 def finish_twin(

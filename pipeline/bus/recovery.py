@@ -1,8 +1,7 @@
 """Requests for missed messages: asked without waiting, and bounded in messages, bytes and time.
 
 A producer answers at `<key>/recover/<producer>` with the messages that it still keeps, and then with how many it has
-published at all. That number ends the answer of a named producer, and exposes forged messages: one with a higher
-sequence number is not from this producer.
+published at all. That number ends the answer of a named producer.
 """
 
 from __future__ import annotations

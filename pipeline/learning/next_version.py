@@ -330,7 +330,8 @@ class _Work:
                 "start the site again"
             )
         with twin_errors():
-            fit_twin(training, validation, self._name).save(twin)
+            trained = fit_twin(training, validation, self._name)
+        write_whole(twin, trained.onnx(), "")
         return twin
 
     def _calibrated(self, twin: Path, test: TrainingData) -> _CalibratedFile:
@@ -340,7 +341,8 @@ class _Work:
             # The command line loads twin only when it is needed.
             from fantwin.twin.export.onnx_export import with_card_entries  # noqa: PLC0415
 
-            named.write_bytes(with_card_entries(twin.read_bytes(), {"name": self._name}))
+            content = with_card_entries(twin.read_bytes(), {"name": self._name})
+        write_whole(named, content, "")
         self._say(f"{self._name}: calibrating on {_hours(sum(each.seconds for each in of))} of healthy running")
         left_out = self._alarms_since(of[0].span[0])
         paths, part = [each.path for each in of], HealthyPart(named)
@@ -348,7 +350,7 @@ class _Work:
             found = calibrated_on(
                 paths, part, self._per_day, in_this_process, extrapolate=True, alarms_left_out=left_out
             )
-        done.write_bytes(with_calibration(named, found.calibration))
+        write_whole(done, with_calibration(named, found.calibration), "")
         drops = tuple(drops_found(done, test.rad_s_per_unit))
         return _CalibratedFile(done.read_bytes(), found.calibration, drops)
 

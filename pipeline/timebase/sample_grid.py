@@ -264,7 +264,9 @@ class SampleGrid:
                 return
             else:
                 skipped_t_ns, self._next_t_ns = self._next_t_ns, first_grid_time(next_raw_t_ns, self._period_ns)
-                self._count_gap((self._next_t_ns - skipped_t_ns) // self._period_ns)
+                skipped = (self._next_t_ns - skipped_t_ns) // self._period_ns
+                self._count_gap(skipped)
+                self._counts["grid_samples_skipped"] += skipped
 
     def _release_samples(self) -> None:
         """Keep only the last of the samples at or before the next grid time."""

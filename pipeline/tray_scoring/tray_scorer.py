@@ -69,6 +69,8 @@ class JudgedShare:
         return [f"{100 * self._judged / samples:.1f} % of the fans' samples judged{because}"]
 
 
+KEPT = ("seen", "command", "kind", "stands")
+"""arrays of a fan that a snapshot holds beside those of what the scorer consists of"""
 WEAR_EVERY_S = 600.0
 """between two points of the wear of a fan, which takes days to months"""
 NO_READING = KINDS.index(Standing.NO_READING)
@@ -292,10 +294,7 @@ class TrayScorer:
             **within("bins", of_bins),
             **within("falls", self._falls.arrays()),
             **within("now", vars(self._now)),
-            "seen": self._seen,
-            "command": self._command,
-            "kind": self._kind,
-            "stands": self._stands,
+            **{name: getattr(self, f"_{name}") for name in KEPT},
         }
         if self._against:
             arrays |= within("against", self._against.kept())
@@ -326,6 +325,10 @@ class TrayScorer:
         self._falls.restore(part("falls", stored))
         if self._against:
             self._against.restore(part("against", stored))
-        self._now = ScoreColumns(**part("now", stored))
-        self._seen, self._command, self._kind = stored["seen"], stored["command"], stored["kind"]
-        self._stands = stored["stands"]
+        now = ScoreColumns(**part("now", stored))
+        fans = {stored[name].shape[-1:] for name in KEPT} | {column.shape for column in vars(now).values()}
+        if fans != {(self.fans,)}:
+            raise ValueError("what was seen of another number of fans")
+        self._now = now
+        for name in KEPT:
+            setattr(self, f"_{name}", stored[name])

@@ -131,7 +131,9 @@ class Bins:
         Raises:
             KeyError, ValueError: it is of another number of fans.
         """
-        if stored["before"].shape != self._before.shape:
+        kept = [stored[name] for name in COLUMNS] if open_t_ns else []
+        shapes = {stored["before"].shape[1:], stored["newest"].shape, *(each.shape[1:] for each in kept)}
+        if shapes != {self._top.shape}:
             raise ValueError("samples of another number of fans")
         self._before[...], self._newest_rad_s[...] = stored["before"], stored["newest"]
         self._number = open_t_ns // self._bin_ns

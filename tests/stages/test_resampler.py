@@ -119,6 +119,8 @@ def test_after_a_long_silence_the_grid_ends() -> None:
     )
     assert seconds_of(grid.t_ns)[-2:].tolist() == [3600.0, 3600.01]
     assert core.counters()["grid_samples_in_gaps"] == 359_999
+    _, core = run([raw(at(*np.arange(0.0, 10.0, 0.01), 20.0), np.zeros(1001))])
+    assert "1, 50.0 % of the time" in core.notes()[0], "also of the part of the gap in which nothing is published"
 
 
 def _ticks(core: ResamplerCore, from_s: float, to_s: float, period_s: float = 0.05) -> list[Grid]:

@@ -23,6 +23,7 @@ from fantwin.schemas.messages import Alarm, Score, ScorerSnapshot
 from fantwin.schemas.units import NS_PER_S
 from fantwin.scoring.alarms.alarm_state import is_listed, is_retained, is_silenced
 from fantwin.scoring.alarms.current_alarms import CurrentAlarm
+from fantwin.scoring.model.saved import as_json, from_json
 from fantwin.scoring.wear.wear_monitor import WearMonitor
 from fantwin.stages.scorer import ScorerCore
 from tests.support.scored_blocks import (
@@ -244,6 +245,20 @@ def test_only_a_replay_of_earlier_samples_makes_a_snapshot_be_discarded(
         assert not scores or scores[0].t_ns[0] > prediction_of(np.zeros(1), first=99).t_ns[0]
     successor.step(prediction_of(np.zeros((20, 3)), first=-2 * HOUR, producer="integrator-3"))
     assert successor.counters().get("snapshots_of_other_times", 0) == is_discarded, "only the first one can tell"
+
+
+def test_a_snapshot_in_which_one_array_is_of_another_number_of_fans_is_refused() -> None:
+    before = core_of(3)
+    feed(before, [prediction_of(np.zeros((105, 3)))])  # a bin is open
+    state = json.loads(snapshot_of(before).state_json)
+    arrays = from_json(state["model"]["arrays"])
+    of_fans = [name for name, array in arrays.items() if 3 in array.shape and not name.startswith("evidence.")]
+    assert {"seen", "now.score", "bins.measured", "bins.newest", "model.mean"} <= set(of_fans)
+    for name in of_fans:
+        cut = np.take(arrays[name], [0, 1], axis=arrays[name].shape.index(3))
+        state["model"]["arrays"] = as_json(arrays | {name: cut})
+        with pytest.raises(ValueError):
+            core_of(3).tray.restore_model(state)
 
 
 @pytest.mark.parametrize("twin", ["twin", "another"])

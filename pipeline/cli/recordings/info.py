@@ -266,8 +266,8 @@ def _duration_s(part: Contents) -> float:
 
 
 def _rate_hz(counts: StreamCounts) -> float | None:
-    if counts.first_ns is None or counts.last_ns is None or counts.last_ns <= counts.first_ns:
-        return None
+    if counts.first_ns is None or counts.last_ns is None or counts.last_ns - counts.first_ns < NS_PER_S:
+        return None  # a few messages within a moment have no rate
     return (counts.messages - 1) / ((counts.last_ns - counts.first_ns) / NS_PER_S)
 
 

@@ -17,7 +17,7 @@ from fantwin.pipeline.cli.progress import working
 from fantwin.pipeline.cli.recordings.replay_offline import Again, score_again
 from fantwin.pipeline.errors import UsageError, UserError
 from fantwin.pipeline.extras import require
-from fantwin.pipeline.files import make_folder
+from fantwin.pipeline.files import make_folder, write_whole
 from fantwin.pipeline.recordings.left_out import RAW, left_out
 from fantwin.pipeline.recordings.run_recordings import recorded_files
 
@@ -106,7 +106,7 @@ def _draw(files: Sequence[Path], output: Path, *, json_output: bool) -> None:
 
     with working(f"drawing {output}"):
         drawn = draw_picture(files[0])
-    output.write_bytes(drawn.png)
+    write_whole(output, drawn.png)
     shown = f"{output}: {', '.join(sorted(drawn.reports))}"
     show({"picture": str(output), "views": drawn.reports}, shown, json_output=json_output)
     for name, reports in drawn.reports.items():

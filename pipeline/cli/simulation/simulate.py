@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import threading
 import time as clock
 from collections.abc import Callable
@@ -17,6 +18,7 @@ from fantwin.pipeline.cli.printing import show
 from fantwin.pipeline.cli.progress import Reporter
 from fantwin.pipeline.cli.simulation.scenario import Scenario, read_scenario
 from fantwin.pipeline.errors import UsageError, UserError
+from fantwin.pipeline.files import write_whole
 from fantwin.pipeline.recordings.simulated import record
 from fantwin.pipeline.runtime.signals import stop_on_signals
 from fantwin.pipeline.sources.hwmon.chips import chip_of
@@ -264,14 +266,9 @@ def save(path: Path | None, summary: Summary) -> None:
     Raises:
         UserError: it cannot be written.
     """
-    from fantwin.simulation.truth import write_truth  # noqa: PLC0415
-
-    if path is None:
-        return
-    try:
-        write_truth(path, summary)
-    except OSError as error:
-        raise UserError(f"{path}: cannot be written: {error.strerror}; name another file with --truth") from error
+    if path is not None:
+        content = json.dumps(summary, indent=2) + "\n"
+        write_whole(path, content.encode(), "; name another file with --truth")
 
 
 def count_text(played: PlaybackCounts) -> str:

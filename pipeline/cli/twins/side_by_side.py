@@ -74,7 +74,7 @@ def train_side_by_side(
                 progress=start(kind.title),
             )
             if contender.twin:
-                contender.twin.save(_file(folder, kind))
+                write_whole(_file(folder, kind), contender.twin.onnx())
             contenders.append(contender)
     winner = best(contenders)
     source = source_of(validation_runs, test_runs)

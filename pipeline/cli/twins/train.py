@@ -33,6 +33,7 @@ from fantwin.pipeline.cli.twins.figures import figures_in, sentence, shown
 from fantwin.pipeline.cli.twins.side_by_side import Data, train_side_by_side
 from fantwin.pipeline.errors import UsageError
 from fantwin.pipeline.extras import require_torch
+from fantwin.pipeline.files import write_whole
 from fantwin.pipeline.learning.fitting import DEFAULT_SETTINGS, NETWORKS, Trainer, TrainingSettings, fit_twin
 from fantwin.pipeline.learning.training_data import (
     Part,
@@ -152,7 +153,7 @@ def train(
                 trained = _place(type_twin, training_data, held_out, named, start(""))
             else:
                 trained = fit_twin(training_data, held_out, named, settings, start(""), each_network)
-        trained.save(output)
+        write_whole(output, trained.onnx())
     result = as_json(trained, training_data, output)
     if type_twin:
         result |= {"of_type": trained.card.training.of_type}

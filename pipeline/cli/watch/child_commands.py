@@ -1,4 +1,8 @@
-"""Other `fantwin` commands as child processes, each in a session of its own; the one that runs gets a Ctrl-C."""
+"""Other `fantwin` commands as child processes, each in a session of its own; the one that runs gets a Ctrl-C.
+
+What a command does for its user is then a list of commands, which the user sees and can repeat, and the memory of each
+ends with it.
+"""
 
 from __future__ import annotations
 

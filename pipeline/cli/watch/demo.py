@@ -31,6 +31,7 @@ from fantwin.pipeline.config.roles import roles_of
 from fantwin.pipeline.config.settings import Config, TrayConfig
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.extras import missing_extra
+from fantwin.pipeline.files import write_whole
 from fantwin.pipeline.launch.this_host import load_for_this_host, page_addresses
 from fantwin.pipeline.runtime.signals import stop_on_signals
 from fantwin.pipeline.selftest.scratch_site import free_port, lines_of, started
@@ -98,7 +99,7 @@ def demo(
     lost = _run(config, overrides, out, console)
     summary = summarise(out / "truth.json", sorted(out.glob("recording*.mcap")), lost)
     _draw(out, console)
-    (out / "summary.json").write_text(summary.to_json() + "\n", encoding="utf-8")
+    write_whole(out / "summary.json", f"{summary.to_json()}\n".encode(), "; name another folder")
     if json_output:
         typer.echo(summary.to_json())
     _print_report(summary, out, time.monotonic() - started_s, console)
