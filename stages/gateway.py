@@ -49,7 +49,7 @@ class GatewayCore(SiteCore):
 
     def add_score(self, envelope: Envelope) -> None:
         """Keep it, and send it to the pages that show one of its fans."""
-        score = self._model.add_score(envelope)
+        score = self._model.add_score(envelope, every_s=self._every_s)
         tray = self._model.tray(envelope.header.tray)
         if score is None or tray is None:
             return

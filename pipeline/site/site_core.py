@@ -25,7 +25,7 @@ class SiteCore(Core):
     def __init__(self, model: SiteModel) -> None:
         self._model = model
         self._counts: Counter[str] = Counter()
-        self._is_small = sum(tray.fans for tray in model.trays) <= ALL_SAMPLES
+        self._every_s = 0.0 if sum(tray.fans for tray in model.trays) <= ALL_SAMPLES else SAMPLED_S
 
     def step(self, item: Message | Envelope) -> Sequence[Message]:
         """Keep what has arrived, if it is about a fan of the site or about a stage."""
@@ -51,7 +51,7 @@ class SiteCore(Core):
 
     def needs_score(self, tray: str) -> bool:
         """Whether the score of a tray that has arrived is to be decoded."""
-        return self._is_small or self._model.wants_score(tray, SAMPLED_S)
+        return self._model.wants_score(tray, self._every_s)
 
     @abstractmethod
     def add_score(self, envelope: Envelope) -> None:

@@ -114,14 +114,16 @@ class SiteModel:
         self.wrong_fans: dict[str, int] = {}
         """by tray, how many fans its last score had, if they are not those of the configuration"""
 
-    def add_score(self, envelope: Envelope, columns: Sequence[str] = COLUMNS) -> Score | None:
-        """A score of a known tray has arrived; returns it with these columns, or None if it cannot be shown."""
+    def add_score(self, envelope: Envelope, columns: Sequence[str] = COLUMNS, every_s: float = 0.0) -> Score | None:
+        """A score of a known tray has arrived; returns it with these columns, or None if it cannot be shown. It is not
+        kept where another was, less than every_s ago."""
         try:
             score = decode(Score, envelope.payload, columns)
         except CodecError:
             self.refused_scores += 1
             return None
-        return self.add_decoded_score(envelope.header.tray, score)
+        is_kept = self.wants_score(tray := envelope.header.tray, every_s) or score.fans != self._by_name[tray].fans
+        return self.add_decoded_score(tray, score) if is_kept else score
 
     def wants_score(self, tray: str, every_s: float) -> bool:
         """Whether a known tray's last score was so long ago."""

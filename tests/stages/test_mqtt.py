@@ -145,7 +145,7 @@ def test_of_too_many_transitions_that_wait_the_oldest_are_lost_counted_and_said(
 
 
 def test_a_broker_that_hangs_holds_nobody_up_and_is_named(tmp_path, broker, monkeypatch):
-    monkeypatch.setattr("fantwin.pipeline.outputs.mqtt.link.SILENT_AFTER_S", 0.2)
+    monkeypatch.setattr("fantwin.pipeline.outputs.mqtt.link.HANGS_AFTER_S", 0.2)
     stage = RunningMqtt(tmp_path, broker.port)
     stage.feed(score())
     eventually(lambda: f"{FAN}/state" in retained_by(broker.port), "it is published")
