@@ -15,7 +15,9 @@ With w the speed, w' its rate, both as the twin predicts them, a healthy fan in 
     v           share                what theta does not resolve: constant at one speed and command
     u           share                the wandering of the speed: an Ornstein-Uhlenbeck process over seconds
     f           share                what a fault takes: 0, and a random walk while there is an alarm
-    e           rad/s                part of a pulse that a count misses; the next count has it, if it adjoins
+    e           rad/s                part of a pulse that a count misses; the next count has it, if it adjoins. Where
+                                     samples leave out windows, the error of a count, y = mean of x - late w' - e: while
+                                     the count stays the same its windows may begin at the same phase, and so does e
     x, mean     rad/s                deviation of the rotor at the end of the bin, and its mean over the bin
     q           rad/s                s as the torque balance shows it, which passes the filter of the balance
 
@@ -110,9 +112,13 @@ class HealthyFans(Saved):
         self.noise[:, AGE] = priors.ageing_per_sqrt_h**2 * bin_s / 3600.0
         self.noise[:, WANDER] = priors.wander**2 * (1.0 - self.kept[:, WANDER - AIR] ** 2)
         self.noise[:, AIR] = priors.air**2 * (1.0 - self.kept[:, 0] ** 2)
-        self._missed = _missed(fans, priors)
+        self._lasts = _lasts(fans, period_s)
+        """(fans,) true where samples leave out windows, so that the error of a count lasts as long as the count"""
+        self._missed = _missed(fans, priors, period_s)
         self._adjoins = fans.adjoins & (fans.held_s > 0.75 * bin_s)
         """(fans,) true where each count begins where the one before ended, and no bin contains two"""
+        self._remembers = self._adjoins.astype(np.float64)
+        """(fans,) 1 where the error of a count is in the next bin's"""
         self._of_balance = np.zeros(count)
         """(fans,) variance of the noise of the torque balance, as speed"""
         self.tends[:, SHOWN - ROTOR, COUNT] = -1.0
@@ -121,7 +127,7 @@ class HealthyFans(Saved):
 
     def of(self, fans: Array) -> HealthyFans:
         """A copy for some fans, (n,) by number."""
-        copied = HealthyFans(self.fans.of(fans), self._priors, self._bin_s, 0.0)
+        copied = HealthyFans(self.fans.of(fans), self._priors, self._bin_s, self._period_s)
         copied.mean, copied.covariance = self.mean[fans], self.covariance[fans]
         copied._has_begun = self._has_begun[fans]
         return copied
@@ -195,9 +201,10 @@ class HealthyFans(Saved):
         walked = np.minimum(lags + (p.lag_s**2 * moved)[:, np.newaxis], (2.0 * p.lag_s) ** 2)
         np.maximum(lags, walked, out=lags)
         self._follow(now)
-        covariance[:, COUNT] *= self._adjoins[:, np.newaxis]
-        covariance[:, :, COUNT] *= self._adjoins[:, np.newaxis]
-        covariance[:, COUNT, COUNT] += np.where(self._adjoins, 0.0, self._missed)
+        self._remembers = np.where(self._lasts, ~now.changes, self._adjoins).astype(np.float64)
+        covariance[:, COUNT] *= self._remembers[:, np.newaxis]
+        covariance[:, :, COUNT] *= self._remembers[:, np.newaxis]
+        covariance[:, COUNT, COUNT] += (1.0 - self._remembers) * self._missed
         with_states = self.tends @ covariance
         own = with_states @ self.tends.swapaxes(1, 2)
         self._of_balance = np.square(self.fans.balance_noise / self.fans.slope(now.speed_rad_s))
@@ -213,7 +220,7 @@ class HealthyFans(Saved):
     def carry(self, states: Array) -> None:
         """Take (fans, STATES, n) states on to the present bin."""
         states[:, FADING] *= self.kept[:, :, np.newaxis]
-        states[:, COUNT] *= self._adjoins[:, np.newaxis]
+        states[:, COUNT] *= self._remembers[:, np.newaxis]
         states[:, FOLLOWING] = self.tends.astype(states.dtype, copy=False) @ states
         states[:, COUNT] *= self._holds[:, np.newaxis]
 
@@ -224,7 +231,7 @@ class HealthyFans(Saved):
         follows[:, 0], follows[:, 1] = -np.expm1(-decay), self._filters
         follows[:, 2] = 1.0 - follows[:, 0] / decay  # the mean over the bin
         is_new = now.is_new
-        self._holds = 1.0 - (is_new | now.ends)
+        self._holds = 1.0 - ((is_new | now.ends) & ~self._lasts)
         begins = is_new & ~self._has_begun
         if begins.any():
             follows[begins] = 1.0
@@ -247,7 +254,7 @@ class HealthyFans(Saved):
         with_states = self.covariance[self._rows, shown]
         white = np.square(fans.noise_rad_s) / np.maximum(now.readings, 1.0)
         white += np.square(p.half_range * now.half_range_rad_s) + np.square(fans.timing_s * now.rate_rad_s2)
-        missed = np.where(now.is_balance, 0.0, self._missed)
+        missed = np.where(now.is_balance | self._lasts, 0.0, self._missed)
         of_balance = p.balance**2 * self._of_balance + np.square(p.balance_time_s * now.moves_rad_s2)
         white = np.where(now.is_balance, of_balance, white + missed)
         variance = with_states[self._rows, shown] + white
@@ -266,9 +273,14 @@ class HealthyFans(Saved):
         self.covariance -= halves @ np.multiply(halves.swapaxes(1, 2), BOTH_BUT_NOT, order="C")
 
 
-def _missed(fans: Fans, p: Priors) -> Array:
-    """Variance of the part of a pulse that a count misses, (fans,)."""
-    return np.asarray(np.square(p.count * fans.pulse_rad_s) / 12.0)
+def _lasts(fans: Fans, period_s: float) -> Array:
+    return (fans.pulse_rad_s > 0.0) & (fans.held_s < 0.75 * period_s)
+
+
+def _missed(fans: Fans, p: Priors, period_s: float) -> Array:
+    """Variance of the part of a pulse that a count misses, (fans,); of two such parts where they are not related."""
+    of_both = np.square(fans.pulse_rad_s) / 6.0
+    return np.where(_lasts(fans, period_s), of_both, np.square(p.count * fans.pulse_rad_s) / 12.0)
 
 
 def _prior(fans: Fans, p: Priors, period_s: float) -> Array:
@@ -284,6 +296,6 @@ def _prior(fans: Fans, p: Priors, period_s: float) -> Array:
         covariance[:, state, state] = std**2
     phase_s = (fans.held_s + period_s) / math.sqrt(6.0)  # of window and sample: two phases, then and now
     covariance[:, LATE, LATE] = np.square(phase_s)
-    covariance[:, COUNT, COUNT] = _missed(fans, p)
+    covariance[:, COUNT, COUNT] = _missed(fans, p, period_s)
     covariance[:, LOCAL, LOCAL] = np.square(p.local_rad_s / (0.5 * top))
     return covariance

@@ -10,9 +10,12 @@ import pytest
 from scipy.stats import poisson
 
 from fantwin.schemas.messages import Array
+from fantwin.schemas.tacho import Tacho
+from fantwin.schemas.units import RAD_S_PER_UNIT
 from fantwin.scoring.model.bins import Bin
+from fantwin.scoring.model.decision import Decision
 from fantwin.scoring.model.operation import Fans
-from tests.support.made_bins import MadeFans, plays, with_reading
+from tests.support.made_bins import PRIORS, MadeFans, plays, with_reading
 from tests.support.scored_blocks import twin_of
 
 DECLARED_S, LASTS_S = 100.0, 150.0
@@ -123,3 +126,28 @@ def test_far_readings_of_a_counting_tacho_agree_where_they_differ_or_last_longer
 
     raised = [time_s - 30.0 for time_s, _, is_raised in plays(made, decision, 3.0, with_far) if is_raised]
     assert raised == ([] if raised_s is None else [raised_s])
+
+
+@pytest.mark.parametrize("rpm", [2250.0, 450.0])
+def test_counts_that_err_alike_because_samples_leave_out_windows_raise_nothing_and_a_fault_is_found(rpm: float) -> None:
+    """At these speeds a fan makes whole pulses in a second: each window of half a second begins at the same phase."""
+    speed, window_s = rpm * RAD_S_PER_UNIT["rpm"], 0.5
+    fans = twin_of(FANS, tachos=(Tacho(kind="count", window_s=window_s),)).fans
+    nothing, phase = np.zeros(FANS), np.random.default_rng(1).uniform(size=FANS)
+    turning = replace(fans, pulse_rad_s=nothing, noise_rad_s=nothing + 1e-3, timing_s=nothing)
+    made = MadeFans(turning, 1.0, lambda _time_s: speed, seed=1, own=0.0)
+    decision = Decision(fans, made.bin_ns, 1.0, 86400.0, PRIORS)
+    before = nothing
+
+    def counted(one: Bin) -> Bin:
+        nonlocal phase, before
+        pulses_hz = (speed * (1.0 - lost) + 0.3 * one.deviation_rad_s) / np.pi  # two a turn
+        phase = phase + pulses_hz
+        shown = (np.floor(phase) - np.floor(phase - window_s * pulses_hz)) * np.pi / window_s
+        before, another = shown, shown != before
+        return replace(with_reading(one, shown - speed), another=another[np.newaxis])
+
+    lost = 0.0
+    assert plays(made, decision, 300.0, counted) == []
+    lost = 0.25
+    assert {fan for _, fan, _ in plays(made, decision, 60.0, counted)} == set(range(FANS))
