@@ -16,7 +16,7 @@ from fantwin.schemas.messages import Alarm, Message, ModelCard, ScorerSnapshot
 ALL_SAMPLES = 64
 """number of fans up to which all samples are kept; of a larger site, some of each tray"""
 SAMPLED_S = 1.0
-"""time between two scores of a tray of a larger site that are decoded: at 10,000 fans that is what an output costs"""
+"""time between two scores of a tray of a larger site that are decoded and kept"""
 
 
 class SiteCore(Core):

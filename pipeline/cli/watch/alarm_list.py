@@ -49,6 +49,7 @@ from fantwin.scoring.wear.slow_change import is_of_slow_change
 _SCORES_S = 3.0  # a score of every tray arrives in this time
 _POLL_S = 0.02
 _WATCH_S = 0.2  # between two looks at the stages while no alarm comes
+NS_PER_HOUR = 3600 * NS_PER_S
 _STYLES = {Severity.NONE: "", Severity.WARNING: "yellow", Severity.ALARM: "bold red"}
 
 
@@ -182,10 +183,6 @@ def probable(causes: Iterable[Diagnosis]) -> str:
     )
 
 
-NS_PER_HOUR = 3600 * NS_PER_S
-_STYLES_BY_NAME = {"warning": "yellow", "alarm": "bold red"}
-
-
 @dataclass
 class _Tray:
     """What is known of a tray. judged_ns: summed over fans."""
@@ -241,7 +238,7 @@ def _line(alarm: Episode) -> Text:
     said = "not marked" if alarm.feedback == Feedback.NONE else f"{alarm.feedback.words}{by}{reason}"
     return Text.assemble(
         f"{format_local(alarm.onset_ns)}  {alarm.tray} fan {alarm.fan}  ",
-        (f"{alarm.severity.upper():7}", _STYLES_BY_NAME.get(alarm.severity, "")),
+        (f"{alarm.severity.upper():7}", _STYLES[Severity[alarm.severity.upper()]]),
         f"  {lasted}{cause}  ",
         (said, "" if alarm.feedback == Feedback.NONE else "bold"),
     )

@@ -2,8 +2,8 @@
 events.
 
 The stage publishes from its own thread and never waits: each reader has a bounded queue. A reader that misses events is
-sent `missed` instead, and asks for the state again. (sse-starlette would replace a
-handler of uvicorn.)
+sent `missed` instead, and asks for the state again. (sse-starlette
+would replace a handler of uvicorn.)
 """
 
 from __future__ import annotations
