@@ -52,21 +52,17 @@ class Transition(OpenEnum):
     DIAGNOSED = 3
     CLEARED = 4
     ACKNOWLEDGED = 5
-    CONFIRMED = 6
-    RESET = 7
-    SHELVED = 8
-    UNSHELVED = 9
-    SUPPRESSED = 10
-    UNSUPPRESSED = 11
-    OUT_OF_SERVICE = 12
-    IN_SERVICE = 13
-    COMMISSIONING = 14
-    REPUBLISHED = 15
-    REFUSED = 16
-    DATA_LOST = 17
-    DATA_RESTORED = 18
-    MARKED_TRUE = 19
-    MARKED_FALSE = 20
+    SHELVED = 6
+    UNSHELVED = 7
+    OUT_OF_SERVICE = 8
+    IN_SERVICE = 9
+    COMMISSIONING = 10
+    REPUBLISHED = 11
+    REFUSED = 12
+    DATA_LOST = 13
+    DATA_RESTORED = 14
+    MARKED_TRUE = 15
+    MARKED_FALSE = 16
 
 
 class Action(OpenEnum):
@@ -74,17 +70,13 @@ class Action(OpenEnum):
 
     NONE = 0
     ACKNOWLEDGE = 1
-    CONFIRM = 2
-    RESET = 3
-    SHELVE = 4
-    UNSHELVE = 5
-    SUPPRESS = 6
-    UNSUPPRESS = 7
-    OUT_OF_SERVICE = 8
-    IN_SERVICE = 9
-    COMMISSION = 10
-    TRUE_ALARM = 11
-    FALSE_ALARM = 12
+    SHELVE = 2
+    UNSHELVE = 3
+    OUT_OF_SERVICE = 4
+    IN_SERVICE = 5
+    COMMISSION = 6
+    TRUE_ALARM = 7
+    FALSE_ALARM = 8
 
 
 class Feedback(OpenEnum):

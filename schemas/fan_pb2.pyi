@@ -47,12 +47,8 @@ class Transition(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     TRANSITION_DIAGNOSED: _ClassVar[Transition]
     TRANSITION_CLEARED: _ClassVar[Transition]
     TRANSITION_ACKNOWLEDGED: _ClassVar[Transition]
-    TRANSITION_CONFIRMED: _ClassVar[Transition]
-    TRANSITION_RESET: _ClassVar[Transition]
     TRANSITION_SHELVED: _ClassVar[Transition]
     TRANSITION_UNSHELVED: _ClassVar[Transition]
-    TRANSITION_SUPPRESSED: _ClassVar[Transition]
-    TRANSITION_UNSUPPRESSED: _ClassVar[Transition]
     TRANSITION_OUT_OF_SERVICE: _ClassVar[Transition]
     TRANSITION_IN_SERVICE: _ClassVar[Transition]
     TRANSITION_COMMISSIONING: _ClassVar[Transition]
@@ -67,12 +63,8 @@ class Action(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
     ACTION_NONE: _ClassVar[Action]
     ACTION_ACKNOWLEDGE: _ClassVar[Action]
-    ACTION_CONFIRM: _ClassVar[Action]
-    ACTION_RESET: _ClassVar[Action]
     ACTION_SHELVE: _ClassVar[Action]
     ACTION_UNSHELVE: _ClassVar[Action]
-    ACTION_SUPPRESS: _ClassVar[Action]
-    ACTION_UNSUPPRESS: _ClassVar[Action]
     ACTION_OUT_OF_SERVICE: _ClassVar[Action]
     ACTION_IN_SERVICE: _ClassVar[Action]
     ACTION_COMMISSION: _ClassVar[Action]
@@ -133,12 +125,8 @@ TRANSITION_SEVERITY: Transition
 TRANSITION_DIAGNOSED: Transition
 TRANSITION_CLEARED: Transition
 TRANSITION_ACKNOWLEDGED: Transition
-TRANSITION_CONFIRMED: Transition
-TRANSITION_RESET: Transition
 TRANSITION_SHELVED: Transition
 TRANSITION_UNSHELVED: Transition
-TRANSITION_SUPPRESSED: Transition
-TRANSITION_UNSUPPRESSED: Transition
 TRANSITION_OUT_OF_SERVICE: Transition
 TRANSITION_IN_SERVICE: Transition
 TRANSITION_COMMISSIONING: Transition
@@ -150,12 +138,8 @@ TRANSITION_MARKED_TRUE: Transition
 TRANSITION_MARKED_FALSE: Transition
 ACTION_NONE: Action
 ACTION_ACKNOWLEDGE: Action
-ACTION_CONFIRM: Action
-ACTION_RESET: Action
 ACTION_SHELVE: Action
 ACTION_UNSHELVE: Action
-ACTION_SUPPRESS: Action
-ACTION_UNSUPPRESS: Action
 ACTION_OUT_OF_SERVICE: Action
 ACTION_IN_SERVICE: Action
 ACTION_COMMISSION: Action
@@ -395,7 +379,7 @@ class Diagnosis(_message.Message):
     def __init__(self, cause: _Optional[str] = ..., probability: _Optional[float] = ..., parameter: _Optional[str] = ..., change: _Optional[float] = ..., unit: _Optional[str] = ..., evidence: _Optional[str] = ...) -> None: ...
 
 class Alarm(_message.Message):
-    __slots__ = ("header", "fan", "active", "severity", "t_ns", "onset_t_ns", "residual_rad_s", "residual_std_rad_s", "message", "transition", "statistic", "score", "torque_balance_command", "torque_balance_std_command", "acknowledged", "confirmed", "latched", "shelved_until_t_ns", "suppressed", "out_of_service", "causes", "request", "operator_name", "comment", "stale", "feedback", "feedback_by", "feedback_reason", "marked_onset_t_ns")
+    __slots__ = ("header", "fan", "active", "severity", "t_ns", "onset_t_ns", "residual_rad_s", "residual_std_rad_s", "message", "transition", "statistic", "score", "torque_balance_command", "torque_balance_std_command", "acknowledged", "shelved_until_t_ns", "out_of_service", "causes", "request", "operator_name", "comment", "stale", "feedback", "feedback_by", "feedback_reason", "marked_onset_t_ns")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     FAN_FIELD_NUMBER: _ClassVar[int]
     ACTIVE_FIELD_NUMBER: _ClassVar[int]
@@ -411,10 +395,7 @@ class Alarm(_message.Message):
     TORQUE_BALANCE_COMMAND_FIELD_NUMBER: _ClassVar[int]
     TORQUE_BALANCE_STD_COMMAND_FIELD_NUMBER: _ClassVar[int]
     ACKNOWLEDGED_FIELD_NUMBER: _ClassVar[int]
-    CONFIRMED_FIELD_NUMBER: _ClassVar[int]
-    LATCHED_FIELD_NUMBER: _ClassVar[int]
     SHELVED_UNTIL_T_NS_FIELD_NUMBER: _ClassVar[int]
-    SUPPRESSED_FIELD_NUMBER: _ClassVar[int]
     OUT_OF_SERVICE_FIELD_NUMBER: _ClassVar[int]
     CAUSES_FIELD_NUMBER: _ClassVar[int]
     REQUEST_FIELD_NUMBER: _ClassVar[int]
@@ -440,10 +421,7 @@ class Alarm(_message.Message):
     torque_balance_command: float
     torque_balance_std_command: float
     acknowledged: bool
-    confirmed: bool
-    latched: bool
     shelved_until_t_ns: int
-    suppressed: bool
     out_of_service: bool
     causes: _containers.RepeatedCompositeFieldContainer[Diagnosis]
     request: str
@@ -454,7 +432,7 @@ class Alarm(_message.Message):
     feedback_by: str
     feedback_reason: str
     marked_onset_t_ns: int
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fan: _Optional[int] = ..., active: _Optional[bool] = ..., severity: _Optional[_Union[Severity, str]] = ..., t_ns: _Optional[int] = ..., onset_t_ns: _Optional[int] = ..., residual_rad_s: _Optional[float] = ..., residual_std_rad_s: _Optional[float] = ..., message: _Optional[str] = ..., transition: _Optional[_Union[Transition, str]] = ..., statistic: _Optional[_Union[Statistic, str]] = ..., score: _Optional[float] = ..., torque_balance_command: _Optional[float] = ..., torque_balance_std_command: _Optional[float] = ..., acknowledged: _Optional[bool] = ..., confirmed: _Optional[bool] = ..., latched: _Optional[bool] = ..., shelved_until_t_ns: _Optional[int] = ..., suppressed: _Optional[bool] = ..., out_of_service: _Optional[bool] = ..., causes: _Optional[_Iterable[_Union[Diagnosis, _Mapping]]] = ..., request: _Optional[str] = ..., operator_name: _Optional[str] = ..., comment: _Optional[str] = ..., stale: _Optional[bool] = ..., feedback: _Optional[_Union[Feedback, str]] = ..., feedback_by: _Optional[str] = ..., feedback_reason: _Optional[str] = ..., marked_onset_t_ns: _Optional[int] = ...) -> None: ...
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fan: _Optional[int] = ..., active: _Optional[bool] = ..., severity: _Optional[_Union[Severity, str]] = ..., t_ns: _Optional[int] = ..., onset_t_ns: _Optional[int] = ..., residual_rad_s: _Optional[float] = ..., residual_std_rad_s: _Optional[float] = ..., message: _Optional[str] = ..., transition: _Optional[_Union[Transition, str]] = ..., statistic: _Optional[_Union[Statistic, str]] = ..., score: _Optional[float] = ..., torque_balance_command: _Optional[float] = ..., torque_balance_std_command: _Optional[float] = ..., acknowledged: _Optional[bool] = ..., shelved_until_t_ns: _Optional[int] = ..., out_of_service: _Optional[bool] = ..., causes: _Optional[_Iterable[_Union[Diagnosis, _Mapping]]] = ..., request: _Optional[str] = ..., operator_name: _Optional[str] = ..., comment: _Optional[str] = ..., stale: _Optional[bool] = ..., feedback: _Optional[_Union[Feedback, str]] = ..., feedback_by: _Optional[str] = ..., feedback_reason: _Optional[str] = ..., marked_onset_t_ns: _Optional[int] = ...) -> None: ...
 
 class Request(_message.Message):
     __slots__ = ("header", "t_ns", "action", "fan", "duration_s", "operator_name", "comment", "onset_t_ns")

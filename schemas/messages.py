@@ -214,10 +214,7 @@ class Alarm:
     torque_balance_command: float = 0.0
     torque_balance_std_command: float = 0.0
     acknowledged: bool = False
-    confirmed: bool = False
-    latched: bool = False
     shelved_until_t_ns: int = 0
-    suppressed: bool = False
     out_of_service: bool = False
     causes: tuple[Diagnosis, ...] = ()
     request: str = ""

@@ -47,11 +47,11 @@ NOT_JUDGED_S = 10.0  # health names a fan that has had no score for this long: b
 SHOWN_NS = 60 * NS_PER_S  # how long health says that a snapshot was not used
 NEW_START = "what was learned of the fans, alarms and wear start from the beginning"
 WEAR_CONTINUES = "what was learned of the fans and alarms start from the beginning, wear continues"
-OPERATORS_KEPT = "shelved, suppressed and out of service are kept"
+OPERATORS_KEPT = "shelved and out of service are kept"
 ANOTHER_TWIN = f"the snapshot is of another twin: {NEW_START}; {OPERATORS_KEPT}"
 EARLIER_TWIN = f"the snapshot is of the previous twin: {WEAR_CONTINUES}; {OPERATORS_KEPT}"
 READ_IN_PART = "the snapshot can be read in part only: {}; " + OPERATORS_KEPT
-NOT_READ = f"the snapshot cannot be read: {NEW_START}, and nothing is shelved, suppressed or out of service"
+NOT_READ = f"the snapshot cannot be read: {NEW_START}, and nothing is shelved or out of service"
 NOT_CALIBRATED = (
     "the twin is not calibrated: its alarms rest on what fans have in common, and their rate is not checked; "
     "see fantwin calibrate"
@@ -120,7 +120,7 @@ class ScorerCore(Core):
         """Continue from a snapshot. Returns the messages that report it.
 
         If it is of another twin, or what was learned of the fans cannot be read, as after an update, only what
-        belongs to operators is restored: shelved, suppressed, out of service, and the requests already answered. The
+        belongs to operators is restored: shelved, out of service, and the requests already answered. The
         wear is restored as well, if it can be read and the twin is the same or a learned one.
         """
         try:

@@ -162,5 +162,4 @@ def _alarm(excursion: Excursion, at_s: float, active: bool) -> Alarm:
         transition=Transition.RAISED if active else Transition.CLEARED,
         statistic=Statistic.DEVIATION,
         score=2.5 if active else 0.2,
-        confirmed=True,
     )

@@ -272,7 +272,6 @@ def _alarm(tray: str, fan: int, sequence: int) -> Alarm:
         residual_std_rad_s=4.0,
         message=f"fan {fan}: slower than its twin",
         transition=Transition.RAISED,
-        confirmed=True,
         causes=(Diagnosis(cause="drag", probability=0.8, evidence="drag +20 %"),),
     )
 

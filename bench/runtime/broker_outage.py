@@ -152,8 +152,8 @@ def outage(chain: Chain, watcher: SiteWatcher, operator: Operator, latency: Late
         if not is_burst_over and gone_s > outage_s / 2:
             is_burst_over = True
             for _ in range(BURST_REQUESTS):
-                operator.ask(Action.SUPPRESS, -1)
-                operator.ask(Action.UNSUPPRESS, -1)
+                operator.ask(Action.OUT_OF_SERVICE, -1)
+                operator.ask(Action.IN_SERVICE, -1)
         if not is_killed and gone_s > KILLED_AT * outage_s:
             is_killed = True
             chain.kill(watcher, "mqtt")

@@ -24,12 +24,8 @@ LONGEST_COMMENT = 500
 
 OperatorAction = Literal[
     "acknowledge",
-    "confirm",
-    "reset",
     "shelve",
     "unshelve",
-    "suppress",
-    "unsuppress",
     "out_of_service",
     "in_service",
     "commission",

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
 from pydantic import Field
 
 from fantwin.pipeline.runtime.stage import StageConfig
@@ -26,11 +24,6 @@ class ScorerConfig(StageConfig):
         default=0.1,
         gt=0,
         description="share of the speed: a fault that takes at least this much is an alarm, a smaller one a warning",
-    )
-    alarms_need: tuple[Literal["confirm", "reset"], ...] = Field(
-        default=(),
-        description="what operators must do, besides acknowledging an alarm: confirm it, too, or reset it once it has "
-        "cleared",
     )
     asks_for_snapshots: bool | None = Field(
         default=None,

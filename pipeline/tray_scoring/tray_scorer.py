@@ -20,7 +20,6 @@ from fantwin.schemas.enums import InvalidReason, Severity, Statistic
 from fantwin.schemas.messages import Alarm, Array, Diagnosis, Prediction, Score
 from fantwin.schemas.units import NS_PER_S
 from fantwin.scoring.alarms.alarm_manager import AlarmManager, Measured
-from fantwin.scoring.alarms.alarm_state import ConditionSettings
 from fantwin.scoring.alarms.alarm_text import AlarmText
 from fantwin.scoring.alarms.alarms_of_tray import Decided
 from fantwin.scoring.alarms.unscored_monitor import REASONS
@@ -88,8 +87,7 @@ class TrayScorer:
         self._words = CauseWords(twin.advice, has_supply=twin.has_supply)
         self.wear = WearMonitor(fans, WEAR_EVERY_S)
         self._against = AgainstCommand(twin.standstill, twin.tachos) if twin.standstill else None
-        needs = ConditionSettings(latching="reset" in config.alarms_need, confirming="confirm" in config.alarms_need)
-        self.alarms = AlarmManager(fans, needs, text)
+        self.alarms = AlarmManager(fans, text)
         self._period_ns = 0
         self._open(NS_PER_S)
         self._period_ns = 0  # of no sample yet

@@ -12,7 +12,7 @@ from fantwin.schemas.enums import Feedback, Severity, Statistic, Transition
 from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Alarm, Array, Diagnosis, Request
 from fantwin.schemas.units import NS_PER_S
-from fantwin.scoring.alarms.alarm_state import AlarmState, ConditionSettings, is_listed
+from fantwin.scoring.alarms.alarm_state import AlarmState, is_listed
 from fantwin.scoring.alarms.alarm_text import AlarmText
 from fantwin.scoring.alarms.alarms_of_tray import AlarmsOfTray, Decided
 from fantwin.scoring.diagnosis.ranked_causes import says_more
@@ -63,9 +63,9 @@ class FanFacts(Protocol):
 class AlarmManager:
     """Keeps the alarms of a tray."""
 
-    def __init__(self, fans: int, settings: ConditionSettings, alarm_text: AlarmText) -> None:
+    def __init__(self, fans: int, alarm_text: AlarmText) -> None:
         self._fans = fans
-        self._conditions = AlarmsOfTray(fans, settings)
+        self._conditions = AlarmsOfTray(fans)
         self._alarm_text = alarm_text
         self._last_emitted: dict[int, Alarm] = {}
         """the last message about each fan"""
@@ -166,7 +166,7 @@ class AlarmManager:
     def discard_all(self, t_ns: int, *, keep_silenced: bool) -> list[Alarm]:
         """Return all alarms to never raised; one message for each that was listed.
 
-        keep_silenced: shelved, suppressed and out of service stay as set.
+        keep_silenced: shelved and out of service stay as set.
         """
         fans = self._listed()
         self._conditions.discard_all(keep_silenced=keep_silenced)
@@ -238,7 +238,6 @@ class AlarmManager:
             residual_std_rad_s=0.0,
             message="",
             acknowledged=True,
-            confirmed=True,
         )
         return replace(last, header=Header(), request="", operator_name="", comment="", marked_onset_t_ns=0)
 

@@ -1,10 +1,9 @@
 """The alarm condition of one fan: the state of its alarm, including the actions of operators.
 
-Names and rules are those of OPC UA Part 9 (OPC 10000-9, release 1.05.03): ActiveState (5.8.2), AckedState and
-ConfirmedState of one occurrence (4.3, 5.7; the rows of table B.1 are a test), LatchedState and Reset (4.8, 5.8.5),
-timed and one-shot shelving (5.8.17), suppressed (5.8.8), out of service (5.8.12). Only the present occurrence is kept;
-there are no branches of earlier ones (as in B.1.2). What operators say of an alarm, that it was true or false, is not
-of Part 9. See docs/reference/alarms.md.
+Names and rules are those of OPC UA Part 9 (OPC 10000-9, release 1.05.03): ActiveState (5.8.2), AckedState of one
+occurrence (4.3, 5.7), timed and one-shot shelving (5.8.17), out of service (5.8.12). Only the present occurrence is
+kept; there are no branches of earlier ones (as in B.1.2). What operators say of an alarm, that it was true or false,
+is not of Part 9. See docs/reference/alarms.md.
 
 Whether an alarm needs attention is defined here alone: `is_retained`, `is_silenced`, `is_presented`, `is_listed`. The
 scorer's `AlarmState` and the `Alarm` message carry the same flags; both are accepted.
@@ -24,15 +23,13 @@ from fantwin.schemas.units import NS_PER_S
 
 
 def is_retained(alarm: Alarm | AlarmState) -> bool:
-    """Return whether the alarm still needs attention (Retain, 5.5.2): active, latched, unacknowledged or
-    unconfirmed."""
-    return alarm.active or alarm.latched or not (alarm.acknowledged and alarm.confirmed)
+    """Return whether the alarm still needs attention (Retain, 5.5.2): active or unacknowledged."""
+    return alarm.active or not alarm.acknowledged
 
 
 def is_silenced(alarm: Alarm | AlarmState) -> bool:
-    """Return whether an operator has silenced the alarm (SuppressedOrShelved, 5.8.2): shelved, suppressed, out of
-    service."""
-    return bool(alarm.shelved_until_t_ns) or alarm.suppressed or alarm.out_of_service
+    """Return whether an operator has silenced the alarm (SuppressedOrShelved, 5.8.2): shelved or out of service."""
+    return bool(alarm.shelved_until_t_ns) or alarm.out_of_service
 
 
 def is_presented(alarm: Alarm | AlarmState) -> bool:
@@ -56,21 +53,9 @@ GIVES_FEEDBACK = {
 
 
 DATA_LOST_AFTER_NS = 2 * NS_PER_S
+"""an active alarm is stale after a longer time in which nothing was judged"""
 EARLIER_ALARMS = 32
-
-
-@dataclass(frozen=True)
-class ConditionSettings:
-    """Settings of an alarm: what operators must do with it, and for how long data confirm it."""
-
-    latching: bool = False
-    """true: a cleared alarm remains until it is reset"""
-    confirming: bool = False
-    """an acknowledged alarm must also be confirmed"""
-    data_lost_after_ns: int = DATA_LOST_AFTER_NS
-    """an active alarm is stale after a longer time in which nothing was judged"""
-    earlier_alarms: int = EARLIER_ALARMS
-    """number of earlier alarms of each fan whose onsets are kept for feedback"""
+"""number of earlier alarms of each fan whose onsets are kept for feedback"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,12 +68,8 @@ class AlarmState:
     onset_t_ns: int = 0
     """probable start of the alarm's fault; identifies the occurrence"""
     acknowledged: bool = True
-    confirmed: bool = True
-    """False between an acknowledgement and its confirmation, where confirming is required"""
-    latched: bool = False
     shelved_until_t_ns: int = 0
     """0: not shelved"""
-    suppressed: bool = False
     out_of_service: bool = False
     stale: bool = False
     """the state is that of before a gap: no sample has confirmed it since"""
@@ -104,8 +85,7 @@ class AlarmState:
 class FanCondition:
     """Alarm of one fan, as a condition of OPC UA Part 9."""
 
-    def __init__(self, settings: ConditionSettings) -> None:
-        self._settings = settings
+    def __init__(self) -> None:
         self.alarm_state = AlarmState()
         self._earlier_onsets_t_ns: tuple[int, ...] = ()
         """onsets of the alarms before this one, oldest first"""
@@ -136,8 +116,6 @@ class FanCondition:
             severity=severity,
             onset_t_ns=onset_t_ns,
             acknowledged=False,
-            confirmed=True,  # nothing to confirm before it is acknowledged, see table B.1
-            latched=self._settings.latching,
             stale=False,
             acknowledged_by="",
             feedback=Feedback.NONE,
@@ -161,7 +139,7 @@ class FanCondition:
         return ((Transition.DATA_LOST, self.alarm_state),)
 
     def discard(self, *, keep_silenced: bool) -> None:
-        """Return to an alarm that was never raised. keep_silenced: shelved, suppressed, out of service stay as set, and
+        """Return to an alarm that was never raised. keep_silenced: shelved and out of service stay as set, and
         operators may still give feedback on the alarms of before."""
         self._keep_onset()
         if not keep_silenced:
@@ -170,7 +148,6 @@ class FanCondition:
         if keep_silenced:
             self.alarm_state = AlarmState(
                 shelved_until_t_ns=before.shelved_until_t_ns,
-                suppressed=before.suppressed,
                 out_of_service=before.out_of_service,
                 comment=before.comment,
             )
@@ -209,18 +186,13 @@ class FanCondition:
             return Transition.REFUSED, refusal
         timed = action == Action.SHELVE and duration_ns  # other actions ignore the duration, which may be NaN
         until_t_ns = now_t_ns + round(duration_ns) if timed else UNTIL_IT_CLEARS_T_NS
-        confirmed = not self._settings.confirming
         granted: dict[Action, tuple[Transition, dict[str, Any]]] = {
             Action.ACKNOWLEDGE: (
                 Transition.ACKNOWLEDGED,
-                {"acknowledged": True, "confirmed": confirmed, "acknowledged_by": operator_name},
+                {"acknowledged": True, "acknowledged_by": operator_name},
             ),
-            Action.CONFIRM: (Transition.CONFIRMED, {"confirmed": True}),
-            Action.RESET: (Transition.RESET, {"latched": False}),
             Action.SHELVE: (Transition.SHELVED, {"shelved_until_t_ns": until_t_ns}),
             Action.UNSHELVE: (Transition.UNSHELVED, {"shelved_until_t_ns": 0}),
-            Action.SUPPRESS: (Transition.SUPPRESSED, {"suppressed": True}),
-            Action.UNSUPPRESS: (Transition.UNSUPPRESSED, {"suppressed": False}),
             Action.OUT_OF_SERVICE: (Transition.OUT_OF_SERVICE, {"out_of_service": True}),
             Action.IN_SERVICE: (Transition.IN_SERVICE, {"out_of_service": False}),
             Action.COMMISSION: (Transition.COMMISSIONING, {}),
@@ -240,13 +212,13 @@ class FanCondition:
         return {**earlier, **alarm}
 
     @classmethod
-    def restore(cls, settings: ConditionSettings, stored: Mapping[str, Any]) -> Self:
+    def restore(cls, stored: Mapping[str, Any]) -> Self:
         """The condition of a snapshot.
 
         Raises:
             KeyError, TypeError, ValueError, OverflowError: it is not a snapshot of a condition.
         """
-        condition = cls(settings)
+        condition = cls()
         condition._earlier_onsets_t_ns = tuple(map(_time, stored.get("earlier_onsets_t_ns", ())))
         condition.alarm_state = AlarmState(
             active=bool(stored["active"]),
@@ -254,9 +226,6 @@ class FanCondition:
             onset_t_ns=_time(stored["onset_t_ns"]),
             shelved_until_t_ns=_time(stored["shelved_until_t_ns"]),
             acknowledged=bool(stored["acknowledged"]),
-            confirmed=bool(stored["confirmed"]),
-            latched=bool(stored["latched"]),
-            suppressed=bool(stored["suppressed"]),
             out_of_service=bool(stored["out_of_service"]),
             stale=bool(stored["stale"]),
             acknowledged_by=str(stored["acknowledged_by"]),
@@ -274,7 +243,7 @@ class FanCondition:
     def _keep_onset(self) -> None:
         """The present occurrence becomes an earlier one."""
         known = (*self._earlier_onsets_t_ns, *self._own_onset())
-        self._earlier_onsets_t_ns = known[-self._settings.earlier_alarms :]
+        self._earlier_onsets_t_ns = known[-EARLIER_ALARMS:]
 
     def _take_feedback(
         self, action: Action, operator_name: str, reason: str, onset_t_ns: int
@@ -305,23 +274,11 @@ class FanCondition:
                 (not raised, "no alarm has been raised"),
                 (now.acknowledged, "it is acknowledged already"),
             ),
-            Action.CONFIRM: (
-                (not now.acknowledged, "it must be acknowledged first"),
-                (now.confirmed, "there is nothing to confirm"),
-            ),
-            Action.RESET: (
-                (not now.latched, "it is not latched"),
-                (now.active, "it is still active"),
-                (not now.acknowledged, "it must be acknowledged first"),
-                (not now.confirmed, "it must be confirmed first"),
-            ),
             Action.SHELVE: (
                 (not fits, "it cannot be shelved for such a time"),
                 (once, "it is shelved until it clears already"),
             ),
             Action.UNSHELVE: ((not now.shelved_until_t_ns, "it is not shelved"),),
-            Action.SUPPRESS: ((now.suppressed, "it is suppressed already"),),
-            Action.UNSUPPRESS: ((not now.suppressed, "it is not suppressed"),),
             Action.OUT_OF_SERVICE: ((now.out_of_service, "it is out of service already"),),
             Action.IN_SERVICE: ((not now.out_of_service, "it is in service already"),),
             Action.COMMISSION: (),

@@ -34,12 +34,8 @@ def words_now(state: int, invalid_reason: int = InvalidReason.NONE) -> str:
 TRANSITIONS = {
     Transition.CLEARED: "back to normal",
     Transition.ACKNOWLEDGED: "acknowledged",
-    Transition.CONFIRMED: "confirmed",
-    Transition.RESET: "reset",
     Transition.SHELVED: "shelved",
     Transition.UNSHELVED: "no longer shelved",
-    Transition.SUPPRESSED: "suppressed",
-    Transition.UNSUPPRESSED: "no longer suppressed",
     Transition.OUT_OF_SERVICE: "out of service",
     Transition.IN_SERVICE: "in service",
     Transition.COMMISSIONING: "what was learned of it is forgotten",
@@ -143,10 +139,7 @@ def _after_restart(alarm: Alarm) -> str:
         return CONTINUES
     kept = {
         "not acknowledged": not alarm.acknowledged,
-        "not confirmed": not alarm.confirmed,
-        "latched": alarm.latched,
         "shelved": bool(alarm.shelved_until_t_ns),
-        "suppressed": alarm.suppressed,
         "out of service": alarm.out_of_service,
     }
     before = "no alarm" if alarm.severity == Severity.NONE else "back to normal"

@@ -14,7 +14,7 @@ import numpy as np
 
 from fantwin.schemas.enums import Action, Severity, Transition
 from fantwin.schemas.messages import Array
-from fantwin.scoring.alarms.alarm_state import UNTIL_IT_CLEARS_T_NS, AlarmState, ConditionSettings, FanCondition
+from fantwin.scoring.alarms.alarm_state import DATA_LOST_AFTER_NS, UNTIL_IT_CLEARS_T_NS, AlarmState, FanCondition
 from fantwin.scoring.column_state import NEVER_NS
 
 
@@ -46,9 +46,8 @@ class Decided:
 class AlarmsOfTray:
     """Conditions of a tray, one for each fan."""
 
-    def __init__(self, fans: int, settings: ConditionSettings) -> None:
-        self._settings = settings
-        self._conditions = [FanCondition(settings) for _ in range(fans)]
+    def __init__(self, fans: int) -> None:
+        self._conditions = [FanCondition() for _ in range(fans)]
         self._judged_t_ns = np.full(fans, NEVER_NS, np.int64)
         """(fans,) time when each was judged last"""
         self._refresh_all()
@@ -56,7 +55,7 @@ class AlarmsOfTray:
     def update(self, now: Decided) -> list[AlarmEvent]:
         """Process a decision; returns the events, sorted by fan."""
         judged, since_ns = now.judged, now.t_ns - self._judged_t_ns
-        longest_ns = max(self._settings.data_lost_after_ns, now.every_ns * 3 // 2)
+        longest_ns = max(DATA_LOST_AFTER_NS, now.every_ns * 3 // 2)
         lost = self._active & (self._judged_t_ns != NEVER_NS) & (since_ns > longest_ns)
         unshelved = self._shelved_until_t_ns <= now.t_ns
         events: list[AlarmEvent] = []
@@ -114,7 +113,7 @@ class AlarmsOfTray:
         return self._conditions[fan].alarm_state
 
     def discard_all(self, *, keep_silenced: bool) -> None:
-        """Return all alarms to never raised. keep_silenced: shelved, suppressed, out of service stay as set."""
+        """Return all alarms to never raised. keep_silenced: shelved and out of service stay as set."""
         for condition in self._conditions:
             condition.discard(keep_silenced=keep_silenced)
         self._refresh_all()
@@ -133,7 +132,7 @@ class AlarmsOfTray:
             ValueError: it is not a snapshot of alarm conditions, or one of another number of fans.
         """
         try:
-            conditions = [FanCondition.restore(self._settings, each) for each in snapshot["fans"]]
+            conditions = [FanCondition.restore(each) for each in snapshot["fans"]]
             judged_t_ns = np.array(snapshot["judged_t_ns"], np.int64)
         except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as error:
             raise ValueError(f"not a snapshot of alarm conditions: {error!r}") from error

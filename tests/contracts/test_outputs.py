@@ -21,7 +21,7 @@ from tests.support.score_data import one_sample
 from tests.support.site_messages import NOW_NS, alarm, score
 
 pytestmark = pytest.mark.usefixtures("quickly_hashed")
-SEEN = {"acknowledged": True, "confirmed": True, "operator_name": "ann"}
+SEEN = {"acknowledged": True, "operator_name": "ann"}
 SHELVED = {"shelved_until_t_ns": NOW_NS + 10**13}
 _numbers = itertools.count(100)
 

@@ -22,17 +22,18 @@ from fantwin.schemas.fields import columns
 from fantwin.schemas.messages import Alarm, Prediction, Score, ScorerSnapshot
 from fantwin.schemas.standstill import Standstill
 from fantwin.schemas.tacho import Tacho
-from fantwin.scoring.alarms.alarm_state import ConditionSettings
+from fantwin.scoring.alarms.alarm_state import DATA_LOST_AFTER_NS
 from fantwin.scoring.alarms.alarms_of_tray import AlarmsOfTray, Decided
 from fantwin.scoring.model.saved import as_json, from_json
 from fantwin.scoring.standing.against_command import AgainstCommand
 from fantwin.stages.scorer import RESTORE_ERRORS, ScorerCore
-from tests.support.scored_blocks import STEP_NS, core_of, prediction_of, request_of
+from tests.support.scored_blocks import core_of, prediction_of, request_of
 
 FANS, BLOCK = 3, 20
+EVERY_NS = DATA_LOST_AFTER_NS // 2
 
 
-OF_EVENTS = ("RAISED", "ACKNOWLEDGED", "MARKED_FALSE", "SHELVED", "SUPPRESSED", "COMMISSIONING")
+OF_EVENTS = ("RAISED", "ACKNOWLEDGED", "MARKED_FALSE", "SHELVED", "OUT_OF_SERVICE", "COMMISSIONING")
 
 
 def in_blocks(whole: Prediction, size: int = BLOCK) -> list[Prediction]:
@@ -52,7 +53,7 @@ def eventful() -> list[Any]:
         (14, Action.ACKNOWLEDGE, -1, {"comment": "ordered"}),
         (18, Action.FALSE_ALARM, 0, {"comment": "a door was open"}),
         (20, Action.SHELVE, 1, {"duration_s": 1.0}),
-        (24, Action.SUPPRESS, 2, {}),
+        (24, Action.OUT_OF_SERVICE, 2, {}),
         (30, Action.COMMISSION, 2, {}),
     ]
     for number, (place, action, fan, more) in enumerate(asked):
@@ -76,7 +77,7 @@ def decisions() -> list[Any]:
     rng = np.random.default_rng(4)
     active, judged = rng.random((2, 200, FANS)) > 0.3
     return [
-        Decided(number * STEP_NS, one, two, np.where(two, 1 + number % 2, 0), np.full(FANS, number), STEP_NS)
+        Decided(number * EVERY_NS, one, two, np.where(two, 1 + number % 2, 0), np.full(FANS, number), EVERY_NS)
         for number, (one, two) in enumerate(zip(judged, active, strict=True))
     ]
 
@@ -134,7 +135,6 @@ def scorer(items: Callable[[], list[Any]], **settings: Any) -> Kind:
 
 
 SCORERS = {"scorer": scorer(eventful), "scorer over days": scorer(days)}
-CONDITIONS = ConditionSettings(confirming=True, data_lost_after_ns=2 * STEP_NS)
 STANDSTILL = Standstill(turning_command=20.0, standing_below_rad_s=50.0, off_command=0.0, start_s=1.0, coast_s=4.0)
 
 
@@ -156,9 +156,7 @@ class Against:
 
 
 PARTS = {
-    "alarm conditions": Kind(
-        lambda fans: AlarmsOfTray(fans, CONDITIONS), decisions, lambda one, item: repr(one.update(item))
-    ),
+    "alarm conditions": Kind(AlarmsOfTray, decisions, lambda one, item: repr(one.update(item))),
     "fans against their command": Kind(Against, stops, Against.take, state=lambda one: None),
 }
 KINDS = SCORERS | PARTS

@@ -101,7 +101,7 @@ def test_states_alarms_and_status_are_retained(tmp_path, broker, listener, start
     kept = retained_by(broker.port)
     assert kept[f"{ROOT}/status"] == "online"
     assert f"{FAN}/alarm/transitions" not in kept
-    stage.feed(alarm(Transition.CLEARED, 1, active=False, acknowledged=True, confirmed=True))
+    stage.feed(alarm(Transition.CLEARED, 1, active=False, acknowledged=True))
     eventually(lambda: listener.last(f"{FAN}/alarm") == "null", "the alarm is over")
     assert (stage.sent, listener.of(f"{FAN}/request/answer")) == ([], [])
     stage.close()

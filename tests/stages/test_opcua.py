@@ -32,7 +32,7 @@ from tests.support.site_users import OPERATOR, PASSWORD, VIEWER, make_users
 
 pytestmark = pytest.mark.usefixtures("quickly_hashed")
 ALARM = f"ns=2;s={TRAY}/2/Alarm"
-SUPPRESS = ua.NodeId(ua.ObjectIds.AlarmConditionType_Suppress)
+REMOVE_FROM_SERVICE = ua.NodeId(ua.ObjectIds.AlarmConditionType_RemoveFromService)
 
 UNHEARD = "unheard"
 """whom the scorer does not answer"""
@@ -49,9 +49,9 @@ class Heard:
 @pytest.fixture(scope="module")
 def opcua(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningOpcua]:
     """One for all tests that do not end it; who changes a user has one of his own."""
-    suppressed = alarm(Transition.SUPPRESSED, suppressed=True)
+    removed = alarm(Transition.OUT_OF_SERVICE, out_of_service=True)
     running = RunningOpcua(
-        tmp_path_factory.mktemp("site"), lambda asked: [] if asked.operator_name == UNHEARD else [suppressed]
+        tmp_path_factory.mktemp("site"), lambda asked: [] if asked.operator_name == UNHEARD else [removed]
     )
     running.feed(score(), alarm())
     make_users(running.users, **USERS)
@@ -73,8 +73,8 @@ async def encrypted(running: RunningOpcua, folder: Path, user: str, password: st
     return client
 
 
-async def status_of_suppress(client: Client) -> str:
-    request = ua.CallMethodRequest(ObjectId=ua.NodeId.from_string(ALARM), MethodId=SUPPRESS)
+async def status_of_removal(client: Client) -> str:
+    request = ua.CallMethodRequest(ObjectId=ua.NodeId.from_string(ALARM), MethodId=REMOVE_FROM_SERVICE)
     (result,) = await client.uaclient.call([request])
     return result.StatusCode.name
 
@@ -82,9 +82,9 @@ async def status_of_suppress(client: Client) -> str:
 def test_a_session_ends_with_the_password_that_began_it(opcua, tmp_path):
     async def session() -> None:
         client = await encrypted(opcua, tmp_path, "changes")
-        assert await status_of_suppress(client) == "Good"
+        assert await status_of_removal(client) == "Good"
         make_users(opcua.users, "another horse battery", changes=UserRole.OPERATOR)
-        assert await status_of_suppress(client) == "BadUserAccessDenied"
+        assert await status_of_removal(client) == "BadUserAccessDenied"
         make_users(opcua.users, **USERS)
         await client.disconnect()
 
@@ -99,7 +99,7 @@ def test_a_scorer_that_does_not_answer_is_a_timeout_and_others_are_served_meanwh
     async def acts() -> tuple[str, str]:
         client = await encrypted(opcua, tmp_path, UNHEARD)
         async with Client(opcua.url, timeout=60) as other:
-            waiting = asyncio.create_task(status_of_suppress(client))
+            waiting = asyncio.create_task(status_of_removal(client))
             while not any(asked.operator_name == UNHEARD for asked in opcua.sent):
                 await asyncio.sleep(0.01)
             message = await other.get_node(f"{ALARM}/Message").read_value()

@@ -24,7 +24,7 @@ FAN = f"ns=2;s={TRAY}/2"
 ALARM = f"{FAN}/Alarm"
 SERVER = "ns=0;i=2253"
 TIMED_SHELVE, ONE_SHOT_SHELVE, UNSHELVE = "ns=0;i=2949", "ns=0;i=2948", "ns=0;i=2947"
-SUPPRESS, REMOVE_FROM_SERVICE = "ns=0;i=16403", "ns=0;i=17869"
+REMOVE_FROM_SERVICE = "ns=0;i=17869"
 CONDITION_TYPE, REFRESH = "ns=0;i=2782", "ns=0;i=3875"
 
 
@@ -42,17 +42,16 @@ class Scorer:
         transition, changed, is_refused = {
             Action.ACKNOWLEDGE: (
                 Transition.ACKNOWLEDGED,
-                {"acknowledged": True, "confirmed": False},
+                {"acknowledged": True},
                 self.state.get("acknowledged"),
             ),
-            Action.CONFIRM: (Transition.CONFIRMED, {"confirmed": True}, False),
             Action.SHELVE: (Transition.SHELVED, {"shelved_until_t_ns": until}, False),
             Action.UNSHELVE: (
                 Transition.UNSHELVED,
                 {"shelved_until_t_ns": 0},
                 not self.state.get("shelved_until_t_ns"),
             ),
-            Action.SUPPRESS: (Transition.SUPPRESSED, {"suppressed": True}, False),
+            Action.OUT_OF_SERVICE: (Transition.OUT_OF_SERVICE, {"out_of_service": True}, False),
         }[request.action]
         if is_refused:
             transition, changed = Transition.REFUSED, {}
@@ -164,8 +163,6 @@ def test_an_alarm_comes_is_refreshed_acknowledged_confirmed_and_shelved(opcua, n
     assert client("acknowledge", condition=ALARM, event=raised["EventId"], comment="again") == (
         "BadConditionBranchAlreadyAcked"
     )
-    assert client("confirm", condition=ALARM, event=acknowledged["EventId"], comment="repaired") == "Good"
-    assert comes("the confirmation", lambda each: each["Comment"] == "repaired")["ConfirmedState.Id"] is True
     assert client("comment", condition=ALARM, event=raised["EventId"], comment="no such request") == (
         "BadNotImplemented"
     )
@@ -178,8 +175,8 @@ def test_an_alarm_comes_is_refreshed_acknowledged_confirmed_and_shelved(opcua, n
     assert client("call", object=ALARM, method=UNSHELVE) == "BadConditionNotShelved"
     assert client("call", object=ALARM, method=TIMED_SHELVE, inputs=[0]) == "BadShelvingTimeOutOfRange"
     assert client("call", object=ALARM, method=ONE_SHOT_SHELVE) == "Good"
-    assert client("call", object=ALARM, method=SUPPRESS) == "Good"
-    comes("the suppression", lambda each: each["SuppressedState.Id"] is True)
+    assert client("call", object=ALARM, method=REMOVE_FROM_SERVICE) == "Good"
+    comes("the removal from service", lambda each: each["OutOfServiceState.Id"] is True)
 
     seen.clear()
     assert client("call", object=CONDITION_TYPE, method=REFRESH, inputs=[{"uint32": number}]) == "Good"
@@ -205,7 +202,6 @@ def test_who_may_do_what(opcua, new_client, scorer):
     viewer.connect(opcua.url, VIEWER, PASSWORD)
     for client in (stranger, viewer):
         assert client("read", nodes=[f"{ALARM}/ActiveState/Id"])[0]["value"] is True
-        assert client("call", object=ALARM, method=SUPPRESS) == "BadUserAccessDenied"
         assert client("call", object=ALARM, method=REMOVE_FROM_SERVICE) == "BadUserAccessDenied"
         with pytest.raises(RuntimeError, match="BadUserAccessDenied"):
             client("write", node=f"{FAN}/Speed")

@@ -73,7 +73,7 @@ def tick_until_cut(core: Recorder, clips: AlarmClips, now_ns: int) -> None:
 
 def raised(fan: int, t_ns: int, **more: Any) -> Alarm:
     fields: dict[str, Any] = {"transition": Transition.RAISED, "active": True, "severity": Severity.ALARM} | more
-    about: dict[str, Any] = {"residual_rad_s": 0.0, "residual_std_rad_s": 0.0, "message": "", "confirmed": True}
+    about: dict[str, Any] = {"residual_rad_s": 0.0, "residual_std_rad_s": 0.0, "message": ""}
     return Alarm(header=Header("scorer-1", fan, "tray1"), fan=fan, t_ns=t_ns, onset_t_ns=t_ns, **about, **fields)
 
 

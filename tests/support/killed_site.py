@@ -239,13 +239,12 @@ class Site(Stages):
         remembers: bool = True,
         is_replayed: bool = False,
         learns: bool = False,
-        scorer_settings: str = "",
     ) -> None:
         """raw_samples: in a message of acquisition. remembers: whether a restarted scorer finds the snapshot of the one
-        before it. learns: the configuration names no twin. scorer_settings: more lines of that section."""
+        before it. learns: the configuration names no twin."""
         card = {"calibration": CALIBRATION} if calibrated else {}
         write_twin(folder / "twin.onnx", balanced_hybrid(), fans=FANS, **card)
-        text = CONFIGURATION + scorer_settings
+        text = CONFIGURATION
         (folder / "site.toml").write_text(text.replace('twin = "twin.onnx"\n', "") if learns else text)
         self.path = folder / "recording.mcap"
         config = load_config(folder / "site.toml")

@@ -79,7 +79,7 @@ def make_golden(path: Path) -> None:
 def make_golden_restart(path: Path) -> None:
     """Kill a scorer while its operators have set something for each fan."""
     with tempfile.TemporaryDirectory() as name:
-        site = Site(Path(name), seed=1, scorer_settings='alarms_need = ["reset"]\n')
+        site = Site(Path(name), seed=1)
         site.run(200)
         site.ask(Action.ACKNOWLEDGE, fan=0)
         site.ask(Action.SHELVE, fan=1, duration_s=60.0)

@@ -45,7 +45,6 @@ def alarm(
         "message": f"fan {fan}: 90 rpm below the twin (limit 50); more drag, 80 %: drag +20 %",
         "transition": transition,
         "causes": CAUSES,
-        "confirmed": True,
         **more,
     }
     number = next(_sequences) if sequence is None else sequence

@@ -6,7 +6,7 @@ const { OPCUACertificateManager } = require("node-opcua-certificate-manager");
 
 const EVENT_FIELDS = [
   "EventId", "EventType", "SourceName", "Time", "Message", "Severity", "Retain", "ConditionName", "ActiveState.Id",
-  "AckedState.Id", "ConfirmedState.Id", "ShelvingState.CurrentState", "SuppressedState.Id", "OutOfServiceState.Id",
+  "AckedState.Id", "ShelvingState.CurrentState", "OutOfServiceState.Id",
   "SuppressedOrShelved", "Comment", "ClientUserId", "2:Cause", "2:Evidence",
 ];
 let client, session, subscription, alarms;

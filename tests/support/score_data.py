@@ -93,7 +93,6 @@ def _alarm(tray: str, fan: int, at_s: float, onset_s: float, active: bool) -> Al
         statistic=Statistic.DEVIATION,
         score=3.75 if active else 0.1,
         torque_balance_command=0.3 if active else 0.01,
-        confirmed=True,
     )
 
 

@@ -32,14 +32,13 @@ class Scorer:
     """Grants what is asked."""
 
     def __init__(self) -> None:
-        self._state = {"acknowledged": False, "confirmed": False, "shelved_until_t_ns": 0}
+        self._state = {"acknowledged": False, "shelved_until_t_ns": 0}
 
     def __call__(self, request: Request) -> list[Alarm]:
         if request.action == Action.FALSE_ALARM:
             return [replace(marked(Feedback.FALSE_ALARM, 2, request.comment), marked_onset_t_ns=5)]
         transition, change = {
             Action.ACKNOWLEDGE: (Transition.ACKNOWLEDGED, {"acknowledged": True}),
-            Action.CONFIRM: (Transition.CONFIRMED, {"confirmed": True}),
             Action.SHELVE: (Transition.SHELVED, {"shelved_until_t_ns": alarm().t_ns + round(request.duration_s * 1e9)}),
         }[request.action]
         self._state |= change
@@ -85,7 +84,7 @@ def test_everything_is_done_by_keyboard(gateway, browser):
     keyboard.press("ArrowLeft")
     keyboard.press("Enter")
     card = page.locator(f'article[data-fan="{TRAY}/{FAULTY}"]')
-    for button, done in (("Acknowledge", "by ann, unconfirmed"), ("Confirm", "by ann"), ("Shelve", "shelved until")):
+    for button, done in (("Acknowledge", "by ann"), ("Shelve", "shelved until")):
         tab_to(button)
         keyboard.press("Enter")
         page.get_by_label("Reason").focus()
@@ -99,7 +98,6 @@ def test_everything_is_done_by_keyboard(gateway, browser):
     asked = [(each.action, each.operator_name, each.comment) for each in gateway.sent]
     assert asked == [
         (Action.ACKNOWLEDGE, "ann", "Acknowledge by key"),
-        (Action.CONFIRM, "ann", "Confirm by key"),
         (Action.SHELVE, "ann", "Shelve by key"),
     ]
     keyboard.press("Escape")

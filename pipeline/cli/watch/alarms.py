@@ -1,4 +1,4 @@
-"""`fantwin alarms`: list the current alarms, acknowledge, shelve or suppress them, and say whether they were true."""
+"""`fantwin alarms`: list the current alarms, acknowledge or shelve them, and say whether they were true."""
 
 from __future__ import annotations
 
@@ -39,12 +39,8 @@ class OperatorAction(StrEnum):
     """The actions, as they are typed."""
 
     ACK = "ack"
-    CONFIRM = "confirm"
-    RESET = "reset"
     SHELVE = "shelve"
     UNSHELVE = "unshelve"
-    SUPPRESS = "suppress"
-    UNSUPPRESS = "unsuppress"
     OUT_OF_SERVICE = "out-of-service"
     IN_SERVICE = "in-service"
     COMMISSION = "commission"
@@ -100,7 +96,7 @@ def alarms(
     overrides: SetOption = None,
     json_output: JsonOption = False,
 ) -> None:
-    """List the current alarms; acknowledge, shelve or suppress the alarm of a fan, or say whether it was true
+    """List the current alarms; acknowledge or shelve the alarm of a fan, or say whether it was true
     (docs/reference/alarms.md).
 
     Exit code 0: the list was printed and every fan is judged now, or the request was granted; 1: a fan is not judged,

@@ -34,20 +34,13 @@ class ConditionMethod:
 EVENT_ID, COMMENT, SHELVING_TIME = "EventId", "Comment", "ShelvingTime"
 METHODS = (
     ConditionMethod("Acknowledge", Action.ACKNOWLEDGE, (EVENT_ID, COMMENT)),
-    ConditionMethod("Confirm", Action.CONFIRM, (EVENT_ID, COMMENT)),
     ConditionMethod("AddComment", None, (EVENT_ID, COMMENT)),
     ConditionMethod("Enable", None, refusal="BadConditionAlreadyEnabled"),
     ConditionMethod("Disable", None),
-    ConditionMethod("Suppress", Action.SUPPRESS),
-    ConditionMethod("Suppress2", Action.SUPPRESS, (COMMENT,)),
-    ConditionMethod("Unsuppress", Action.UNSUPPRESS),
-    ConditionMethod("Unsuppress2", Action.UNSUPPRESS, (COMMENT,)),
     ConditionMethod("RemoveFromService", Action.OUT_OF_SERVICE),
     ConditionMethod("RemoveFromService2", Action.OUT_OF_SERVICE, (COMMENT,)),
     ConditionMethod("PlaceInService", Action.IN_SERVICE),
     ConditionMethod("PlaceInService2", Action.IN_SERVICE, (COMMENT,)),
-    ConditionMethod("Reset", Action.RESET),
-    ConditionMethod("Reset2", Action.RESET, (COMMENT,)),
 )
 SHELVING_METHODS = (
     ConditionMethod("TimedShelve", Action.SHELVE, (SHELVING_TIME,)),
@@ -67,8 +60,6 @@ def status_of(answer: Alarm, action: Action) -> str:
     if action == Action.ACKNOWLEDGE:
         never_raised = answer.severity == Severity.NONE
         return "BadInvalidState" if never_raised else "BadConditionBranchAlreadyAcked"
-    if action == Action.CONFIRM:
-        return "BadConditionBranchAlreadyConfirmed" if answer.acknowledged else "BadInvalidState"
     if action == Action.SHELVE:
         is_once = answer.shelved_until_t_ns == UNTIL_IT_CLEARS_T_NS
         return "BadConditionAlreadyShelved" if is_once else "BadShelvingTimeOutOfRange"

@@ -107,10 +107,7 @@ class Alarm(BaseModel):
     severity: str
     active: bool
     acknowledged: bool
-    confirmed: bool
-    latched: bool
     shelved_until_t_ns: int
-    suppressed: bool
     out_of_service: bool
     stale: bool
     retained: bool

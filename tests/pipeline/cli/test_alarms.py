@@ -23,7 +23,7 @@ from fantwin.schemas.enums import InvalidReason, Severity, StageStatus, Transiti
 from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Alarm, Diagnosis, Message, Request
 from fantwin.schemas.topics import BY_NAME, tray_key
-from fantwin.scoring.alarms.alarm_state import AlarmState, ConditionSettings
+from fantwin.scoring.alarms.alarm_state import AlarmState
 from fantwin.scoring.alarms.alarms_of_tray import AlarmsOfTray, Decided
 from fantwin.scoring.alarms.current_alarms import clock
 from tests.support.fantwin_command import error_of, fantwin
@@ -33,7 +33,7 @@ from tests.support.score_data import one_sample
 
 FANS = 8
 FLAGS = (
-    *("active", "severity", "onset_t_ns", "acknowledged", "confirmed", "latched", "shelved_until_t_ns", "suppressed"),
+    *("active", "severity", "onset_t_ns", "acknowledged", "shelved_until_t_ns"),
     *("out_of_service", "feedback", "feedback_by", "feedback_reason"),
 )
 """of a message about an alarm, and of its state in the scorer"""
@@ -47,7 +47,7 @@ class AlarmOnRequestScorer(Core):
     """The conditions of a tray whose fans have the alarms that a test says; answers requests as a scorer does."""
 
     def __init__(self) -> None:
-        self.conditions = AlarmsOfTray(FANS, ConditionSettings(earlier_alarms=4))
+        self.conditions = AlarmsOfTray(FANS)
         self.has_alarm: set[int] = set()
         self._raised_t_ns = np.zeros(FANS, np.int64)
         self.deaf = False

@@ -103,7 +103,7 @@ def test_a_broken_rate_is_exit_code_3_and_recordings_that_made_the_twin_prove_no
 ) -> None:
     calibrated, other, copy = healthy / "calibrated.onnx", healthy / "other.mcap", tmp_path / "copy.mcap"
     rare = changed(tmp_path / "rare.onnx", calibrated, false_alarms_per_day=0.1)
-    verified = ("calibrate", rare, "--verify", other, healthy / "faulty.mcap", "--set", 'scorer.alarms_need=["reset"]')
+    verified = ("calibrate", rare, "--verify", other, healthy / "faulty.mcap", "--set", "scorer.alarm_share=0.2")
     broken = json.loads(done(*verified, "--json", exit_code=3))["verify"]
     assert (broken["kept"], broken["alarms"]) == (False, 1)
     assert broken["fan_hours"] == pytest.approx(FANS * 2 * OTHER_S / 3600, rel=0.1), "all that follows --verify"

@@ -190,7 +190,7 @@ def test_alarms_are_shown_with_their_states_and_probable_causes(site):
             {"transition": Transition.SHELVED, **shelved},
         )
     ):
-        header, changes = Header("scorer-all-1", number, TRAY), {"t_ns": ALARM.t_ns + number, "confirmed": True}
+        header, changes = Header("scorer-all-1", number, TRAY), {"t_ns": ALARM.t_ns + number}
         site.alarm.put(encode(replace(ALARM, header=header, **changes | more)))
     watcher = site.watcher()
     view(site, watcher, HEALTH)

@@ -23,7 +23,6 @@ def alarm(fan: int = 0, at_s: float = 0.0, tray: str = "tray1", *, onset_s: floa
         "residual_rad_s": 0.0,
         "residual_std_rad_s": 0.0,
         "message": "",
-        "confirmed": True,
     }
     onset_t_ns = T0 + round((at_s if onset_s is None else onset_s) * S)
     t_ns = T0 + round(at_s * S)
@@ -85,7 +84,7 @@ def test_a_fan_that_raises_alarms_for_ever_does_not_make_a_clip_without_an_end()
 
 def test_what_is_known_silenced_or_no_raise_gives_no_clip():
     of = tracker()
-    follow(of, alarm(0), alarm(0, 200.0, onset_s=0.0), alarm(1, 300.0, suppressed=True))
+    follow(of, alarm(0), alarm(0, 200.0, onset_s=0.0), alarm(1, 300.0, out_of_service=True))
     follow(of, alarm(2, 400.0, transition=Transition.REPUBLISHED), alarm(3, 500.0, transition=Transition.DIAGNOSED))
     assert len(of.clips) == 1
 

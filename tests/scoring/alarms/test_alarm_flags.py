@@ -15,8 +15,8 @@ from fantwin.scoring.alarms.alarm_state import (
     is_silenced,
 )
 
-ACTIVE = {"active": True, "acknowledged": False, "confirmed": True}
-OVER = {"active": False, "acknowledged": True, "confirmed": True}
+ACTIVE = {"active": True, "acknowledged": False}
+OVER = {"active": False, "acknowledged": True}
 
 
 @pytest.mark.parametrize(
@@ -26,12 +26,9 @@ OVER = {"active": False, "acknowledged": True, "confirmed": True}
         (ACTIVE | {"acknowledged": True}, True, False),
         (ACTIVE | {"active": False}, True, False),
         (OVER, False, False),
-        (OVER | {"confirmed": False}, True, False),
-        (OVER | {"latched": True}, True, False),
-        (OVER | {"suppressed": True}, False, True),
+        (OVER | {"out_of_service": True}, False, True),
         (ACTIVE | {"shelved_until_t_ns": 5}, True, True),
         (ACTIVE | {"shelved_until_t_ns": UNTIL_IT_CLEARS_T_NS}, True, True),
-        (ACTIVE | {"suppressed": True}, True, True),
         (ACTIVE | {"out_of_service": True}, True, True),
     ],
     ids=str,

@@ -12,19 +12,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fantwin.schemas.enums import Action, Severity, Transition
-from fantwin.scoring.alarms.alarm_state import UNTIL_IT_CLEARS_T_NS, ConditionSettings, is_retained, is_silenced
+from fantwin.scoring.alarms.alarm_state import DATA_LOST_AFTER_NS, UNTIL_IT_CLEARS_T_NS, is_retained, is_silenced
 from fantwin.scoring.alarms.alarms_of_tray import AlarmEvent, AlarmsOfTray, Decided
 
-STEP_NS = 10
-LOST_NS = 35
+STEP_NS = DATA_LOST_AFTER_NS * 2 // 7
 RAISED, CLEARED, UNSHELVED = Transition.RAISED, Transition.CLEARED, Transition.UNSHELVED
 UP, LOW, HIGH = 1, 0, 2
 """an active alarm, none, and an active one of severity ALARM"""
 ONSET_NS = 7
-
-
-def conditions_of(fans: int = 1, **more: Any) -> AlarmsOfTray:
-    return AlarmsOfTray(fans, ConditionSettings(data_lost_after_ns=LOST_NS, **more))
 
 
 def decided(number: int, active: Sequence[int], judged: Sequence[bool]) -> Decided:
@@ -54,14 +49,14 @@ def asked(
 
 
 def test_an_alarm_is_raised_with_its_onset_and_cleared_at_what_was_decided() -> None:
-    conditions = conditions_of()
+    conditions = AlarmsOfTray(1)
     assert take(conditions, [LOW, UP, UP, LOW, LOW]) == [(1, RAISED), (3, CLEARED)]
     assert conditions.alarm_state(0).onset_t_ns == STEP_NS - ONSET_NS
     assert not conditions.active[0]
 
 
 def test_what_was_not_judged_raises_and_clears_nothing_and_makes_an_alarm_stale_after_a_time() -> None:
-    conditions = conditions_of()
+    conditions = AlarmsOfTray(1)
     assert take(conditions, [UP], [False]) == []
     judged = [True, *[False] * 6, True]
     assert take(conditions, [UP, *[LOW] * 6, UP], judged) == [
@@ -73,7 +68,7 @@ def test_what_was_not_judged_raises_and_clears_nothing_and_makes_an_alarm_stale_
 
 
 def test_severity_rises_and_does_not_fall_before_the_next_alarm() -> None:
-    conditions = conditions_of()
+    conditions = AlarmsOfTray(1)
     found = []
     for number, each in enumerate([UP, HIGH, UP, LOW, UP]):
         events = conditions.update(decided(number, [each], [True]))
@@ -86,33 +81,8 @@ def test_severity_rises_and_does_not_fall_before_the_next_alarm() -> None:
     ]
 
 
-B1 = [  # table B.1 of Part 9: what happens, then Active, Acked, Confirmed, Retain
-    (UP, True, False, True, True),
-    (Action.ACKNOWLEDGE, True, True, False, True),
-    (LOW, False, True, False, True),
-    (Action.CONFIRM, False, True, True, False),
-    (UP, True, False, True, True),
-    (LOW, False, False, True, True),
-    (Action.ACKNOWLEDGE, False, True, False, True),
-    (Action.CONFIRM, False, True, True, False),
-]
-
-
-def test_acknowledging_and_confirming_follow_table_b1_of_part_9():
-    conditions = conditions_of(confirming=True)
-    now = conditions.alarm_state(0)
-    assert (now.active, now.acknowledged, now.confirmed, is_retained(now)) == (False, True, True, False)
-    for event, *expected in B1:
-        if isinstance(event, Action):
-            assert asked(conditions, event)[0] != Transition.REFUSED
-        else:
-            take(conditions, [event])
-        now = conditions.alarm_state(0)
-        assert [now.active, now.acknowledged, now.confirmed, is_retained(now)] == expected, event
-
-
-def test_without_confirming_an_acknowledged_alarm_is_done_once_it_has_cleared():
-    conditions = conditions_of()
+def test_an_acknowledged_alarm_is_done_once_it_has_cleared():
+    conditions = AlarmsOfTray(1)
     take(conditions, [UP, LOW])
     assert is_retained(conditions.alarm_state(0))
     assert asked(conditions, Action.ACKNOWLEDGE) == (Transition.ACKNOWLEDGED, "")
@@ -123,39 +93,20 @@ def test_without_confirming_an_acknowledged_alarm_is_done_once_it_has_cleared():
     assert (now.acknowledged, now.acknowledged_by) == (False, "")
 
 
-def test_a_latched_alarm_stays_until_it_is_reset_in_its_turn():
-    conditions = conditions_of(latching=True, confirming=True)
-    assert asked(conditions, Action.RESET)[1] == "it is not latched"
-    take(conditions, [UP])
-    assert asked(conditions, Action.RESET)[1] == "it is still active"
-    take(conditions, [LOW])
-    assert asked(conditions, Action.RESET)[1] == "it must be acknowledged first"
-    asked(conditions, Action.ACKNOWLEDGE)
-    assert asked(conditions, Action.RESET)[1] == "it must be confirmed first"
-    asked(conditions, Action.CONFIRM)
-    assert (conditions.alarm_state(0).latched, is_retained(conditions.alarm_state(0))) == (True, True)
-    assert asked(conditions, Action.RESET) == (Transition.RESET, "")
-    assert not is_retained(conditions.alarm_state(0))
-
-
 @pytest.mark.parametrize(
     ("before", "action", "why"),
     [
         ((), Action.ACKNOWLEDGE, "no alarm has been raised"),
         ((UP, Action.ACKNOWLEDGE), Action.ACKNOWLEDGE, "it is acknowledged already"),
-        ((UP,), Action.CONFIRM, "it must be acknowledged first"),
-        ((UP, Action.ACKNOWLEDGE), Action.CONFIRM, "there is nothing to confirm"),
         ((Action.SHELVE,), Action.SHELVE, "it is shelved until it clears already"),
         ((), Action.UNSHELVE, "it is not shelved"),
-        ((Action.SUPPRESS,), Action.SUPPRESS, "it is suppressed already"),
-        ((), Action.UNSUPPRESS, "it is not suppressed"),
         ((Action.OUT_OF_SERVICE,), Action.OUT_OF_SERVICE, "it is out of service already"),
         ((), Action.IN_SERVICE, "it is in service already"),
         ((), Action.NONE, "no action is named"),
     ],
 )
 def test_an_invalid_request_is_refused_in_plain_words_and_changes_nothing(before, action, why):
-    conditions = conditions_of()
+    conditions = AlarmsOfTray(1)
     for event in before:
         if isinstance(event, Action):
             assert asked(conditions, event)[0] != Transition.REFUSED
@@ -169,25 +120,25 @@ def test_an_invalid_request_is_refused_in_plain_words_and_changes_nothing(before
 @pytest.mark.parametrize("duration_ns", [-1, math.nan, 2**63 - 1])
 def test_a_time_that_no_shelving_can_have_is_refused(duration_ns):
     refused = (Transition.REFUSED, "it cannot be shelved for such a time")
-    assert asked(conditions_of(), Action.SHELVE, now_t_ns=5, duration_ns=duration_ns) == refused
+    assert asked(AlarmsOfTray(1), Action.SHELVE, now_t_ns=5, duration_ns=duration_ns) == refused
 
 
 def test_every_fan_asked_about_gets_exactly_one_answer():
-    conditions = conditions_of(fans=2)
-    answers = conditions.request(Action.SUPPRESS, [1, 0, 2, -3], 0)
+    conditions = AlarmsOfTray(2)
+    answers = conditions.request(Action.OUT_OF_SERVICE, [1, 0, 2, -3], 0)
     assert [fan for fan, *_ in answers] == [1, 0, 2, -3]
-    assert [transition for _, transition, _ in answers] == [Transition.SUPPRESSED] * 2 + [Transition.REFUSED] * 2
+    assert [transition for _, transition, _ in answers] == [Transition.OUT_OF_SERVICE] * 2 + [Transition.REFUSED] * 2
 
 
 def test_a_timed_shelving_ends_with_the_first_decision_at_its_time_even_if_nothing_was_judged() -> None:
-    conditions = conditions_of()
+    conditions = AlarmsOfTray(1)
     asked(conditions, Action.SHELVE, now_t_ns=0, duration_ns=3 * STEP_NS)
     assert take(conditions, [LOW] * 6, [True, True, True, False, False, True]) == [(3, UNSHELVED)]
     assert conditions.alarm_state(0).shelved_until_t_ns == 0
 
 
 def test_a_shelved_alarm_is_evaluated_and_emitted_but_not_presented() -> None:
-    conditions = conditions_of()
+    conditions = AlarmsOfTray(1)
     asked(conditions, Action.SHELVE, now_t_ns=0, duration_ns=4 * STEP_NS)
     assert take(conditions, [LOW, LOW, UP]) == [(2, RAISED)]
     assert is_silenced(conditions.alarm_state(0))
@@ -196,25 +147,23 @@ def test_a_shelved_alarm_is_evaluated_and_emitted_but_not_presented() -> None:
 
 
 def test_a_shelving_without_a_time_ends_when_the_alarm_clears() -> None:
-    conditions = conditions_of()
+    conditions = AlarmsOfTray(1)
     asked(conditions, Action.SHELVE)
     assert conditions.alarm_state(0).shelved_until_t_ns == UNTIL_IT_CLEARS_T_NS
     assert take(conditions, [LOW, UP, LOW, UP]) == [(1, RAISED), (2, CLEARED), (2, UNSHELVED), (3, RAISED)]
 
 
-@pytest.mark.parametrize("action", [Action.SUPPRESS, Action.OUT_OF_SERVICE])
-def test_suppressed_or_out_of_service_hides_no_transition_and_presents_nothing(action):
-    conditions = conditions_of()
-    asked(conditions, action)
+def test_out_of_service_hides_no_transition_and_presents_nothing():
+    conditions = AlarmsOfTray(1)
+    asked(conditions, Action.OUT_OF_SERVICE)
     assert take(conditions, [UP]) == [(0, RAISED)]
     assert is_retained(conditions.alarm_state(0)) and is_silenced(conditions.alarm_state(0))
-    back = Action.UNSUPPRESS if action == Action.SUPPRESS else Action.IN_SERVICE
-    asked(conditions, back)
+    asked(conditions, Action.IN_SERVICE)
     assert is_retained(conditions.alarm_state(0)) and not is_silenced(conditions.alarm_state(0))
 
 
 def test_commissioning_is_granted_and_does_not_change_the_alarm():
-    conditions = conditions_of()
+    conditions = AlarmsOfTray(1)
     take(conditions, [UP])
     before = conditions.alarm_state(0)
     assert conditions.request(Action.COMMISSION, [0], 0) == [(0, Transition.COMMISSIONING, "")]
@@ -232,22 +181,17 @@ HISTORIES = st.fixed_dictionaries(
         ),
         "requests": st.dictionaries(
             st.integers(1, LENGTH - 1),
-            st.tuples(st.sampled_from(Action), st.integers(0, 1), st.sampled_from([0, 35, 170])),
+            st.tuples(st.sampled_from(Action), st.integers(0, 1), st.sampled_from([0, 3 * STEP_NS, 17 * STEP_NS])),
             max_size=12,
         ),
     }
 )
-SETTINGS = st.builds(
-    ConditionSettings, latching=st.booleans(), confirming=st.booleans(), data_lost_after_ns=st.just(LOST_NS)
-)
 
 
-@given(HISTORIES, SETTINGS)
+@given(HISTORIES)
 @settings(max_examples=30, deadline=None)
-def test_raised_and_cleared_alternate_and_say_what_was_decided_last(
-    history: dict[str, Any], chosen: ConditionSettings
-) -> None:
-    conditions, found = AlarmsOfTray(2, chosen), list[Any]()
+def test_raised_and_cleared_alternate_and_say_what_was_decided_last(history: dict[str, Any]) -> None:
+    conditions, found = AlarmsOfTray(2), list[Any]()
     for number, (active, judged) in enumerate(zip(history["active"], history["judged"], strict=True)):
         if number in history["requests"]:
             action, fan, duration_ns = history["requests"][number]

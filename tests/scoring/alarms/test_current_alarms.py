@@ -20,7 +20,6 @@ def alarm(
 ) -> Alarm:
     fields: dict[str, Any] = {"fan": 0, "active": True, "severity": Severity.WARNING, "onset_t_ns": 1}
     fields |= {
-        "confirmed": True,
         "residual_rad_s": 0.0,
         "residual_std_rad_s": 0.0,
         "message": f"{transition.name} at {t_ns}",
@@ -60,12 +59,11 @@ def test_who_acknowledged_is_known_from_alarms_that_a_restarted_scorer_republish
 
 def test_states_in_words():
     assert one(alarm()).states() == ["active", "unacknowledged"]
-    over = one(alarm(active=False, acknowledged=True, confirmed=False, latched=True))
-    assert over.states() == ["cleared", "acknowledged", "unconfirmed", "latched"]
-    silenced = one(alarm(shelved_until_t_ns=UNTIL_IT_CLEARS_T_NS, suppressed=True, out_of_service=True))
-    assert silenced.states()[2:] == ["shelved until it clears", "suppressed", "out of service"]
-    never = one(alarm(active=False, severity=Severity.NONE, acknowledged=True, suppressed=True))
-    assert never.states() == ["never raised", "suppressed"]
+    assert one(alarm(active=False, acknowledged=True)).states() == ["cleared", "acknowledged"]
+    silenced = one(alarm(shelved_until_t_ns=UNTIL_IT_CLEARS_T_NS, out_of_service=True))
+    assert silenced.states()[2:] == ["shelved until it clears", "out of service"]
+    never = one(alarm(active=False, severity=Severity.NONE, acknowledged=True, out_of_service=True))
+    assert never.states() == ["never raised", "out of service"]
 
 
 def test_a_machine_gets_it_all_as_json():

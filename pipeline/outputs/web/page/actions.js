@@ -5,14 +5,10 @@ import { learnWhoIAm, me, Refused, send } from "./server.js";
 
 export const ACTIONS = {
   acknowledge: { title: "Acknowledge", about: "I have seen this alarm." },
-  confirm: { title: "Confirm", about: "This alarm is over and has been dealt with." },
   shelve: { title: "Shelve", about: "Hide the fan's alarm for a while.", lasts: true },
   unshelve: { title: "Unshelve", about: "Show the fan's alarm again." },
-  suppress: { title: "Suppress", about: "Hide the fan's alarm until it is unsuppressed." },
-  unsuppress: { title: "Unsuppress", about: "Show the fan's alarm again." },
   out_of_service: { title: "Out of service", about: "The fan is being worked on." },
   in_service: { title: "In service", about: "The fan is back in service." },
-  reset: { title: "Reset", about: "Release the latched alarm." },
   true_alarm: { title: "True alarm", about: "Something was wrong with the fan." },
   false_alarm: { title: "False alarm", about: "Nothing was wrong with the fan. Calibration may learn from it.", needsReason: true },
   commission: { title: "Commission", about: "The fan was replaced or repaired: forget what was learned of it, and end its alarm." },
@@ -21,13 +17,10 @@ const SHELVED_FOR = [["30 minutes", 1800], ["2 hours", 7200], ["8 hours", 28800]
 
 // Those that make sense in the state of an alarm.
 export function possible(alarm) {
-  if (!alarm) return ["out_of_service", "suppress", "commission"];
+  if (!alarm) return ["out_of_service", "commission"];
   return [
     alarm.retained && !alarm.acknowledged ? "acknowledge" : "",
-    alarm.acknowledged && !alarm.confirmed ? "confirm" : "",
-    alarm.latched ? "reset" : "",
     alarm.shelved_until_t_ns ? "unshelve" : "shelve",
-    alarm.suppressed ? "unsuppress" : "suppress",
     alarm.out_of_service ? "in_service" : "out_of_service",
     ...feedbackOn(alarm),
     "commission",

@@ -94,7 +94,7 @@ def test_a_button_acknowledges_where_that_is_accepted():
     button = devices_of(accept=("acknowledge",))["tray1-0"]["components"]["acknowledge"]
     assert button["command_topic"] == "fantwin/hall/tray1/0/request"
     assert json.loads(button["payload_press"])["action"] == "acknowledge"
-    assert "acknowledge" not in devices_of(accept=("confirm",))["tray1-0"]["components"]
+    assert "acknowledge" not in devices_of(accept=("shelve",))["tray1-0"]["components"]
 
 
 def test_sites_and_shards_have_devices_of_their_own():

@@ -36,7 +36,7 @@ def test_raised_worse_acknowledged_and_cleared():
     assert (worse["Severity"], worse["LastSeverity"]) == (900, 500)
     over = after(alarm(), alarm(Transition.CLEARED, 1, active=False))
     assert (over["ActiveState/Id"], over["Retain"]) == (False, True), "until it is acknowledged"
-    done = after(alarm(), alarm(Transition.ACKNOWLEDGED, 1, active=False, acknowledged=True, confirmed=True))
+    done = after(alarm(), alarm(Transition.ACKNOWLEDGED, 1, active=False, acknowledged=True))
     assert done["Retain"] is False
 
 

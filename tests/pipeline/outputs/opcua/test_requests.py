@@ -7,15 +7,15 @@ import pytest
 from fantwin.pipeline.outputs.opcua.requests import FAN_METHODS, METHODS, SHELVING_METHODS, status_of
 from fantwin.schemas.enums import Action, Severity, Transition
 from fantwin.schemas.messages import Alarm
-from fantwin.scoring.alarms.alarm_state import GIVES_FEEDBACK, ConditionSettings, FanCondition
+from fantwin.scoring.alarms.alarm_state import GIVES_FEEDBACK, FanCondition
 from tests.support.site_messages import alarm
 
 NOW_NS = 1_790_000_000_000_000_000
 
 
-def answers(*actions: Action, confirming: bool = True, raised: bool = True, duration_ns: float = 0.0) -> Alarm:
+def answers(*actions: Action, raised: bool = True, duration_ns: float = 0.0) -> Alarm:
     """What a fan's condition answers to the last of several requests."""
-    condition = FanCondition(ConditionSettings(confirming=confirming))
+    condition = FanCondition()
     if raised:
         condition.update(active=True, severity=Severity.ALARM, onset_t_ns=NOW_NS)
     transition = Transition.NONE
@@ -27,9 +27,7 @@ def answers(*actions: Action, confirming: bool = True, raised: bool = True, dura
         active=now.active,
         severity=now.severity,
         acknowledged=now.acknowledged,
-        confirmed=now.confirmed,
         shelved_until_t_ns=now.shelved_until_t_ns,
-        suppressed=now.suppressed,
         out_of_service=now.out_of_service,
     )
 
@@ -43,17 +41,11 @@ A = Action
         ((A.ACKNOWLEDGE,), True, 0, "Good"),
         ((A.ACKNOWLEDGE, A.ACKNOWLEDGE), True, 0, "BadConditionBranchAlreadyAcked"),
         ((A.ACKNOWLEDGE,), False, 0, "BadInvalidState"),
-        ((A.CONFIRM,), True, 0, "BadInvalidState"),
-        ((A.ACKNOWLEDGE, A.CONFIRM), True, 0, "Good"),
-        ((A.ACKNOWLEDGE, A.CONFIRM, A.CONFIRM), True, 0, "BadConditionBranchAlreadyConfirmed"),
         ((A.SHELVE, A.SHELVE), True, 0, "BadConditionAlreadyShelved"),
         ((A.SHELVE,), True, float("inf"), "BadShelvingTimeOutOfRange"),
         ((A.UNSHELVE,), True, 0, "BadConditionNotShelved"),
-        ((A.SUPPRESS, A.SUPPRESS), True, 0, "BadInvalidState"),
-        ((A.UNSUPPRESS,), True, 0, "BadInvalidState"),
         ((A.OUT_OF_SERVICE, A.IN_SERVICE), True, 0, "Good"),
         ((A.IN_SERVICE,), True, 0, "BadInvalidState"),
-        ((A.RESET,), True, 0, "BadInvalidState"),
         ((A.COMMISSION,), True, 0, "Good"),
     ],
 )

@@ -22,7 +22,7 @@ class Table:
     def add(self, fan: int, transition: Transition, **more: Any) -> None:
         self._count += 1
         onset_t_ns = START_NS + fan * 1_000_000_000
-        fields = {"active": True, "severity": Severity.ALARM, "confirmed": True, "t_ns": onset_t_ns, "score": 2.0}
+        fields = {"active": True, "severity": Severity.ALARM, "t_ns": onset_t_ns, "score": 2.0}
         fields |= {"residual_rad_s": 0.0, "residual_std_rad_s": 1.0, "statistic": Statistic.DEVIATION, "message": "so"}
         header = Header("scorer", self._count, "tray1")
         self._book.add(
@@ -54,7 +54,7 @@ def test_active_alarms_come_first_with_cause_and_who_has_seen_them_and_those_ove
     ]
     assert table.text().startswith("#### 2 active, 1 over")
     alarms.add(3, Transition.ACKNOWLEDGED, active=False, acknowledged=True)
-    alarms.add(2, Transition.SUPPRESSED, severity=Severity.WARNING, suppressed=True)
+    alarms.add(2, Transition.OUT_OF_SERVICE, severity=Severity.WARNING, out_of_service=True)
     alarms.add(1, Transition.DATA_LOST, stale=True)
     assert [row.split(" | ")[1] for row in rows(table)] == ["alarm, no data", "warning, silenced"]
 
