@@ -7,14 +7,15 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
+from pydantic import TypeAdapter
 
-from fantwin.schemas.enums import Feedback, Severity, Statistic, Transition
+from fantwin.schemas.enums import Severity, Statistic, Transition
 from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Alarm, Array, Diagnosis, Request
 from fantwin.schemas.units import NS_PER_S
 from fantwin.scoring.alarms.alarm_state import AlarmState, is_listed
 from fantwin.scoring.alarms.alarm_text import AlarmText
-from fantwin.scoring.alarms.alarms_of_tray import AlarmsOfTray, Decided
+from fantwin.scoring.alarms.alarms_of_tray import AlarmsOfTray, Decided, KeptConditions
 from fantwin.scoring.diagnosis.ranked_causes import says_more
 
 AGAIN_AFTER_S = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512)
@@ -190,31 +191,25 @@ class AlarmManager:
 
     def snapshot(self) -> dict[str, Any]:
         """The whole state, as JSON values."""
-        return {
-            "conditions": self._conditions.snapshot(),
-            "due_t_ns": {str(fan): times for fan, times in self._due_t_ns.items()},
-            "stood": self._stood.tolist(),
-            "last_emitted": {str(fan): _to_json(alarm) for fan, alarm in self._last_emitted.items()},
-            "answered": self._answered,
-        }
+        stood = self._stood.tolist()
+        kept = _Kept(self._conditions.kept, self._due_t_ns, stood, self._last_emitted, self._answered)
+        return dict(_KEPT.dump_python(kept, mode="json", exclude_defaults=True))
 
     def restore(self, stored: Mapping[str, Any]) -> None:
-        """Continue from a snapshot of the same number of fans.
+        """Continue from a snapshot of the same number of fans. Nothing has changed if this raises.
 
         Raises:
-            ValueError, KeyError, TypeError, AttributeError: it is not such a snapshot.
+            ValueError, OverflowError: it is not such a snapshot.
         """
-        self._conditions.restore(stored["conditions"])
-        self._due_t_ns = {int(fan): [int(t_ns) for t_ns in times] for fan, times in stored["due_t_ns"].items()}
-        if not all(0 <= fan < self._fans and times for fan, times in self._due_t_ns.items()):
-            raise ValueError("an alarm of a fan that does not exist")
-        self._stood = np.array(stored["stood"], np.bool_)
-        if self._stood.shape != (self._fans,):
+        kept = _KEPT.validate_python(stored)
+        named = {*kept.due_t_ns, *kept.last_emitted, *(alarm.fan for alarm in kept.last_emitted.values())}
+        if not named <= set(range(self._fans)) or not all(kept.due_t_ns.values()):
+            raise ValueError("an alarm of a fan that does not exist, or without times")
+        if len(kept.stood) != self._fans:
             raise ValueError(f"a snapshot of alarms, but not of {self._fans} fans")
-        self._last_emitted = {int(fan): _from_json(alarm) for fan, alarm in stored["last_emitted"].items()}
-        if not all(0 <= fan < self._fans and alarm.fan == fan for fan, alarm in self._last_emitted.items()):
-            raise ValueError("an alarm of a fan that does not exist")
-        self._answered = {str(producer): int(sequence) for producer, sequence in stored["answered"].items()}
+        self._conditions.restore(kept.conditions)
+        self._due_t_ns, self._last_emitted, self._answered = kept.due_t_ns, kept.last_emitted, kept.answered
+        self._stood = np.array(kept.stood)
 
     def _is_new(self, header: Header) -> bool:
         """Return whether a request is not yet answered. A restarted scorer receives again what producers still hold."""
@@ -287,20 +282,15 @@ def _state_fields(state: AlarmState) -> dict[str, Any]:
     return {name: value for name, value in asdict(state).items() if name not in ("acknowledged_by", "comment")}
 
 
-def _to_json(alarm: Alarm) -> dict[str, Any]:
-    """The fields of an alarm."""
-    fields = {name: value for name, value in vars(alarm).items() if name != "header"}
-    return fields | {"causes": [vars(cause) for cause in alarm.causes]}
+@dataclass(frozen=True)
+class _Kept:
+    """What a snapshot keeps of an AlarmManager: its fields, by the same names."""
+
+    conditions: KeptConditions
+    due_t_ns: dict[int, list[int]]
+    stood: list[bool]
+    last_emitted: dict[int, Alarm]
+    answered: dict[str, int]
 
 
-def _from_json(stored: Mapping[str, Any]) -> Alarm:
-    return Alarm(
-        **{
-            **stored,
-            "severity": Severity.known(stored["severity"]),
-            "transition": Transition.known(stored["transition"]),
-            "feedback": Feedback.known(stored["feedback"]),
-            "statistic": Statistic(stored["statistic"]),  # a detector may be added before its name
-            "causes": tuple(Diagnosis(**cause) for cause in stored["causes"]),
-        }
-    )
+_KEPT = TypeAdapter(_Kept)

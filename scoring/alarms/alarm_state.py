@@ -11,11 +11,9 @@ scorer's `AlarmState` and the `Alarm` message carry the same flags; both are acc
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
-from typing import Any, Self
-
-import numpy as np
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 from fantwin.schemas.enums import Action, Feedback, Severity, Transition
 from fantwin.schemas.messages import Alarm
@@ -82,13 +80,23 @@ class AlarmState:
     feedback_reason: str = ""
 
 
+@dataclass(frozen=True)
+class KeptCondition:
+    """What a snapshot keeps of a condition."""
+
+    state: AlarmState = AlarmState()
+    earlier_onsets_t_ns: tuple[int, ...] = ()
+    """onsets of the alarms before the present one, oldest first"""
+
+
 class FanCondition:
     """Alarm of one fan, as a condition of OPC UA Part 9."""
 
-    def __init__(self) -> None:
-        self.alarm_state = AlarmState()
-        self._earlier_onsets_t_ns: tuple[int, ...] = ()
-        """onsets of the alarms before this one, oldest first"""
+    def __init__(self, kept: KeptCondition | None = None) -> None:
+        """Continue from a state; None: an alarm that was never raised."""
+        kept = kept or KeptCondition()
+        self.alarm_state = kept.state
+        self._earlier_onsets_t_ns = kept.earlier_onsets_t_ns
 
     def update(self, *, active: bool, severity: Severity, onset_t_ns: int) -> Sequence[tuple[Transition, AlarmState]]:
         """Process what was decided, on data; returns the transitions, in order.
@@ -201,40 +209,10 @@ class FanCondition:
         self.alarm_state = replace(self.alarm_state, **changed, comment=comment or self.alarm_state.comment)
         return transition, ""
 
-    def snapshot(self) -> dict[str, Any]:
-        """The whole state, as JSON values."""
-        alarm = asdict(self.alarm_state)
-        alarm["severity"] = int(self.alarm_state.severity)
-        alarm["feedback"] = int(self.alarm_state.feedback)
-        if not alarm["feedback"]:  # most alarms have none: it would be a third of the state of a healthy fan
-            del alarm["feedback"], alarm["feedback_by"], alarm["feedback_reason"]
-        earlier = {"earlier_onsets_t_ns": list(self._earlier_onsets_t_ns)} if self._earlier_onsets_t_ns else {}
-        return {**earlier, **alarm}
-
-    @classmethod
-    def restore(cls, stored: Mapping[str, Any]) -> Self:
-        """The condition of a snapshot.
-
-        Raises:
-            KeyError, TypeError, ValueError, OverflowError: it is not a snapshot of a condition.
-        """
-        condition = cls()
-        condition._earlier_onsets_t_ns = tuple(map(_time, stored.get("earlier_onsets_t_ns", ())))
-        condition.alarm_state = AlarmState(
-            active=bool(stored["active"]),
-            severity=Severity.known(stored["severity"]),
-            onset_t_ns=_time(stored["onset_t_ns"]),
-            shelved_until_t_ns=_time(stored["shelved_until_t_ns"]),
-            acknowledged=bool(stored["acknowledged"]),
-            out_of_service=bool(stored["out_of_service"]),
-            stale=bool(stored["stale"]),
-            acknowledged_by=str(stored["acknowledged_by"]),
-            comment=str(stored["comment"]),
-            feedback=Feedback.known(stored.get("feedback", 0)),
-            feedback_by=str(stored.get("feedback_by", "")),
-            feedback_reason=str(stored.get("feedback_reason", "")),
-        )
-        return condition
+    @property
+    def kept(self) -> KeptCondition:
+        """The whole state."""
+        return KeptCondition(self.alarm_state, self._earlier_onsets_t_ns)
 
     def _own_onset(self) -> tuple[int, ...]:
         """The onset of the present occurrence, if an alarm was raised."""
@@ -285,7 +263,3 @@ class FanCondition:
             Action.NONE: ((True, "no action is named"),),
         }
         return next((reason for applies, reason in reasons.get(action, unknown) if applies), "")
-
-
-def _time(value: Any) -> int:
-    return int(np.int64(value))

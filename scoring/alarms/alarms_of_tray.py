@@ -6,15 +6,20 @@ stale.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from fantwin.schemas.enums import Action, Severity, Transition
 from fantwin.schemas.messages import Array
-from fantwin.scoring.alarms.alarm_state import DATA_LOST_AFTER_NS, UNTIL_IT_CLEARS_T_NS, AlarmState, FanCondition
+from fantwin.scoring.alarms.alarm_state import (
+    DATA_LOST_AFTER_NS,
+    UNTIL_IT_CLEARS_T_NS,
+    AlarmState,
+    FanCondition,
+    KeptCondition,
+)
 from fantwin.scoring.column_state import NEVER_NS
 
 
@@ -41,6 +46,15 @@ class Decided:
     """start of the fault of an active alarm"""
     every_ns: int
     """time between two decisions"""
+
+
+@dataclass(frozen=True)
+class KeptConditions:
+    """What a snapshot keeps of the conditions of a tray."""
+
+    fans: list[KeptCondition]
+    judged_t_ns: list[int]
+    """time when each was judged last"""
 
 
 class AlarmsOfTray:
@@ -118,27 +132,22 @@ class AlarmsOfTray:
             condition.discard(keep_silenced=keep_silenced)
         self._refresh_all()
 
-    def snapshot(self) -> dict[str, Any]:
-        """The whole state, as JSON values."""
-        return {
-            "fans": [condition.snapshot() for condition in self._conditions],
-            "judged_t_ns": self._judged_t_ns.tolist(),
-        }
+    @property
+    def kept(self) -> KeptConditions:
+        """The whole state."""
+        return KeptConditions([condition.kept for condition in self._conditions], self._judged_t_ns.tolist())
 
-    def restore(self, snapshot: Mapping[str, Any]) -> None:
-        """Continue from a snapshot. Nothing has changed if this raises.
+    def restore(self, kept: KeptConditions) -> None:
+        """Continue from a state. Nothing has changed if this raises.
 
         Raises:
-            ValueError: it is not a snapshot of alarm conditions, or one of another number of fans.
+            ValueError, OverflowError: it is one of another number of fans, or of impossible times.
         """
-        try:
-            conditions = [FanCondition.restore(each) for each in snapshot["fans"]]
-            judged_t_ns = np.array(snapshot["judged_t_ns"], np.int64)
-        except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as error:
-            raise ValueError(f"not a snapshot of alarm conditions: {error!r}") from error
-        if not len(conditions) == len(judged_t_ns) == len(self._conditions):
-            raise ValueError(f"a snapshot of {len(conditions)} fans, here are {len(self._conditions)}")
-        self._conditions, self._judged_t_ns = conditions, judged_t_ns
+        if not len(kept.fans) == len(kept.judged_t_ns) == len(self._conditions):
+            raise ValueError(f"a snapshot of {len(kept.fans)} fans, here are {len(self._conditions)}")
+        np.array([fan.state.shelved_until_t_ns for fan in kept.fans], np.int64)  # raises
+        self._judged_t_ns = np.array(kept.judged_t_ns, np.int64)
+        self._conditions = [FanCondition(fan) for fan in kept.fans]
         self._refresh_all()
 
     def _refresh_all(self) -> None:

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from pydantic import TypeAdapter
 
 from fantwin.schemas.blocks import cut
 from fantwin.schemas.codec import decode, encode
@@ -23,7 +24,7 @@ from fantwin.schemas.messages import Alarm, Prediction, Score, ScorerSnapshot
 from fantwin.schemas.standstill import Standstill
 from fantwin.schemas.tacho import Tacho
 from fantwin.scoring.alarms.alarm_state import DATA_LOST_AFTER_NS
-from fantwin.scoring.alarms.alarms_of_tray import AlarmsOfTray, Decided
+from fantwin.scoring.alarms.alarms_of_tray import AlarmsOfTray, Decided, KeptConditions
 from fantwin.scoring.model.saved import as_json, from_json
 from fantwin.scoring.standing.against_command import AgainstCommand
 from fantwin.stages.scorer import RESTORE_ERRORS, ScorerCore
@@ -135,7 +136,18 @@ def scorer(items: Callable[[], list[Any]], **settings: Any) -> Kind:
 
 
 SCORERS = {"scorer": scorer(eventful), "scorer over days": scorer(days)}
+KEPT = TypeAdapter(KeptConditions)
 STANDSTILL = Standstill(turning_command=20.0, standing_below_rad_s=50.0, off_command=0.0, start_s=1.0, coast_s=4.0)
+
+
+class Conditions(AlarmsOfTray):
+    """Alarm conditions, with a snapshot as JSON."""
+
+    def snapshot(self) -> dict[str, Any]:
+        return dict(KEPT.dump_python(self.kept, mode="json", exclude_defaults=True))
+
+    def restore(self, kept: Any) -> None:
+        super().restore(KEPT.validate_python(kept))
 
 
 class Against:
@@ -156,7 +168,7 @@ class Against:
 
 
 PARTS = {
-    "alarm conditions": Kind(AlarmsOfTray, decisions, lambda one, item: repr(one.update(item))),
+    "alarm conditions": Kind(Conditions, decisions, lambda one, item: repr(one.update(item))),
     "fans against their command": Kind(Against, stops, Against.take, state=lambda one: None),
 }
 KINDS = SCORERS | PARTS

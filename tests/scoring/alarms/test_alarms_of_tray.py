@@ -112,9 +112,9 @@ def test_an_invalid_request_is_refused_in_plain_words_and_changes_nothing(before
             assert asked(conditions, event)[0] != Transition.REFUSED
         else:
             take(conditions, [event])
-    kept = conditions.snapshot()
+    kept = conditions.kept
     assert asked(conditions, action) == (Transition.REFUSED, why)
-    assert conditions.snapshot() == kept
+    assert conditions.kept == kept
 
 
 @pytest.mark.parametrize("duration_ns", [-1, math.nan, 2**63 - 1])
@@ -197,10 +197,9 @@ def test_raised_and_cleared_alternate_and_say_what_was_decided_last(history: dic
             action, fan, duration_ns = history["requests"][number]
             found += conditions.request(action, [fan], STEP_NS * (number - 1), duration_ns, "Ann")
         found += conditions.update(decided(number, active, judged))
-    snapshot = conditions.snapshot()
     for fan in (0, 1):
         events = [each for each in found if isinstance(each, AlarmEvent) and each.fan == fan]
         turns = [each.transition for each in events if each.transition in (RAISED, CLEARED)]
         assert turns == [CLEARED if i % 2 else RAISED for i in range(len(turns))]
         judged = [a[fan] for a, j in zip(history["active"], history["judged"], strict=True) if j[fan]]
-        assert snapshot["fans"][fan]["active"] == bool(judged and judged[-1])
+        assert conditions.alarm_state(fan).active == bool(judged and judged[-1])
