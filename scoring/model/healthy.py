@@ -16,8 +16,8 @@ With w the speed, w' its rate, both as the twin predicts them, a healthy fan in 
     u           share                the wandering of the speed: an Ornstein-Uhlenbeck process over seconds
     f           share                what a fault takes: 0, and a random walk while there is an alarm
     e           rad/s                part of a pulse that a count misses; the next count has it, if it adjoins. Where
-                                     samples leave out windows, the error of a count, y = mean of x - late w' - e: while
-                                     the count stays the same its windows may begin at the same phase, and so does e
+                                     samples leave out windows, the error of a count, y = mean of x - late w' - e: what
+                                     two counts in a row have in common of it follows from how far counts differ
     x, mean     rad/s                deviation of the rotor at the end of the bin, and its mean over the bin
     q           rad/s                s as the torque balance shows it, which passes the filter of the balance
 
@@ -61,6 +61,12 @@ BOTH_BUT_NOT = np.array([[1.0], [-1.0]])
 """signs of the outer products in `update`: the covariance of two states that learn nothing is not reduced"""
 UNSEEN_S = 100.0
 """time constant of the unseen error: how heat and supply act there is not known, either"""
+MISSED = 1.0 / 6.0
+"""variance of the error of a count, pulses, where its window begins at any phase"""
+UNRELATED = 2.0 * MISSED
+"""mean square of the difference of two counts, pulses, whose errors are not related"""
+TURNS = 8.0
+"""number of counts over which their differences are averaged"""
 SLOWEST_RAD_S = 10.0
 """lowest speed by which an error in rad/s is divided to make it a share"""
 
@@ -86,7 +92,7 @@ class Innovation:
 class HealthyFans(Saved):
     """The filter, all fans as columns of one state: mean (fans, STATES) and covariance (fans, STATES, STATES)."""
 
-    KEPT = ("mean", "_has_begun")
+    KEPT = ("mean", "_has_begun", "_turns", "_before_rad_s")
 
     def __init__(self, fans: Fans, priors: Priors, bin_s: float, period_s: float) -> None:
         """Begin with the priors. period_s: of the samples."""
@@ -112,8 +118,12 @@ class HealthyFans(Saved):
         self.noise[:, AGE] = priors.ageing_per_sqrt_h**2 * bin_s / 3600.0
         self.noise[:, WANDER] = priors.wander**2 * (1.0 - self.kept[:, WANDER - AIR] ** 2)
         self.noise[:, AIR] = priors.air**2 * (1.0 - self.kept[:, 0] ** 2)
-        self._lasts = _lasts(fans, period_s)
-        """(fans,) true where samples leave out windows, so that the error of a count lasts as long as the count"""
+        self._skips = _skips(fans, period_s)
+        """(fans,) true where samples leave out windows of the tacho"""
+        self._turns = np.full(count, UNRELATED)
+        """(fans,) mean square of the difference of two counts in a row, pulses, over the last TURNS of them"""
+        self._before_rad_s = np.zeros(count)
+        """(fans,) deviation of the last reading from the free run"""
         self._missed = _missed(fans, priors, period_s)
         self._adjoins = fans.adjoins & (fans.held_s > 0.75 * bin_s)
         """(fans,) true where each count begins where the one before ended, and no bin contains two"""
@@ -129,14 +139,16 @@ class HealthyFans(Saved):
         """A copy for some fans, (n,) by number."""
         copied = HealthyFans(self.fans.of(fans), self._priors, self._bin_s, self._period_s)
         copied.mean, copied.covariance = self.mean[fans], self.covariance[fans]
-        copied._has_begun = self._has_begun[fans]
+        for name in self.KEPT[1:]:
+            setattr(copied, name, getattr(self, name)[fans])
         return copied
 
     def continue_as(self, other: HealthyFans) -> None:
         """Take the states of the first fans from another of fewer fans."""
         first = slice(len(other.mean))
-        self.mean[first], self.covariance[first] = other.mean, other.covariance
-        self._has_begun[first] = other._has_begun
+        self.covariance[first] = other.covariance
+        for name in self.KEPT:
+            getattr(self, name)[first] = getattr(other, name)
 
     def arrays(self) -> dict[str, Array]:
         """See Saved. Half of a covariance is the other half."""
@@ -201,10 +213,10 @@ class HealthyFans(Saved):
         walked = np.minimum(lags + (p.lag_s**2 * moved)[:, np.newaxis], (2.0 * p.lag_s) ** 2)
         np.maximum(lags, walked, out=lags)
         self._follow(now)
-        self._remembers = np.where(self._lasts, ~now.changes, self._adjoins).astype(np.float64)
+        self._remembers = np.where(self._skips, self._common(now), self._adjoins)
         covariance[:, COUNT] *= self._remembers[:, np.newaxis]
         covariance[:, :, COUNT] *= self._remembers[:, np.newaxis]
-        covariance[:, COUNT, COUNT] += (1.0 - self._remembers) * self._missed
+        covariance[:, COUNT, COUNT] += (1.0 - np.square(self._remembers)) * self._missed
         with_states = self.tends @ covariance
         own = with_states @ self.tends.swapaxes(1, 2)
         self._of_balance = np.square(self.fans.balance_noise / self.fans.slope(now.speed_rad_s))
@@ -224,6 +236,24 @@ class HealthyFans(Saved):
         states[:, FOLLOWING] = self.tends.astype(states.dtype, copy=False) @ states
         states[:, COUNT] *= self._holds[:, np.newaxis]
 
+    def _common(self, now: Inputs) -> Array:
+        """Return the share of the error of the last count that the present one has, (fans,), where samples leave out
+        windows.
+
+        A count of a speed that makes p of a pulse more than whole ones errs by -p or 1 - p. If two counts in a row
+        differ with the probability c, their errors correlate by 1 - c / (2 p (1 - p)). So they do not where windows
+        begin at any phase, and fully where a fan makes whole pulses between two samples.
+        """
+        pulse = np.where(self._skips, self.fans.pulse_rad_s, np.inf)
+        turned = np.minimum(np.square((now.deviation_rad_s - self._before_rad_s) / pulse), 1.0)
+        known = now.readings > 0
+        correlation = (1.0 - self._turns / UNRELATED).clip(0.0)
+        # a count that stays while the speed moves errs by as much more
+        share = np.sqrt((np.square(correlation) - turned / MISSED).clip(0.0)) * ~now.changes
+        self._turns = np.where(known, self._turns + (turned - self._turns) / TURNS, self._turns)
+        self._before_rad_s = np.where(known, now.deviation_rad_s, self._before_rad_s)
+        return np.where(known, share, 1.0)
+
     def _follow(self, now: Inputs) -> None:
         """Set how rotor, balance and tacho follow the steady speed of the fan."""
         fans, speed, tends, follows = self.fans, now.speed_rad_s, self.tends, self.follows
@@ -231,7 +261,7 @@ class HealthyFans(Saved):
         follows[:, 0], follows[:, 1] = -np.expm1(-decay), self._filters
         follows[:, 2] = 1.0 - follows[:, 0] / decay  # the mean over the bin
         is_new = now.is_new
-        self._holds = 1.0 - ((is_new | now.ends) & ~self._lasts)
+        self._holds = 1.0 - ((is_new | now.ends) & ~self._skips)
         begins = is_new & ~self._has_begun
         if begins.any():
             follows[begins] = 1.0
@@ -254,7 +284,7 @@ class HealthyFans(Saved):
         with_states = self.covariance[self._rows, shown]
         white = np.square(fans.noise_rad_s) / np.maximum(now.readings, 1.0)
         white += np.square(p.half_range * now.half_range_rad_s) + np.square(fans.timing_s * now.rate_rad_s2)
-        missed = np.where(now.is_balance | self._lasts, 0.0, self._missed)
+        missed = np.where(now.is_balance | self._skips, 0.0, self._missed)
         of_balance = p.balance**2 * self._of_balance + np.square(p.balance_time_s * now.moves_rad_s2)
         white = np.where(now.is_balance, of_balance, white + missed)
         variance = with_states[self._rows, shown] + white
@@ -273,14 +303,14 @@ class HealthyFans(Saved):
         self.covariance -= halves @ np.multiply(halves.swapaxes(1, 2), BOTH_BUT_NOT, order="C")
 
 
-def _lasts(fans: Fans, period_s: float) -> Array:
+def _skips(fans: Fans, period_s: float) -> Array:
     return (fans.pulse_rad_s > 0.0) & (fans.held_s < 0.75 * period_s)
 
 
 def _missed(fans: Fans, p: Priors, period_s: float) -> Array:
     """Variance of the part of a pulse that a count misses, (fans,); of two such parts where they are not related."""
-    of_both = np.square(fans.pulse_rad_s) / 6.0
-    return np.where(_lasts(fans, period_s), of_both, np.square(p.count * fans.pulse_rad_s) / 12.0)
+    of_both = MISSED * np.square(fans.pulse_rad_s)
+    return np.where(_skips(fans, period_s), of_both, np.square(p.count * fans.pulse_rad_s) / 12.0)
 
 
 def _prior(fans: Fans, p: Priors, period_s: float) -> Array:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.stats import poisson
 
+from fantwin.pipeline.tray_scoring.healthy_twin import HealthyTwin
 from fantwin.schemas.messages import Array
 from fantwin.schemas.tacho import Tacho
 from fantwin.schemas.units import RAD_S_PER_UNIT
@@ -19,6 +20,7 @@ from tests.support.made_bins import PRIORS, MadeFans, plays, with_reading
 from tests.support.scored_blocks import twin_of
 
 DECLARED_S, LASTS_S = 100.0, 150.0
+WINDOW_S = 0.5
 FANS = 20
 SURE = 0.999
 NO_ALARM_S = 1e12
@@ -128,11 +130,25 @@ def test_far_readings_of_a_counting_tacho_agree_where_they_differ_or_last_longer
     assert raised == ([] if raised_s is None else [raised_s])
 
 
+def skipping() -> HealthyTwin:
+    """Fans whose tachos count for WINDOW_S, twice a sample."""
+    return twin_of(FANS, tachos=(Tacho(kind="count", window_s=WINDOW_S),))
+
+
+def test_where_samples_leave_out_windows_a_count_weighs_as_much_as_it_is_frequent() -> None:
+    made = MadeFans(skipping().fans, 1.0, lambda _time_s: 100.0, seed=1)
+    decision, pulse_rad_s = made.decision(86400.0), np.pi / WINDOW_S  # two pulses a turn
+    for number in range(200):
+        is_other = np.full(FANS, number % 5 == 0)
+        one = with_reading(made.next(), np.where(is_other, -0.8, 0.2) * pulse_rad_s)
+        decision.take(replace(one, another=np.full((1, FANS), number % 5 < 2)))
+    assert np.abs(decision.model.expected_rad_s).max() < 0.05 * pulse_rad_s
+
+
 @pytest.mark.parametrize("rpm", [2250.0, 450.0])
 def test_counts_that_err_alike_because_samples_leave_out_windows_raise_nothing_and_a_fault_is_found(rpm: float) -> None:
     """At these speeds a fan makes whole pulses in a second: each window of half a second begins at the same phase."""
-    speed, window_s = rpm * RAD_S_PER_UNIT["rpm"], 0.5
-    fans = twin_of(FANS, tachos=(Tacho(kind="count", window_s=window_s),)).fans
+    speed, window_s, fans = rpm * RAD_S_PER_UNIT["rpm"], WINDOW_S, skipping().fans
     nothing, phase = np.zeros(FANS), np.random.default_rng(1).uniform(size=FANS)
     turning = replace(fans, pulse_rad_s=nothing, noise_rad_s=nothing + 1e-3, timing_s=nothing)
     made = MadeFans(turning, 1.0, lambda _time_s: speed, seed=1, own=0.0)
