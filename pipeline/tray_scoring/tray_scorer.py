@@ -247,7 +247,7 @@ class TrayScorer:
         is_large = self._stands | (np.abs(decision.fault[0]) >= self._alarm_share)
         began_ns = np.where(decision.active, decision.number - decision.onset + 1, 1)
         decided = Decided(
-            one.t_ns,
+            min(one.t_ns, int(item.t_ns[row])),  # a bin ends with its last sample, which is before its end
             judged,
             active,
             np.where(is_large, int(Severity.ALARM), int(Severity.WARNING)),

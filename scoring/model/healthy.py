@@ -18,7 +18,8 @@ With w the speed, w' its rate, both as the twin predicts them, a healthy fan in 
     e           rad/s                part of a pulse that a count misses; the next count has it, if it adjoins. Where
                                      samples leave out windows, the error of a count, y = mean of x - late w' - e: what
                                      two counts in a row have in common of it follows from how far counts differ
-    x, mean     rad/s                deviation of the rotor at the end of the bin, and its mean over the bin
+    x, mean     rad/s                deviation of the rotor at the end of the bin, and its mean over the bin;
+                                     a command that has moved since the last sample may have done so at any time since
     q           rad/s                s as the torque balance shows it, which passes the filter of the balance
 
 The time constant is that of the twin's torque balance, J w' = torque - viscous w - drag w|w| - friction: the deviation
@@ -129,6 +130,9 @@ class HealthyFans(Saved):
         """(fans,) true where each count begins where the one before ended, and no bin contains two"""
         self._remembers = self._adjoins.astype(np.float64)
         """(fans,) 1 where the error of a count is in the next bin's"""
+        self._ahead = np.zeros(count)
+        """(fans,) share of a movement of the command by which a rotor may be ahead of the twin, standard deviation: the
+        command has moved at any time within the period before its sample"""
         self._of_balance = np.zeros(count)
         """(fans,) variance of the noise of the torque balance, as speed"""
         self.tends[:, SHOWN - ROTOR, COUNT] = -1.0
@@ -214,6 +218,7 @@ class HealthyFans(Saved):
         np.maximum(lags, walked, out=lags)
         self._follow(now)
         self._remembers = np.where(self._skips, self._common(now), self._adjoins)
+        variance[:, ROTOR] += np.square(self._ahead * now.command_moved * self.fans.top_rad_s)
         covariance[:, COUNT] *= self._remembers[:, np.newaxis]
         covariance[:, :, COUNT] *= self._remembers[:, np.newaxis]
         covariance[:, COUNT, COUNT] += (1.0 - np.square(self._remembers)) * self._missed
@@ -260,6 +265,7 @@ class HealthyFans(Saved):
         decay = np.maximum(fans.viscous + fans.drag * (now.measured_rad_s + speed), 1e-9) / fans.inertia * self._bin_s
         follows[:, 0], follows[:, 1] = -np.expm1(-decay), self._filters
         follows[:, 2] = 1.0 - follows[:, 0] / decay  # the mean over the bin
+        self._ahead = -np.expm1(-decay * self._period_s / self._bin_s / math.sqrt(12.0))
         is_new = now.is_new
         self._holds = 1.0 - ((is_new | now.ends) & ~self._skips)
         begins = is_new & ~self._has_begun

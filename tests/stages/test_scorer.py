@@ -281,6 +281,14 @@ def test_a_score_carries_all_that_a_viewer_draws_and_a_prediction_that_is_no_num
     assert score.state[4, 0] == FanState.UNKNOWN
 
 
+def test_an_alarm_has_the_time_of_the_sample_that_raised_it_also_where_a_second_has_one_sample() -> None:
+    residual = np.where(np.arange(60)[:, np.newaxis] < 30, 0.0, -150.0)
+    core, blocks = learned(), parts(prediction_of(residual, period_ns=NS_PER_S), range(61))
+    found = ((block, feed(core, [block])[1]) for block in blocks)
+    block, raised = next((block, alarms) for block, alarms in found if alarms)
+    assert [each.t_ns for each in raised] == block.t_ns.tolist()
+
+
 def test_repeated_samples_are_dropped_and_counted() -> None:
     residual = with_step(4.0, 1.0)
     core = learned()
