@@ -1,5 +1,5 @@
-"""The kinds of sources: one row each, and the only place that lists them. Other packages add theirs by entry points of
-the group `fantwin.sources`.
+"""The kinds of sources, and the only place that lists them. Other packages add theirs by entry points of the group
+`fantwin.sources`.
 
 A row holds import strings, so that a process imports the source that its configuration names and no other.
 """
@@ -12,35 +12,14 @@ from typing import Any
 from fantwin.pipeline.plugins import SourceKind, loaded, rows_of_others
 from fantwin.pipeline.sources.source import SampleSource, SourceConfig, SourceContext
 
-SOURCE_KINDS: dict[str, SourceKind] = {
-    "serial": SourceKind(
-        config="fantwin.pipeline.sources.serial.config:SerialConfig",
-        source="fantwin.pipeline.sources.serial.source:SerialSource",
-    ),
-    "mqtt": SourceKind(
-        config="fantwin.pipeline.sources.mqtt.config:MqttConfig",
-        source="fantwin.pipeline.sources.mqtt.source:MqttSource",
-    ),
-    "http": SourceKind(
-        config="fantwin.pipeline.sources.http.config:HttpConfig",
-        source="fantwin.pipeline.sources.http.source:HttpSource",
-    ),
-    "push": SourceKind(
-        config="fantwin.pipeline.sources.push.config:PushConfig",
-        source="fantwin.pipeline.sources.push.source:PushSource",
-    ),
-    "hwmon": SourceKind(
-        config="fantwin.pipeline.sources.hwmon.config:HwmonConfig",
-        source="fantwin.pipeline.sources.hwmon.source:HwmonSource",
-    ),
-    "modbus": SourceKind(
-        config="fantwin.pipeline.sources.modbus.config:ModbusConfig",
-        source="fantwin.pipeline.sources.modbus.source:ModbusSource",
-    ),
-    "redfish": SourceKind(
-        config="fantwin.pipeline.sources.redfish.config:RedfishConfig",
-        source="fantwin.pipeline.sources.redfish.source:RedfishSource",
-    ),
+_OWN = ("serial", "mqtt", "http", "push", "hwmon", "modbus", "redfish")
+"""of each a folder beside this file: `config` has its settings, MqttConfig, and `source` its source, MqttSource"""
+SOURCE_KINDS = {
+    kind: SourceKind(
+        config=f"fantwin.pipeline.sources.{kind}.config:{kind.title()}Config",
+        source=f"fantwin.pipeline.sources.{kind}.source:{kind.title()}Source",
+    )
+    for kind in _OWN
 }
 SOURCE_KINDS |= rows_of_others("fantwin.sources", SourceKind, SOURCE_KINDS)
 

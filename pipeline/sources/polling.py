@@ -15,9 +15,9 @@ from __future__ import annotations
 import math
 import threading
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Protocol
 
 from pydantic import Field
 
@@ -59,53 +59,11 @@ class DeviceError(Exception):
         self.is_lost = is_lost
 
 
-class PolledDevice(Protocol):
-    """Device that is polled. All is called in one thread, but `name`, `settings_to_check` and `check`."""
-
-    @property
-    def name(self) -> str:
-        """Name of the device, for people."""
-        ...
-
-    @property
-    def settings_to_check(self) -> str:
-        """See SampleSource."""
-        ...
-
-    @property
-    def is_writable(self) -> bool:
-        """Return whether it takes commands."""
-        ...
-
-    def connect(self) -> None:
-        """Find it, or open a connection. Raises DeviceError."""
-        ...
-
-    def read(self) -> Reading | Rejected:
-        """Read once, NaN for a value that cannot be read; what cannot be used is `Rejected`, with the reason.
-
-        Raises DeviceError where nothing can be read.
-        """
-        ...
-
-    def write(self, command: tuple[float, ...], set_point: tuple[float, ...]) -> None:
-        """See SampleSource.send. Raises DeviceError."""
-        ...
-
-    def disconnect(self) -> None:
-        """Leave it as it was found. Raises DeviceError, or nothing."""
-        ...
-
-    def check(self) -> list[str]:
-        """Problems that would keep it from being read now, one line each."""
-        ...
-
-
 class _Write:
     """A command on its way to the thread, and what came of it."""
 
-    def __init__(self, command: tuple[float, ...], set_point: tuple[float, ...]) -> None:
-        self.command, self.set_point = command, set_point
+    def __init__(self, command: tuple[float, ...]) -> None:
+        self.command = command
         self.is_done = threading.Event()
         self.failure = ""
         """why the command could not be written; empty if it was"""
@@ -113,12 +71,12 @@ class _Write:
         """its sender still waits for the outcome"""
 
 
-class PollingSource:
-    """A `SampleSource` made of a device that is asked."""
+class PollingSource(ABC):
+    """A `SampleSource` that asks a device. A kind says how to connect, read and write, all called in one thread."""
 
-    def __init__(self, device: PolledDevice, period_s: float) -> None:
-        self.device = device
-        self._period_s = period_s
+    def __init__(self, config: PolledConfig) -> None:
+        self._period_s = config.period_s
+        self._why_no_commands = config.why_no_commands
         self._deliver: Callable[[SourceEvent], None] = lambda _event: None
         self._stopping = False
         self._wake = threading.Condition()
@@ -128,14 +86,37 @@ class PollingSource:
         self._sequence = 0
 
     @property
+    @abstractmethod
     def name(self) -> str:
-        """Name of the device."""
-        return self.device.name
+        """Name of the device, for people."""
 
     @property
+    @abstractmethod
     def settings_to_check(self) -> str:
-        """Settings of the device that may be wrong."""
-        return self.device.settings_to_check
+        """See SampleSource."""
+
+    @abstractmethod
+    def connect(self) -> None:
+        """Find the device, or open a connection. Raises DeviceError."""
+
+    @abstractmethod
+    def read(self) -> Reading | Rejected:
+        """Read once, NaN for a value that cannot be read; what cannot be used is `Rejected`, with the reason.
+
+        Raises DeviceError where nothing can be read.
+        """
+
+    @abstractmethod
+    def disconnect(self) -> None:
+        """Leave the device as it was found. Raises DeviceError, or nothing."""
+
+    def write(self, command: tuple[float, ...]) -> None:
+        """Write commands, NaN where a fan keeps its own. Only where the settings let it. Raises DeviceError."""
+        raise NotImplementedError
+
+    def check(self) -> list[str]:
+        """Problems that would keep it from being read now, one line each."""
+        return []
 
     def start(self, deliver: Callable[[SourceEvent], None]) -> None:
         """Poll in a thread; wait for a device that is not there yet."""
@@ -156,10 +137,12 @@ class PollingSource:
 
         A write that fails after WRITE_WAIT_S is counted as `failed_writes`.
         """
-        write = _Write(command, set_point)
+        if self._why_no_commands:
+            return self._why_no_commands
+        if not all(map(math.isnan, set_point)):
+            return f"{self.name} takes commands, no set-points"
+        write = _Write(command)
         with self._wake:
-            if not self.device.is_writable:
-                return f"{self.name} takes no commands"
             if not self._is_connected or self._stopping:
                 return f"{self.name} is not connected"
             self._writes.append(write)
@@ -169,15 +152,11 @@ class PollingSource:
             write.is_awaited = False
             return write.failure
 
-    def check(self) -> list[str]:
-        """Problems that would keep the device from being read."""
-        return self.device.check()
-
     def _run(self) -> None:
         delay_s, reported = RECONNECT_DELAY_S, ""
         while not self._stopping:
             try:
-                self.device.connect()
+                self.connect()
                 first = self._read()  # connected is what can be read
             except Exception as error:  # noqa: BLE001  a library may raise anything, and no thread may end silently
                 reason = _reason(error)
@@ -202,14 +181,14 @@ class PollingSource:
         for write in writes:
             self._finish(write, "the connection was lost before it was written")
         try:
-            self.device.disconnect()
+            self.disconnect()
         except Exception as error:  # noqa: BLE001
             self._count("failed_writes", f"it could not be left as it was found: {_reason(error)}")
 
     def _read(self) -> Reading | Rejected:
         """A reading with the time of the middle of its request."""
         began_s = time.monotonic()
-        reading = self.device.read()
+        reading = self.read()
         if isinstance(reading, Rejected):
             return reading
         return replace(reading, clock_us=round((began_s + time.monotonic()) / 2.0 * 1e6) % UINT32)
@@ -261,7 +240,7 @@ class PollingSource:
                     return True
                 write = self._writes.pop(0)
             try:
-                self.device.write(write.command, write.set_point)
+                self.write(write.command)
             except Exception as error:  # noqa: BLE001
                 self._finish(write, _reason(error))
             else:

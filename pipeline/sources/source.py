@@ -18,6 +18,7 @@ from pydantic import BaseModel
 
 from fantwin.schemas.channels import FanValues
 from fantwin.schemas.tacho import Tacho
+from fantwin.schemas.units import RAD_S_PER_UNIT
 
 MOST_FANS = 1024
 """fans of a tray: those whose samples come in one reading"""
@@ -113,6 +114,11 @@ class SourceContext:
     """limits of accepted readings, for a source that reports refused ones to their sender; None: not known"""
     run_folder: Path | None = None
     """folder where it may keep files; None: nowhere"""
+
+    @property
+    def units_per_rpm(self) -> float:
+        """One rpm in the speed unit."""
+        return RAD_S_PER_UNIT["rpm"] / RAD_S_PER_UNIT[self.speed_unit]
 
 
 @dataclass(frozen=True, slots=True)

@@ -26,7 +26,7 @@ from fantwin.pipeline.sources.json_samples import (
     parse_samples,
 )
 from fantwin.pipeline.sources.secret_file import read_secret
-from fantwin.pipeline.sources.source import LinkDown, LinkUp, Rejected, SourceContext, SourceEvent
+from fantwin.pipeline.sources.source import LinkDown, LinkUp, ReadingBatch, Rejected, SourceContext, SourceEvent
 from fantwin.pipeline.timebase.host_clock import HOST_CLOCK
 from fantwin.pipeline.timebase.receipt_times import ReceiptTimes
 
@@ -60,12 +60,11 @@ class HttpSource:
         self._token = read_secret(context.folder / config.token_file) if config.token_file else ""
         self._receipts = ReceiptTimes()
         self._changed = threading.Condition()
-        self._waiting: deque[SourceEvent] = deque()
-        """events for acquisition"""
-        self._waiting_samples = 0
+        self._waiting: deque[ReadingBatch] = deque()
+        """samples for acquisition, one in each"""
         self._accepted = self._refused = self._turned_away = 0
         self._stopping = False
-        self._threads: list[threading.Thread] = []
+        self._thread: threading.Thread | None = None
 
     @property
     def name(self) -> str:
@@ -79,21 +78,17 @@ class HttpSource:
         return ""
 
     def start(self, deliver: Callable[[SourceEvent], None]) -> None:
-        """Listen, and deliver what comes, in threads of their own."""
-        self._threads = [
-            threading.Thread(target=self._serve, name="http link", daemon=True),
-            threading.Thread(target=self._deliver_all, args=(deliver,), name="http samples", daemon=True),
-        ]
-        for thread in self._threads:
-            thread.start()
+        """Listen, and deliver what comes, in a thread of its own."""
+        self._thread = threading.Thread(target=self._run, args=(deliver,), name="http samples", daemon=True)
+        self._thread.start()
 
     def stop(self) -> None:
         """Answer what is being asked, deliver what was accepted, then end."""
         with self._changed:
             self._stopping = True
             self._changed.notify_all()
-        for thread in self._threads:
-            thread.join(STOP_LIMIT_S)
+        if self._thread:
+            self._thread.join(STOP_LIMIT_S)
 
     def send(self, command: tuple[float, ...], set_point: tuple[float, ...]) -> str:
         """Send nothing."""
@@ -148,14 +143,13 @@ class HttpSource:
             if why is not None:
                 reasons.append((number, why))
         with self._changed:
-            if self._stopping or self._waiting_samples + len(found) > MOST_WAITING:
+            if self._stopping or len(self._waiting) + len(found) > MOST_WAITING:
                 self._turned_away += len(found)
                 error = "acquisition stops" if self._stopping else "acquisition is behind"
                 status = 503 if self._stopping else 429
                 return _answer(status, {"error": error, "accepted": 0}, {"Retry-After": str(RETRY_AFTER_S)})
             batches = batches_of(found, HOST_CLOCK.now_ns(), self._receipts, byte_count)
             self._waiting += batches  # refused ones, too: acquisition counts them
-            self._waiting_samples += len(batches)
             self._accepted += len(found) - len(reasons)
             self._refused += len(reasons)
             self._changed.notify_all()
@@ -187,50 +181,45 @@ class HttpSource:
                 "accepted": self._accepted,
                 "refused": self._refused,
                 "turned_away": self._turned_away,
-                "waiting": self._waiting_samples,
+                "waiting": len(self._waiting),
             }
 
-    def _deliver_all(self, deliver: Callable[[SourceEvent], None]) -> None:
+    def _run(self, deliver: Callable[[SourceEvent], None]) -> None:
+        """Deliver samples until it is stopped and none waits; try again while it cannot listen."""
+        server: HttpServer | None = None
         while True:
+            if server is None and not self._stopping:
+                server = self._listening(deliver)
             with self._changed:
-                self._changed.wait_for(lambda: self._waiting or self._stopping)
-                if not self._waiting:
-                    return
-                event = self._waiting.popleft()
-            deliver(event)  # waits while acquisition is behind
-            with self._changed:
-                self._waiting_samples -= not isinstance(event, LinkUp | LinkDown)
+                self._changed.wait_for(lambda: self._waiting or self._stopping, None if server else RETRY_S)
+                batch = self._waiting[0] if self._waiting else None
+            if batch is None and self._stopping:
+                break
+            if batch is not None:
+                deliver(batch)  # waits while acquisition is behind
+                with self._changed:
+                    self._waiting.popleft()
+        if server is not None:
+            server.stop()
 
-    def _serve(self) -> None:
-        """Listen until it is stopped; try again while it cannot."""
+    def _listening(self, deliver: Callable[[SourceEvent], None]) -> HttpServer | None:
         from fantwin.pipeline.certificates import server_context  # noqa: PLC0415  slow to import
 
         files = self._files_of_tls()
-        while True:
-            server = None
-            try:
-                tls = server_context(*files) if files else None
-                listening = listen(self._config.host, self._config.port, "source")
-            except UserError as error:
-                self._add(LinkDown(str(error)))
-            else:
-                self._add(LinkUp())
-                server = HttpServer(self.app(), listening, tls, MOST_CONNECTIONS)
-            with self._changed:
-                if self._changed.wait_for(lambda: self._stopping, None if server else RETRY_S):
-                    break
-        if server is not None:
-            server.stop()
+        try:
+            tls = server_context(*files) if files else None
+            listening = listen(self._config.host, self._config.port, "source")
+        except UserError as error:
+            deliver(LinkDown(str(error)))
+            return None
+        server = HttpServer(self.app(), listening, tls, MOST_CONNECTIONS)
+        deliver(LinkUp())
+        return server
 
     def _files_of_tls(self) -> tuple[Path, Path] | None:
         """Certificate and key; None: without TLS."""
         certificate, key, folder = self._config.certificate, self._config.key, self._context.folder
         return (folder / certificate, folder / key) if certificate and key else None
-
-    def _add(self, event: SourceEvent) -> None:
-        with self._changed:
-            self._waiting.append(event)
-            self._changed.notify_all()
 
 
 def _answer(status: int, values: dict[str, Any], headers: dict[str, str] | None = None) -> Response:

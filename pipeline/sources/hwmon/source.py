@@ -10,14 +10,11 @@ process that was killed, the next one finds it manual and would otherwise leave 
 from __future__ import annotations
 
 import errno
-import json
 import math
 import os
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Sequence
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import BaseModel, ValidationError
 
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.files import replace_file
@@ -27,56 +24,24 @@ from fantwin.pipeline.sources.hwmon.tree import ChipFolder, chip_folders, device
 from fantwin.pipeline.sources.polling import DeviceError, PollingSource
 from fantwin.pipeline.sources.source import Reading, Rejected, SourceContext
 from fantwin.schemas.channels import CURRENT, SUPPLY_VOLTAGE, TEMPERATURE
-from fantwin.schemas.units import RAD_S_PER_UNIT
 
 
-@dataclass(frozen=True)
-class FoundPwm:
+class FoundPwm(BaseModel, frozen=True):
     """mode: pwmN_enable, None if there is none. pwm: 0 to 255, None if it could not be read."""
 
     mode: int | None
     pwm: int | None
 
 
-@dataclass(frozen=True)
-class _Found:
-    """Content of the file. chip, device: whose pwms they are."""
+class FoundModes(BaseModel, frozen=True):
+    """Modes of the pwms of a chip before fantwin wrote them, as a file keeps them for a later process.
+
+    The file is there as long as something has to be given back.
+    """
 
     chip: str
     device: str
     pwms: dict[int, FoundPwm]
-
-
-_FOUND = TypeAdapter(_Found)
-
-
-class FoundModes:
-    """Modes of the pwms of a chip before fantwin wrote them, in a file that outlives the process that writes them.
-
-    The file is there as long as something has to be given back. Without a path nothing is kept.
-    """
-
-    def __init__(self, path: Path | None) -> None:
-        self._path = path
-
-    def kept(self, chip: ChipFolder) -> dict[int, FoundPwm]:
-        """Modes that an earlier process has not given back, by the number of the pwm."""
-        try:
-            found = _FOUND.validate_json(self._path.read_bytes()) if self._path else None
-        except (OSError, ValidationError):
-            return {}
-        return found.pwms if found and (found.chip, found.device) == (chip.name, chip.device) else {}
-
-    def keep(self, chip: ChipFolder, pwms: Mapping[int, FoundPwm]) -> None:
-        """Replace what is kept. Raises OSError."""
-        if self._path is None:
-            return
-        replace_file(self._path, json.dumps(_FOUND.dump_python(_Found(chip.name, chip.device, dict(pwms)))).encode())
-
-    def forget(self) -> None:
-        """Note that all was given back. Raises OSError."""
-        if self._path is not None:
-            self._path.unlink(missing_ok=True)
 
 
 MANUAL = 1
@@ -91,17 +56,11 @@ class HwmonSource(PollingSource):
 
     def __init__(self, config: HwmonConfig, context: SourceContext) -> None:
         """Raises UserError if the numbers do not fit the fans of the tray."""
-        super().__init__(HwmonDevice(config, context), config.period_s)
-
-
-class HwmonDevice:
-    """A `PolledDevice`."""
-
-    def __init__(self, config: HwmonConfig, context: SourceContext) -> None:
+        super().__init__(config)
         self._config = config
         self._root = context.folder / config.root
         self._quirks = chip_of(config.chip)
-        self._unit_per_rpm = RAD_S_PER_UNIT["rpm"] / RAD_S_PER_UNIT[context.speed_unit]
+        self._units_per_rpm = context.units_per_rpm
         fans = config.fans or tuple(range(1, context.fans + 1))
         if len(fans) != context.fans:
             raise UserError(f"fans = {context.fans}, and source.fans names {len(fans)}: give the same number")
@@ -111,7 +70,7 @@ class HwmonDevice:
         self._voltages = _of_each_fan("voltages", config.voltages, fans)
         self._currents = _of_each_fan("currents", config.currents, fans)
         self._chip: ChipFolder | None = None
-        self._modes = FoundModes(context.run_folder / f"hwmon-{context.tray}.json" if context.run_folder else None)
+        self._modes_file = context.run_folder / f"hwmon-{context.tray}.json" if context.run_folder else None
         self._before: dict[int, FoundPwm] = {}
         """mode of each pwm before it was written, also by a process that was killed"""
         self._taken_over: set[int] = set()
@@ -128,18 +87,13 @@ class HwmonDevice:
         """Settings that may be wrong."""
         return f"chip = {self._config.chip!r}"
 
-    @property
-    def is_writable(self) -> bool:
-        """Return whether the configuration lets fantwin command the fans."""
-        return self._config.writable
-
     def connect(self) -> None:
         """Find the chip."""
         self._chip = chip = self._find()
-        kept = self._modes.kept(chip)
         # What is not manual any more has been given back, or the driver was loaded again.
         self._taken_over = set()
-        self._before = {number: found for number, found in kept.items() if self._mode(chip, number) in (None, MANUAL)}
+        kept = self._kept_modes(chip).items()
+        self._before = {number: found for number, found in kept if self._mode(chip, number) in (None, MANUAL)}
 
     def read(self) -> Reading | Rejected:
         """Speeds, pwm values and what else is asked for."""
@@ -168,10 +122,8 @@ class HwmonDevice:
             TEMPERATURE: tuple(_temperature_c(chip, number) for number in self._temperatures),
         }
 
-    def write(self, command: tuple[float, ...], set_point: tuple[float, ...]) -> None:
+    def write(self, command: tuple[float, ...]) -> None:
         """Set pwm values, after `pwmN_enable` is manual."""
-        if not all(map(math.isnan, set_point)):
-            raise DeviceError("hwmon fans take commands, no set-points")
         chip = self._connected()
         wanted: dict[int, int] = {}
         for number, value in zip(self._pwms, command, strict=True):
@@ -192,7 +144,7 @@ class HwmonDevice:
         chip, before = self._chip, self._before
         self._chip, self._before = None, {}
         failures = []
-        for number, found in before.items() if chip else ():
+        for number, found in before.items():
             assert chip is not None
             try:
                 if found.mode == MANUAL or found.mode is None:
@@ -203,8 +155,8 @@ class HwmonDevice:
                 failures.append(str(error))
         if failures:
             raise DeviceError("; ".join(failures))
-        if before:  # kept until all of it was given back
-            self._modes.forget()
+        if before and self._modes_file:  # kept until all of it was given back
+            self._modes_file.unlink(missing_ok=True)
 
     def check(self) -> list[str]:
         """Problems before the start: what is not there, or may not be read or written."""
@@ -255,8 +207,7 @@ class HwmonDevice:
     def _connected(self) -> ChipFolder:
         """The chip, if its folder is still that of this chip: a driver that is loaded again may take another number."""
         chip = self._chip
-        if chip is None:
-            raise DeviceError("not connected", is_lost=True)
+        assert chip is not None
         try:
             name = (chip.path / "name").read_text(encoding="utf-8", errors="replace").strip()
         except OSError as error:
@@ -279,7 +230,7 @@ class HwmonDevice:
         # What the chip itself calls faulty is no measurement, but a fan that stands may well be a fault.
         if rpm > 0.0 and _value(chip, f"fan{number}_fault", 1.0) > 0.0:
             return math.nan
-        return rpm * self._unit_per_rpm
+        return rpm * self._units_per_rpm
 
     def _take_over(self, chip: ChipFolder, number: int) -> None:
         if number in self._taken_over:
@@ -292,14 +243,24 @@ class HwmonDevice:
                 pwm = chip.number(f"pwm{number}")
             except OSError:
                 pwm = None
-            self._before[number] = FoundPwm(automatic if has_enable and mode is None else mode, pwm)
-        try:
-            self._modes.keep(chip, self._before)
-        except OSError as error:
-            raise DeviceError(f"the mode of pwm{number} cannot be kept in run_folder: {error.strerror}") from error
+            self._before[number] = FoundPwm(mode=automatic if has_enable and mode is None else mode, pwm=pwm)
+        if self._modes_file:
+            found = FoundModes(chip=chip.name, device=chip.device, pwms=self._before)
+            try:
+                replace_file(self._modes_file, found.model_dump_json().encode())
+            except OSError as error:
+                raise DeviceError(f"the mode of pwm{number} cannot be kept in run_folder: {error.strerror}") from error
         if has_enable and mode != MANUAL:
             _write(chip, enable.name, MANUAL)
         self._taken_over.add(number)
+
+    def _kept_modes(self, chip: ChipFolder) -> dict[int, FoundPwm]:
+        """Modes that an earlier process has not given back, by the number of the pwm."""
+        try:
+            found = FoundModes.model_validate_json(self._modes_file.read_bytes()) if self._modes_file else None
+        except (OSError, ValidationError):
+            return {}
+        return found.pwms if found and (found.chip, found.device) == (chip.name, chip.device) else {}
 
     def _mode(self, chip: ChipFolder, number: int) -> int | None:
         """Content of pwmN_enable; None if there is no such file, or it cannot be read."""

@@ -21,7 +21,6 @@ from fantwin.pipeline.sources.modbus.config import ModbusConfig, ModbusFan, Regi
 from fantwin.pipeline.sources.polling import DeviceError, PollingSource
 from fantwin.pipeline.sources.source import Reading, SourceContext
 from fantwin.schemas.channels import CHANNELS, Channel
-from fantwin.schemas.units import RAD_S_PER_UNIT
 
 if TYPE_CHECKING:
     from pymodbus.client.base import ModbusBaseSyncClient
@@ -31,14 +30,6 @@ MOST_REGISTERS = 120
 TIMEOUT_S = 0.5
 """longest wait for the answer to a request"""
 _FORMATS = {"u16": ">H", "s16": ">h", "u32": ">I", "s32": ">i", "f32": ">f"}
-
-
-class ModbusSource(PollingSource):
-    """A `SampleSource`."""
-
-    def __init__(self, config: ModbusConfig, context: SourceContext) -> None:
-        """Raises UserError if the extra is missing, or the fans are not those of the tray."""
-        super().__init__(ModbusDevice(config, context), config.period_s)
 
 
 @dataclass(frozen=True)
@@ -58,10 +49,12 @@ class _Request:
     count: int
 
 
-class ModbusDevice:
-    """A `PolledDevice`."""
+class ModbusSource(PollingSource):
+    """A `SampleSource`."""
 
     def __init__(self, config: ModbusConfig, context: SourceContext) -> None:
+        """Raises UserError if the extra is missing, or the fans are not those of the tray."""
+        super().__init__(config)
         require("source modbus", "devices", "pymodbus")
         if context.fans != len(config.fan):
             raise UserError(
@@ -69,7 +62,7 @@ class ModbusDevice:
             )
         self._config = config
         self._port = str(context.folder / config.port) if config.port else ""
-        self._unit_per_rpm = RAD_S_PER_UNIT["rpm"] / RAD_S_PER_UNIT[context.speed_unit]
+        self._units_per_rpm = context.units_per_rpm
         self._requests = tuple(_requests(config.fan))
         self._client: ModbusBaseSyncClient | None = None
 
@@ -85,11 +78,6 @@ class ModbusDevice:
         config = self._config
         line = "" if config.host else f'baud = {config.baud}, framing = "{config.framing}", '
         return f"{line}unit and registers"
-
-    @property
-    def is_writable(self) -> bool:
-        """Return whether a fan has a register for commands."""
-        return any(fan.write for fan in self._config.fan)
 
     def connect(self) -> None:
         """Open the connection."""
@@ -110,16 +98,14 @@ class ModbusDevice:
             raise DeviceError(f"the command of fan {[*map(math.isnan, command)].index(True)} cannot be read{why}")
         return Reading(
             command=command,
-            speed=tuple(_value(words, fan.unit, fan.speed) * self._unit_per_rpm for fan in fans),
+            speed=tuple(_value(words, fan.unit, fan.speed) * self._units_per_rpm for fan in fans),
             measured={
                 each.name: _column(words, fans, each) for each in CHANNELS if any(fan.channel(each) for fan in fans)
             },
         )
 
-    def write(self, command: tuple[float, ...], set_point: tuple[float, ...]) -> None:
+    def write(self, command: tuple[float, ...]) -> None:
         """Write commands to the registers that are declared for them."""
-        if not all(map(math.isnan, set_point)):
-            raise DeviceError("modbus fans take commands, no set-points")
         wanted = [(fan, value) for fan, value in zip(self._config.fan, command, strict=True) if not math.isnan(value)]
         for number, (fan, _) in enumerate(wanted):
             if fan.write is None:
@@ -160,7 +146,8 @@ class ModbusDevice:
     def _ask(self, request: _Request, words: dict[_Place, int], refused: list[str]) -> None:
         """Add the words that a request gives, none if the device refuses it."""
         unit, table, address = request.first.unit, request.first.table, request.first.address
-        client = self._connected()
+        client = self._client
+        assert client is not None
         read = client.read_holding_registers if table == "holding" else client.read_input_registers
         answer = self._answer(unit, lambda: read(address, count=request.count, device_id=unit))
         if answer.isError():
@@ -170,7 +157,8 @@ class ModbusDevice:
             words[_Place(unit, table, address + number)] = word
 
     def _write(self, unit: int, register: Register, value: float) -> None:
-        client = self._connected()
+        client = self._client
+        assert client is not None
         number = (value - register.offset) / register.scale
         packed = _packed(register, number)
         answer = self._answer(unit, lambda: client.write_registers(register.address, packed, device_id=unit))
@@ -196,11 +184,6 @@ class ModbusDevice:
         if self._port and not Path(self._port).exists():
             what = "no such port, is it unplugged?"
         return DeviceError(f"{what}; waiting for it", is_lost=True)
-
-    def _connected(self) -> ModbusBaseSyncClient:
-        if self._client is None:
-            raise DeviceError("not connected", is_lost=True)
-        return self._client
 
 
 def _registers(fan: ModbusFan) -> Iterator[Register]:

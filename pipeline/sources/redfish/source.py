@@ -17,7 +17,6 @@ from fantwin.pipeline.sources.polling import DeviceError, PollingSource
 from fantwin.pipeline.sources.redfish.config import RedfishConfig
 from fantwin.pipeline.sources.source import Reading, Rejected, SourceContext
 from fantwin.schemas.channels import TEMPERATURE
-from fantwin.schemas.units import RAD_S_PER_UNIT
 
 if TYPE_CHECKING:
     from sushy.main import Sushy
@@ -31,21 +30,13 @@ class RedfishSource(PollingSource):
     """A `SampleSource`."""
 
     def __init__(self, config: RedfishConfig, context: SourceContext) -> None:
-        """Raises UserError if the extra is missing, or a password would be sent in the clear."""
-        super().__init__(RedfishDevice(config, context), config.period_s)
-
-
-class RedfishDevice:
-    """A `PolledDevice`."""
-
-    is_writable = False
-
-    def __init__(self, config: RedfishConfig, context: SourceContext) -> None:
+        """Raises UserError if the extra is missing."""
+        super().__init__(config)
         require("source redfish", "devices", "sushy")
         self._config = config
         self._fans = context.fans
         self._folder = context.folder
-        self._unit_per_rpm = RAD_S_PER_UNIT["rpm"] / RAD_S_PER_UNIT[context.speed_unit]
+        self._units_per_rpm = context.units_per_rpm
         self._root: Sushy | None = None
         self._chassis: Json = {}
 
@@ -100,13 +91,8 @@ class RedfishDevice:
                 setting="source.command",
             )
         measured = {TEMPERATURE: (self._temperature_c(),) * len(fans)} if self._config.temperature else {}
-        speed = tuple(_rpm(fan) * self._unit_per_rpm for fan in fans)
+        speed = tuple(_rpm(fan) * self._units_per_rpm for fan in fans)
         return Reading(command=command, speed=speed, measured=measured)
-
-    def write(self, command: tuple[float, ...], set_point: tuple[float, ...]) -> None:
-        """Redfish has no standard command."""
-        del command, set_point
-        raise DeviceError("redfish fans take no commands")
 
     def disconnect(self) -> None:
         """Log out."""
@@ -150,8 +136,7 @@ class RedfishDevice:
 
     def _get(self, path: str) -> Json:
         root = self._root
-        if root is None:
-            raise DeviceError("not connected", is_lost=True)
+        assert root is not None
         # The connection of sushy, which knows the fans of the older schema only.
         found = self._asked(lambda: root._conn.get(path).json())
         if not isinstance(found, Mapping):

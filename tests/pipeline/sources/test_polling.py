@@ -11,22 +11,29 @@ from types import SimpleNamespace
 import pytest
 
 from fantwin.pipeline.sources import polling
-from fantwin.pipeline.sources.polling import DeviceError, PollingSource
+from fantwin.pipeline.sources.polling import DeviceError, PolledConfig, PollingSource
 from fantwin.pipeline.sources.source import LinkDown, LinkUp, Reading, ReadingBatch, Rejected, SourceEvent
 from tests.support.running_chain import DEADLINE_S
 
 PERIOD_S = 0.02
 
 
-class Device:
+class Device(PollingSource):
     """Does what a list of actions says, one for each reading; the last one goes on."""
 
-    name, settings_to_check, is_writable = "device", "unit", True
-
-    def __init__(self, *actions: Callable[[], float]) -> None:
+    def __init__(self, *actions: Callable[[], float], period_s: float = PERIOD_S) -> None:
+        super().__init__(PolledConfig.model_construct(period_s=period_s))
         self.actions = list(actions) or [lambda: 1.0]
         self.connected = self.disconnected = 0
         self.written: list[tuple[float, ...]] = []
+
+    @property
+    def name(self) -> str:
+        return "device"
+
+    @property
+    def settings_to_check(self) -> str:
+        return ""
 
     def connect(self) -> None:
         self.connected += 1
@@ -35,16 +42,13 @@ class Device:
         action = self.actions.pop(0) if len(self.actions) > 1 else self.actions[0]
         return Reading((0.5,), (action(),))
 
-    def write(self, command: tuple[float, ...], set_point: tuple[float, ...]) -> None:
+    def write(self, command: tuple[float, ...]) -> None:
         if math.isinf(command[0]):
             raise DeviceError("not allowed")
         self.written.append(command)
 
     def disconnect(self) -> None:
         self.disconnected += 1
-
-    def check(self) -> list[str]:
-        return []
 
 
 def failing(reason: str = "timeout", *, is_lost: bool = False) -> Callable[[], float]:
@@ -66,10 +70,9 @@ def polled(
         if until(events):
             is_there.set()
 
-    source = PollingSource(device, PERIOD_S)
-    source.start(deliver)
+    device.start(deliver)
     assert is_there.wait(limit_s)
-    source.stop()
+    device.stop()
     assert device.connected == device.disconnected, "each connection is left in order"
     return events
 
@@ -151,27 +154,24 @@ def test_polls_that_are_late_are_left_out_and_counted_as_lost() -> None:
 
 def test_commands_are_written_between_polls_and_the_sender_sees_a_refusal(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(polling, "WRITE_WAIT_S", DEADLINE_S)
-    device = Device()
-    source = PollingSource(device, 10.0)
+    source = Device(period_s=10.0)
     assert "not connected" in source.send((0.3,), ())
     up = threading.Event()
     source.start(lambda event: up.set() if isinstance(event, ReadingBatch) else None)
     assert up.wait(DEADLINE_S)
     assert source.send((0.3,), ()) == ""
     assert source.send((math.inf,), ()) == "not allowed"
-    device.is_writable = False
-    assert "takes no commands" in source.send((0.4,), ())
+    assert source.send((), (400.0,)) == "device takes commands, no set-points"
     source.stop()
-    assert device.written == [(0.3,)]
+    assert source.written == [(0.3,)]
 
 
 def test_stop_does_not_wait_for_the_next_poll_and_delivers_nothing_afterwards() -> None:
-    device = Device()
+    source = Device(period_s=30.0)
     events: list[SourceEvent] = []
-    source = PollingSource(device, 30.0)
     source.start(events.append)
     while len(events) < 2:
         time.sleep(0.001)
     source.stop()
-    assert source._thread and not source._thread.is_alive() and device.disconnected == 1
+    assert source._thread and not source._thread.is_alive() and source.disconnected == 1
     assert len(events) == 2

@@ -14,7 +14,7 @@ from fantwin.pipeline.config.loading import parse_config
 from fantwin.pipeline.config.settings import ConfigError
 from fantwin.pipeline.sources.polling import DeviceError
 from fantwin.pipeline.sources.redfish.config import RedfishConfig
-from fantwin.pipeline.sources.redfish.source import RedfishDevice
+from fantwin.pipeline.sources.redfish.source import RedfishSource
 from fantwin.pipeline.sources.source import Reading, Rejected, SourceContext
 from fantwin.schemas.channels import TEMPERATURE
 from tests.support.redfish_server import Controller, redfish_server
@@ -22,18 +22,18 @@ from tests.support.redfish_server import Controller, redfish_server
 SECRET = "correct-horse"
 
 
-def device(url: str, count: int = 2, folder: Path = Path(), **settings: Any) -> RedfishDevice:
+def device(url: str, count: int = 2, folder: Path = Path(), **settings: Any) -> RedfishSource:
     config = RedfishConfig.model_validate({"url": url, **settings})
-    return RedfishDevice(config, SourceContext(count, "rpm", folder))
+    return RedfishSource(config, SourceContext(count, "rpm", folder))
 
 
-def connected(url: str, count: int = 2, folder: Path = Path(), **settings: Any) -> RedfishDevice:
+def connected(url: str, count: int = 2, folder: Path = Path(), **settings: Any) -> RedfishSource:
     made = device(url, count, folder, **settings)
     made.connect()
     return made
 
 
-def reading(made: RedfishDevice) -> Reading:
+def reading(made: RedfishSource) -> Reading:
     found = made.read()
     assert isinstance(found, Reading)
     return found

@@ -10,7 +10,7 @@ import pytest
 from fantwin.pipeline.cli.simulation.simulate import InjectedFaults, tachos_of
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.sources.hwmon.config import HwmonConfig
-from fantwin.pipeline.sources.hwmon.source import HwmonDevice
+from fantwin.pipeline.sources.hwmon.source import HwmonSource
 from fantwin.pipeline.sources.simulated.hwmon import HwmonTree, play_hwmon
 from fantwin.pipeline.sources.source import Reading, SourceContext
 from fantwin.schemas.tacho import Tacho
@@ -40,12 +40,12 @@ def test_a_driver_drives_its_fans_until_they_are_taken_over(tmp_path: Path) -> N
     root, fans = tmp_path / "hwmon", tray()
     tree = HwmonTree(root, "nct6798", 2)
     config = HwmonConfig(chip="nct6798", root=root, writable=True)
-    device = HwmonDevice(config, SourceContext(2, "rpm", Path()))
+    device = HwmonSource(config, SourceContext(2, "rpm", Path()))
     device.connect()
     play_hwmon(fans, tree, _Stepped(100))
     automatic = device.read()
     assert isinstance(automatic, Reading)
-    device.write((255.0, 64.0), ())
+    device.write((255.0, 64.0))
     play_hwmon(fans, tree, _Stepped(400))
     commanded = device.read()
     assert isinstance(commanded, Reading) and commanded.command == (255.0, 64.0)
