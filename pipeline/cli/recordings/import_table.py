@@ -50,8 +50,8 @@ def import_table(
         list[str] | None,
         typer.Option(
             metavar="COLUMN",
-            help="Command column: one for all fans, or one per fan. Repeatable. In a log a field, or one pattern for "
-            "all fans, for example 'actuator_outputs.output[*]'.",
+            help="Command column: one for all fans, or one per fan. Repeatable. Or one pattern for all fans, for "
+            "example 'actuator_outputs.output[*]'.",
         ),
     ] = None,
     speed: Annotated[
@@ -115,15 +115,14 @@ def import_table(
     auxiliary = _channels(channel or ())
     if kind is None:
         tachos = _tachos(tacho or (), len(speed))
-        table = read_table(file, time, command, speed, period=period, auxiliary=auxiliary)
-        notes = [table.assumed] if table.assumed else []
+        table, of_log = read_table(file, time, command, speed, period=period, auxiliary=auxiliary), ()
     else:
         if time or period:
             raise UsageError(f"--time and --period are for tables: a {kind.title} has its own times")
         log = open_log(file, kind)
         table, of_log = read_samples(file, log, command, speed, poles, auxiliary=auxiliary)
-        notes = list(of_log)
         tachos = _tachos(tacho or (), table.fans)
+    notes = list(filter(None, (table.assumed, *of_log)))
     write_table(table, output, tray, tachos)
     hints = tacho_hints(table.t_ns / NS_PER_S, table.speed_rad_s, tachos, range(table.fans))
     fans = "1 fan" if table.fans == 1 else f"{table.fans} fans"

@@ -10,13 +10,12 @@ pandas would replace only the reading of cells, and every installation would nee
 from __future__ import annotations
 
 import csv
-import difflib
 import math
 import re
 import shlex
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import chain, islice
+from itertools import islice
 from pathlib import Path
 from typing import TextIO
 
@@ -24,6 +23,7 @@ import numpy as np
 
 from fantwin.pipeline.errors import UsageError, UserError
 from fantwin.pipeline.sources.tables.cells import DATE_UNIT, NS_PER_UNIT, NumberColumn, TimeColumn
+from fantwin.pipeline.sources.tables.fan_columns import FanColumns, fan_columns, require, with_unit
 from fantwin.schemas.messages import FURTHEST_T_NS, LARGEST_PERIOD_NS, Array
 from fantwin.schemas.units import NS_PER_S, RAD_S_PER_UNIT
 
@@ -128,56 +128,53 @@ def read_table(
 
     time: `COLUMN` or `COLUMN:UNIT` with unit s, ms, us, ns or iso (dates; without a time zone they are taken as UTC).
     Without a unit, numbers are seconds and anything else is a date. None: no such column, samples are `period` apart,
-    for example `10ms`. command: one column per fan, or one for all. speed: `COLUMN` or `COLUMN:UNIT`, one per fan,
-    unit rad/s (the default), rpm, hz (revolutions a second) or deg/s. auxiliary: one column for all fans, or one per
-    fan, by the name of what it is (schemas.channels), in its unit.
+    for example `10ms`. command, speed, auxiliary: as for `fan_columns`; the unit of speeds is rad/s (the default), rpm,
+    hz (revolutions a second) or deg/s.
 
     Raises:
         UserError: the file, a column or a unit cannot be used.
     """
-    if not speed or len(command) not in (1, len(speed)):
-        raise UsageError(
-            f"{len(command)} command and {len(speed)} speed columns: give --speed once per fan, and --command "
-            "once for all fans or once per fan"
-        )
     if time and period:
         raise UsageError("--period is for tables without a time column: leave out --time or --period")
     if not (time or period):
         raise UsageError("a table needs --time COLUMN[:UNIT], or --period 10ms if it has no time column")
     rows = _rows(path)
     names = _names(path, next(rows, []))
-    times = TimeColumn(path, *_column(path, time, names, (*NS_PER_UNIT, DATE_UNIT))) if time else None
-    commands = [NumberColumn(path, *_column(path, given, names, ())[:2]) for given in command]
-    found = [_column(path, given, names, RAD_S_PER_TABLE_UNIT) for given in speed]
-    units = {unit for _, _, unit in found}
-    if len(units) > 1:
-        raise UsageError(f"speeds in {', '.join(unit or 'no unit' for _, _, unit in found)}: give all in one unit")
-    unit = found[0][2] or "rad/s"
-    speeds = [NumberColumn(path, name, index) for name, index, _ in found]
-    others = {name: _auxiliary(path, name, given, names, len(speeds)) for name, given in auxiliary.items() if given}
+    times = _time_column(path, time, names) if time else None
+    chosen = fan_columns(path, names, command, speed, auxiliary, RAD_S_PER_TABLE_UNIT)
+    columns = {name: NumberColumn(path, name, names.index(name)) for name in chosen.names}
     count = 0
     for part in _parts(rows, len(names)):
-        for column in (*filter(None, [times]), *commands, *speeds, *chain.from_iterable(others.values())):
+        for column in (*filter(None, [times]), *columns.values()):
             column.add(part)
         count += len(part)
     t_ns, has_time = times.values() if times else _counted_times(count, period or "")
-    command_values = np.column_stack([column.values() for column in commands] * (len(speeds) // len(commands)))
-    speed_rad_s = np.column_stack([column.values() for column in speeds])
-    speed_rad_s *= RAD_S_PER_TABLE_UNIT[unit]
-    assumed = _assumed(times.name if times and times.is_assumed else "", "" if found[0][2] else found[0][0])
-    if times and times.lacks_zone:
-        assumed = "; ".join(filter(None, (assumed, f"dates of {times.name!r} have no time zone: UTC assumed")))
-    of_all = [column.values() for columns in others.values() for column in columns * (len(speeds) // len(columns))]
-    table = clean_samples(path, t_ns, has_time, command_values, np.column_stack([speed_rad_s, *of_all]), unit)
+    values = {name: column.values() for name, column in columns.items()}
+    unit = chosen.unit or "rad/s"
+    table = table_of(path, chosen, values, t_ns, has_time, RAD_S_PER_TABLE_UNIT[unit], unit)
+    return replace(table, assumed=_assumed(times, chosen))
+
+
+def table_of(
+    path: Path,
+    chosen: FanColumns,
+    values: Mapping[str, Array],
+    t_ns: Array,
+    has_time: Array,
+    rad_s_per_unit: float,
+    unit: str,
+) -> Table:
+    """The samples of fans from columns. values: (n,) of each column by its name; a channel without one is NaN. t_ns,
+    has_time, unit: as for `clean_samples`. rad_s_per_unit: of the values of speed."""
+    unknown = np.full(len(t_ns), np.nan)
+    command, speed, *others = (
+        np.column_stack([values[name] if name else unknown for name in names])
+        for names in (chosen.command, chosen.speed, *chosen.others.values())
+    )
+    speed *= rad_s_per_unit
+    table = clean_samples(path, t_ns, has_time, command, np.column_stack([speed, *others]), unit)
     of_speed, *measured = np.split(table.speed_rad_s, len(others) + 1, axis=1)
-    return replace(table, assumed=assumed, speed_rad_s=of_speed, auxiliary=dict(zip(others, measured, strict=True)))
-
-
-def _auxiliary(path: Path, what: str, given: Sequence[str], names: list[str], fans: int) -> list[NumberColumn]:
-    """The columns of one quantity beside command and speed."""
-    if len(given) not in (1, fans):
-        raise UsageError(f"{len(given)} columns of {what} for {fans} fans: give one for all fans, or one per fan")
-    return [NumberColumn(path, *_column(path, each, names, ())[:2]) for each in given]
+    return replace(table, speed_rad_s=of_speed, auxiliary=dict(zip(chosen.others, measured, strict=True)))
 
 
 def _parts(rows: Iterator[list[str]], width: int) -> Iterator[list[list[str]]]:
@@ -220,39 +217,26 @@ def _names(path: Path, header: list[str]) -> list[str]:
     return names
 
 
-def _column(path: Path, given: str, names: list[str], units: Iterable[str]) -> tuple[str, int, str]:
-    """Name and index of a column and its unit, empty if none is given; `given` is NAME or NAME:UNIT."""
-    name, colon, unit = given.rpartition(":")
-    if given in names or not colon:
-        name, unit = given, ""
-    name = name.strip()
-    if name not in names:
-        close = difflib.get_close_matches(name, names, n=3, cutoff=0.5)
-        hint = f"did you mean {' or '.join(map(repr, close))}?" if close else f"it has {', '.join(filter(None, names))}"
-        raise UserError(f"{path}: no column {name!r}; {hint}")
-    if names.count(name) > 1:
-        raise UserError(f"{path}: {names.count(name)} columns are called {name!r}; rename them in its first line")
-    unit, units = unit.strip().lower(), list(units)
-    if unit and unit not in units:
-        known = f"known: {', '.join(units)}" if units else "it has no unit here"
-        raise UsageError(f"{given!r}: unknown unit {unit!r}; {known}")
-    return name, names.index(name), unit
+def _time_column(path: Path, given: str, names: list[str]) -> TimeColumn:
+    name, unit = with_unit(given, names, (*NS_PER_UNIT, DATE_UNIT))
+    require(path, names, name)
+    return TimeColumn(path, name, names.index(name), unit)
 
 
-def _assumed(time: str, speed: str) -> str:
-    """Line on the units that were assumed. time, speed: name of the column without a unit, else empty."""
-    found = [
-        (what, f"{option} {shlex.quote(f'{name}:{other}')}")
-        for name, what, option, other in (
-            (time, "times in s", "--time", "ms"),
-            (speed, "speeds in rad/s", "--speed", "rpm"),
-        )
-        if name
-    ]
-    if not found:
-        return ""
-    assumed, options = (" and ".join(words) for words in zip(*found, strict=True))
-    return f"no unit given, {assumed} assumed; if that is wrong, use for example {options}"
+def _assumed(times: TimeColumn | None, chosen: FanColumns) -> str:
+    """Line on the units and the time zone that were assumed."""
+    found: list[tuple[str, str]] = []
+    if times and times.is_assumed:
+        found.append(("times in s", f"--time {shlex.quote(f'{times.name}:ms')}"))
+    if chosen.assumed:
+        found.append(("speeds in rad/s", chosen.assumed))
+    lines: list[str] = []
+    if found:
+        assumed, options = (" and ".join(words) for words in zip(*found, strict=True))
+        lines.append(f"no unit given, {assumed} assumed; if that is wrong, use for example {options}")
+    if times and times.lacks_zone:
+        lines.append(f"dates of {times.name!r} have no time zone: UTC assumed")
+    return "; ".join(lines)
 
 
 def _counted_times(rows: int, period: str) -> tuple[Array, Array]:

@@ -114,7 +114,10 @@ def test_a_mistake_is_one_line_that_says_what_to_do(tmp_path: Path) -> None:
     assert "an import needs -o, --command and --speed; --list shows the fields" in usage_error_of("import", path)
     for words, error in (
         (("--command", "actuator_output.output[0]", "--speed", speed), "did you mean 'actuator_outputs.output[0]'"),
-        (("--command", "motor[*]", "--speed", speed), "no field matches motor[*]; --list shows them all"),
+        (
+            ("--command", "motor[*]", "--speed", speed),
+            "no column matches motor[*]; it has actuator_outputs.output[0], ",
+        ),
         (("--command", "actuator_outputs.output[*]", "--speed", "esc_status.esc[*].esc_voltage:V"), "unknown unit 'V'"),
         (("--command", "actuator_outputs.output[*]", "--speed", "esc_status.esc[0].esc_rpm"), "pattern for both"),
         (("--command", "actuator_outputs.output[*]", "--speed", speed, "--speed", speed), "once each"),
