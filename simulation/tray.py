@@ -8,13 +8,13 @@ takes them as fast as they are computed, and the same seed gives both the same s
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fantwin.schemas.device_sample import DeviceSample
 from fantwin.simulation.errors import SimulationError
 from fantwin.simulation.excitation import excitation
 from fantwin.simulation.fans import DcFans, FanKind, FourPinTray, simulated_fans
@@ -57,20 +57,6 @@ class TraySettings:
     surroundings: Surroundings = Surroundings()
 
 
-@dataclass(frozen=True)
-class TraySample:
-    """One sample at true time t_s since the start. A lost one still uses up its sequence number."""
-
-    t_s: float
-    clock_us: int
-    sequence: int
-    command: Array
-    speed_rad_s: Array
-    lost: bool
-    auxiliary: Mapping[str, Array]
-    """(fans,) what is measured beside command and speed, by the name of its column"""
-
-
 class SimulatedTray:
     """Gives samples: `due_s` says when the next one is measured, `take` measures it.
 
@@ -107,7 +93,7 @@ class SimulatedTray:
         """Time of the next sample, s since the start; None after the last."""
         return self._due_s if self._count / self.settings.rate_hz < self.settings.duration_s else None
 
-    def take(self) -> TraySample:
+    def take(self) -> DeviceSample:
         """Advance the fans to the next sample and measure it."""
         t_s, step_s = self._due_s, self._due_s - self._t_s
         self._turn(t_s, step_s)
@@ -116,14 +102,14 @@ class SimulatedTray:
         self._plant.set_faults(self.settings.faults, t_s)
         auxiliary = self._surround(t_s)
         self._record_faults(t_s)
-        sample = TraySample(
+        sample = DeviceSample(
             t_s,
             self.settings.clock.at(t_s),
             self._count % 2**32,
             self._command,
             speed_rad_s,
-            bool(self._loss_rng.random() < self.settings.lost),
             auxiliary,
+            lost=bool(self._loss_rng.random() < self.settings.lost),
         )
         self._count += 1
         self._due_s = self._next_due_s()

@@ -18,6 +18,7 @@ import numpy as np
 from fantwin.pipeline.bus.publisher import Publisher
 from fantwin.pipeline.bus.session import Bus
 from fantwin.schemas.codec import decode, encode, type_name
+from fantwin.schemas.device_sample import DeviceSample
 from fantwin.schemas.enums import StageStatus
 from fantwin.schemas.header import Header
 from fantwin.schemas.health import Health, Output
@@ -25,7 +26,7 @@ from fantwin.schemas.messages import Raw, Score
 from fantwin.schemas.topics import ALL_TRAYS, BY_NAME, health_key, tray_key
 from fantwin.schemas.units import NS_PER_S
 from fantwin.simulation.faults import Fault
-from fantwin.simulation.tray import SimulatedTray, TraySample, TraySettings
+from fantwin.simulation.tray import SimulatedTray, TraySettings
 
 SITE, PRODUCER, FANS, RATE_HZ = "fleet", "feed-1", 8, 100
 FAULT_S, PERIOD_S = 6.0, 10.0
@@ -167,7 +168,7 @@ class NewestScores:
         self._newest_ns[tray] = max(newest_ns, self._newest_ns.get(tray, 0))
 
 
-def _raws(tray: str, samples: Sequence[TraySample], epoch_ns: int, length: int) -> Iterator[Raw]:
+def _raws(tray: str, samples: Sequence[DeviceSample], epoch_ns: int, length: int) -> Iterator[Raw]:
     for sequence, first in enumerate(range(0, len(samples), length)):
         block = samples[first : first + length]
         t_ns = [epoch_ns + round((sample.t_s - samples[0].t_s) * NS_PER_S) for sample in block]
@@ -182,6 +183,6 @@ def _raws(tray: str, samples: Sequence[TraySample], epoch_ns: int, length: int) 
         )
 
 
-def _samples(tray: SimulatedTray) -> Iterator[TraySample]:
+def _samples(tray: SimulatedTray) -> Iterator[DeviceSample]:
     while tray.due_s() is not None:
         yield tray.take()

@@ -10,7 +10,8 @@ import numpy as np
 
 from fantwin.pipeline.recordings.reading import TACHO_KEY
 from fantwin.pipeline.recordings.writing import RecordingWriter
-from fantwin.pipeline.sources.simulated.device import Device, DeviceSample, PlaybackCounts
+from fantwin.pipeline.sources.simulated.device import Device, PlaybackCounts
+from fantwin.schemas.device_sample import DeviceSample
 from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Raw
 from fantwin.schemas.tacho import INSTANTANEOUS, Tacho, tachos_to_json

@@ -7,11 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from fantwin.schemas.device_sample import DeviceSample
 from fantwin.simulation.errors import SimulationError
 from fantwin.simulation.faults import Fault
 from fantwin.simulation.plant import Surroundings
 from fantwin.simulation.tacho import NoisyTacho, TachoSettings
-from fantwin.simulation.tray import SimulatedTray, TraySample, TraySettings
+from fantwin.simulation.tray import SimulatedTray, TraySettings
 
 ALL = ("supply_voltage_v", "current_a", "temperature_c")
 STILL = TraySettings(
@@ -19,7 +20,7 @@ STILL = TraySettings(
 )
 
 
-def samples(settings: TraySettings, duty: float = 0.7) -> list[TraySample]:
+def samples(settings: TraySettings, duty: float = 0.7) -> list[DeviceSample]:
     tray, found = SimulatedTray(settings), []
     tray.command(np.full(settings.fans, duty))
     while tray.due_s() is not None:
@@ -27,7 +28,7 @@ def samples(settings: TraySettings, duty: float = 0.7) -> list[TraySample]:
     return found
 
 
-def last(settings: TraySettings) -> TraySample:
+def last(settings: TraySettings) -> DeviceSample:
     return samples(settings)[-1]
 
 

@@ -55,9 +55,9 @@ class FileScenario(Section):
     path: Path = Field(description="a text file whose first line names the columns")
     time: str | None = Field(default=None, description="time column[:unit]; s (default), ms, us, ns, iso (dates)")
     period: str | None = Field(default=None, description="time between rows without a time column, such as 10ms")
-    command: tuple[str, ...] = Field(description="command columns: one for all fans, or one for each")
+    command: tuple[str, ...] = Field(min_length=1, description="command columns: one for all fans, or one for each")
     speed: tuple[str, ...] = Field(
-        description="speed columns[:unit], one for each fan; rpm, hz, deg/s, rad/s (default)"
+        min_length=1, description="speed columns[:unit], one for each fan; rpm, hz, deg/s, rad/s (default)"
     )
     channels: dict[str, tuple[str, ...]] = Field(
         default={},

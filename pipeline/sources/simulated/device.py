@@ -17,7 +17,7 @@ import threading
 import time
 import tty
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 
 from fantwin.pipeline.errors import UserError
 from fantwin.schemas import wire
+from fantwin.schemas.device_sample import DeviceSample
 
 LATE_S = 0.02
 """A sample sent this much after its time counts as late."""
@@ -43,25 +44,6 @@ _COUNTER_OF_FAULT = {
     wire.FaultKind.WRONG_FAN_COUNT: "wrong_kind",
 }
 """the counter of a device for each fault of its input; any other fault counts as a bad length"""
-
-
-class DeviceSample(Protocol):
-    """A measurement at t_s, seconds since the device started. A lost one must not be sent."""
-
-    @property
-    def t_s(self) -> float: ...  # noqa: D102
-    @property
-    def clock_us(self) -> int: ...  # noqa: D102
-    @property
-    def sequence(self) -> int: ...  # noqa: D102
-    @property
-    def command(self) -> NDArray[np.float64]: ...  # noqa: D102
-    @property
-    def speed_rad_s(self) -> NDArray[np.float64]: ...  # noqa: D102
-    @property
-    def lost(self) -> bool: ...  # noqa: D102
-    @property
-    def auxiliary(self) -> Mapping[str, NDArray[np.float64]]: ...  # noqa: D102  by the names of schemas.channels
 
 
 class Device(Protocol):
@@ -216,6 +198,11 @@ class PlaybackCounts:
     bytes_unread: int = 0
     """sent, but unread when the line was closed"""
 
+    def note_lateness(self, lateness_s: float) -> None:
+        """A sample is sent this much after its time."""
+        self.samples_late += lateness_s > LATE_S
+        self.worst_lateness_s = max(self.worst_lateness_s, lateness_s)
+
 
 def wait_for_reader(line: PseudoTerminal, protocol: wire.Protocol, stop: threading.Event) -> None:
     """Return when a reader takes what is sent, or when `stop` is set.
@@ -257,9 +244,7 @@ def play(
         _receive_until(start_s + due_s, device, line, decoder, rad_s_per_unit, stop, played, counters)
         if stop.is_set():
             break
-        lateness_s = time.monotonic() - start_s - due_s
-        played.samples_late += lateness_s > LATE_S
-        played.worst_lateness_s = max(played.worst_lateness_s, lateness_s)
+        played.note_lateness(time.monotonic() - start_s - due_s)
         sample = device.take()
         if sample.lost:
             played.samples_dropped += 1

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fantwin.pipeline.errors import UserError
-from fantwin.pipeline.sources.simulated.device import LATE_S, Device, PlaybackCounts
+from fantwin.pipeline.sources.simulated.device import Device, PlaybackCounts
 from fantwin.schemas.units import RAD_S_PER_UNIT
 
 FULL_SPEED, MANUAL, AUTOMATIC = 0, 1, 2
@@ -144,9 +144,7 @@ def play_hwmon(
     played = PlaybackCounts(start_ns=time.time_ns())
     start_s = time.monotonic()
     while (due_s := device.due_s()) is not None and not stop.wait(max(0.0, start_s + due_s - time.monotonic())):
-        lateness_s = time.monotonic() - start_s - due_s
-        played.samples_late += lateness_s > LATE_S
-        played.worst_lateness_s = max(played.worst_lateness_s, lateness_s)
+        played.note_lateness(time.monotonic() - start_s - due_s)
         before_sample()
         duty, automatic = tree.commands()
         device.release(automatic)

@@ -2,32 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-
 import numpy as np
 from numpy.typing import NDArray
 
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.sources.tables.measured_table import Table
+from fantwin.schemas.device_sample import DeviceSample
 from fantwin.schemas.units import NS_PER_S
 
 
-@dataclass(frozen=True)
-class TableSample:
-    """A row of the table, t_s after the first one played. Its clock is the table's time, its sequence counts rows."""
-
-    t_s: float
-    clock_us: int
-    sequence: int
-    command: NDArray[np.float64]
-    speed_rad_s: NDArray[np.float64]
-    auxiliary: Mapping[str, NDArray[np.float64]] = field(default_factory=dict[str, NDArray[np.float64]])
-    lost: bool = False
-
-
 class TableDevice:
-    """A `Device` (pipeline.sources.simulated.device) that gives the rows of a table and ignores commands."""
+    """A `Device` (pipeline.sources.simulated.device) that gives the rows of a table and ignores commands.
+
+    The clock of a sample is the table's time, its sequence counts rows.
+    """
 
     def __init__(self, table: Table, from_s: float, to_s: float) -> None:
         """Rows with from_s <= t < to_s, t in seconds since the first row of the table.
@@ -55,11 +43,11 @@ class TableDevice:
         """Time of the next row, s since the first; None after the last."""
         return float(self._t_s[self._next]) if self._next < len(self._t_s) else None
 
-    def take(self) -> TableSample:
+    def take(self) -> DeviceSample:
         """The next row."""
         row = self._next
         self._next += 1
-        return TableSample(
+        return DeviceSample(
             float(self._t_s[row]),
             int(self._clock_us[row]),
             row,

@@ -64,40 +64,21 @@ def fan_columns(
     if len(given_units) > 1:
         raise UsageError(f"speeds in {', '.join(unit or 'no unit' for unit in given_units)}: give all in one unit")
     speeds = [name for name, _ in split]
-    patterns = [given for given in (*command, *speeds) if _is_pattern(given, names)]
-    if not patterns:
-        of_fans = dict(enumerate(zip(_of_each(path, names, command, len(speeds), "command"), speeds, strict=True)))
-        for name in speeds:
-            require(path, names, name)
-        left_out: list[str] = []
-    elif len(speed) != 1 or len(command) != 1:
-        raise UsageError(f"{patterns[0]}: with * or {{fan}} give --command and --speed once each")
-    elif not _is_pattern(speeds[0], names):
-        raise UsageError(f"--speed {speeds[0]} is one column, and --command has a pattern: give a pattern for both")
-    else:
-        found = _matches(path, names, speeds[0])
-        if _is_pattern(command[0], names):
-            commands = _matches(path, names, command[0])
-        else:
-            require(path, names, command[0])
-            commands = dict.fromkeys(found, command[0])
-        of_fans = {fan: (commands[fan], found[fan]) for fan in found if fan in commands}
-        left_out = [name for fan, name in (*commands.items(), *found.items()) if fan not in of_fans]
-        if not of_fans:
-            raise UserError(f"{path}: no fan has both {command[0]} and {speeds[0]}")
+    if _is_pattern(command, names) and not _is_pattern(speeds, names):
+        raise UsageError(f"--command {command[0]} is a pattern for all fans: give one as --speed, too")
+    of_speed = _by_fan(path, names, speeds)
+    of_command = _for_fans(path, names, command, of_speed, "command")
+    fans = [fan for fan in of_speed if fan in of_command]
+    if not fans:
+        raise UserError(f"{path}: no fan has both {command[0]} and {speeds[0]}")
+    left_out = [name for fan, name in (*of_command.items(), *of_speed.items()) if fan not in fans]
     more = f" and {len(left_out) - 3} more" if len(left_out) > 3 else ""
     note = f"left out, because only one of command and speed is there: {', '.join(left_out[:3])}{more}"
-    others: dict[str, tuple[str, ...]] = {}
-    for channel, given in auxiliary.items():
-        if len(given) == 1 and _is_pattern(given[0], names):
-            matching = _matches(path, names, given[0])
-            others[channel] = tuple(matching.get(fan, "") for fan in of_fans)
-        else:
-            others[channel] = _of_each(path, names, given, len(of_fans), channel)
+    others = {channel: _for_fans(path, names, given, fans, channel) for channel, given in auxiliary.items()}
     return FanColumns(
-        command=tuple(name for name, _ in of_fans.values()),
-        speed=tuple(name for _, name in of_fans.values()),
-        others=others,
+        command=tuple(of_command[fan] for fan in fans),
+        speed=tuple(of_speed[fan] for fan in fans),
+        others={channel: tuple(found.get(fan, "") for fan in fans) for channel, found in others.items()},
         unit=given_units[0],
         assumed="" if given_units[0] else f"--speed {shlex.quote(f'{speeds[0]}:rpm')}",
         notes=(note,) if left_out else (),
@@ -131,31 +112,36 @@ def require(path: Path, names: Sequence[str], name: str) -> None:
         raise UserError(f"{path}: {names.count(name)} columns are called {name!r}; rename them in its first line")
 
 
-def _is_pattern(given: str, names: Sequence[str]) -> bool:
-    return bool(FAN_NUMBER.search(given)) and given not in names
+def _is_pattern(given: Sequence[str], names: Sequence[str]) -> bool:
+    return len(given) == 1 and given[0] not in names and bool(FAN_NUMBER.search(given[0]))
 
 
-def _of_each(path: Path, names: Sequence[str], given: Sequence[str], fans: int, what: str) -> tuple[str, ...]:
-    """The columns that were given of something, one for each fan."""
-    for name in given:
-        require(path, names, name)
-    if not fans or len(given) not in (1, fans):
+def _for_fans(
+    path: Path, names: Sequence[str], given: Sequence[str], fans: Collection[int], what: str
+) -> dict[int, str]:
+    """The columns of something by fan: one for all fans, one for each, or those of a pattern."""
+    if _is_pattern(given, names):
+        return _by_fan(path, names, given)
+    if len(given) not in (1, len(fans)):
         raise UsageError(
-            f"{len(given)} {what} and {fans} speed columns: give --speed once per fan, and {what} once for all fans or "
-            "once per fan"
+            f"{len(given)} {what} and {len(fans)} speed columns: give --speed once per fan, and {what} once for all "
+            "fans or once per fan"
         )
-    return tuple(given) * (fans // len(given))
+    found = list(_by_fan(path, names, given).values())
+    return dict(zip(fans, found * (len(fans) // len(found)), strict=True))
 
 
-def _matches(path: Path, names: Sequence[str], given: str) -> dict[int, str]:
-    """The columns of a pattern by the number of the fan, in its order."""
-    parts = FAN_NUMBER.split(given)
-    if len(parts) > 2:
-        raise UsageError(f"{given}: only one * or {{fan}} stands for the number of a fan")
-    pattern = re.compile(rf"{re.escape(parts[0])}(\d+){re.escape(parts[1])}")
+def _by_fan(path: Path, names: Sequence[str], given: Sequence[str]) -> dict[int, str]:
+    """The columns by the number of their fan: in the order given, or as a pattern has it."""
+    if not _is_pattern(given, names):
+        for name in given:
+            require(path, names, name)
+        return dict(enumerate(given))
+    before, after = FAN_NUMBER.split(given[0], maxsplit=1)
+    pattern = re.compile(rf"{re.escape(before)}(\d+){re.escape(after)}")
     found = {int(match[1]): name for name in names if (match := pattern.fullmatch(name))}
     if not found:
-        raise UserError(f"{path}: no column matches {given}; {_there_are(names, given)}")
+        raise UserError(f"{path}: no column matches {given[0]}; {_there_are(names, given[0])}")
     return dict(sorted(found.items()))
 
 
@@ -164,5 +150,5 @@ def _there_are(names: Sequence[str], given: str) -> str:
     if close:
         return f"did you mean {' or '.join(map(repr, close))}?"
     known = list(filter(None, names))
-    more = f" and {len(known) - MOST_SHOWN} more; --list shows those of a log" if len(known) > MOST_SHOWN else ""
+    more = " and more; --list shows those of a log" if len(known) > MOST_SHOWN else ""
     return f"it has {', '.join(known[:MOST_SHOWN])}{more}"

@@ -119,8 +119,14 @@ def test_a_mistake_is_one_line_that_says_what_to_do(tmp_path: Path) -> None:
             "no column matches motor[*]; it has actuator_outputs.output[0], ",
         ),
         (("--command", "actuator_outputs.output[*]", "--speed", "esc_status.esc[*].esc_voltage:V"), "unknown unit 'V'"),
-        (("--command", "actuator_outputs.output[*]", "--speed", "esc_status.esc[0].esc_rpm"), "pattern for both"),
-        (("--command", "actuator_outputs.output[*]", "--speed", speed, "--speed", speed), "once each"),
+        (
+            ("--command", "actuator_outputs.output[*]", "--speed", "esc_status.esc[0].esc_rpm"),
+            "give one as --speed, too",
+        ),
+        (
+            ("--command", "actuator_outputs.output[*]", "--speed", speed, "--speed", speed),
+            "give one as --speed, too",
+        ),
         (("--command", "actuator_outputs.output[*]", "--speed", speed, "--time", "t"), "a ULog has its own times"),
     ):
         assert error in error_of("import", path, *words, *out)
