@@ -47,7 +47,6 @@ from fantwin.pipeline.timebase.host_clock import HOST_CLOCK, HostClock
 from fantwin.schemas.channels import CHANNELS
 from fantwin.schemas.health import AcceptedSamples
 from fantwin.schemas.messages import Command, PushedSamples, Raw, StatedTacho
-from fantwin.schemas.tacho import Tacho
 from fantwin.schemas.topics import most_samples
 from fantwin.schemas.units import NS_PER_S, RAD_S_PER_UNIT
 
@@ -95,8 +94,6 @@ class AcquisitionCore(Core):
         self._most_samples = most_samples(tray.fans)
         """samples in a message, however fast a line is"""
         self._stated_tachos = tuple(map(StatedTacho.of, tray.stated_tachos))
-        self._tachos: tuple[Tacho, ...] = ()
-        """tachos that the device itself states"""
         self._commands = DeviceCommands(tray, source)
         self._counts: Counter[str] = Counter()
         self._down_reason: str | None = None
@@ -224,10 +221,6 @@ class AcquisitionCore(Core):
         messages: list[Raw] = []
         samples: list[ReceivedReading] = []
         for batch in block.batches:
-            if batch.tachos != self._tachos:
-                messages += self._message(samples)
-                samples = []
-                self._follow_device(batch.tachos)
             for received in self._samples(batch):
                 if samples and (len(samples) == self._most_samples or received.columns != samples[0].columns):
                     messages += self._message(samples)
@@ -237,12 +230,6 @@ class AcquisitionCore(Core):
 
     def _message(self, samples: Sequence[ReceivedReading]) -> list[Raw]:
         return [raw_message(samples, self._tray, self._stated_tachos)] if samples else []
-
-    def _follow_device(self, tachos: tuple[Tacho, ...]) -> None:
-        """Put what the device itself states into the messages, whatever the configuration says."""
-        self._tachos = tachos
-        stated = tachos[:1] if len(set(tachos)) == 1 else tachos
-        self._stated_tachos = tuple(map(StatedTacho.of, stated or self._tray.stated_tachos))
 
     def _samples(self, batch: ReadingBatch) -> Iterator[ReceivedReading]:
         """The samples that are new and plausible; all others are counted."""

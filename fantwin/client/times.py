@@ -27,11 +27,9 @@ def times_ns(t: Time | Sequence[Time] | NDArray[Any]) -> NDArray[np.int64]:
     Raises:
         TimeOrderError: it is no time, or beyond the year 2116.
     """
-    if isinstance(t, datetime):
-        t = [t]
-    if isinstance(t, Sequence) and t and isinstance(t[0], datetime):
-        return np.array([_date_ns(each) for each in t], np.int64)
     values = np.atleast_1d(np.asarray(t))
+    if values.dtype == object and values.ndim == 1:
+        return np.array([_date_ns(each) for each in values], np.int64)
     if values.dtype.kind not in "iufM" or values.ndim != 1:
         raise TimeOrderError(f"t = {t!r}: give seconds as float, nanoseconds as int, or dates")
     if values.dtype.kind == "M":

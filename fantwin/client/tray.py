@@ -12,6 +12,7 @@ import secrets
 import threading
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 
 from fantwin.client import errors
 from fantwin.client.losses import WITHOUT_SPEED, CountsOfAcquisition, Losses
-from fantwin.client.outbox import Block, Outbox
+from fantwin.client.outbox import Outbox
 from fantwin.client.times import Time, times_ns
 from fantwin.pipeline.acquisition.acquisition_watch import TrayAcquisition
 from fantwin.pipeline.bus.session import Bus
@@ -115,7 +116,7 @@ class Tray:
         self._check_commands(commands)
         if unknown := measured.keys() - CHANNELS_BY_NAME:
             raise TypeError(f"no channel {min(unknown)}; known: {', '.join(CHANNELS_BY_NAME)}")
-        others = {
+        others: dict[str, Any] = {
             name: np.full((len(times), self.fans), values, np.float32)
             if np.ndim(values) == 0
             else self._by_fan(values, len(times), name).astype(np.float32)
@@ -127,7 +128,8 @@ class Tray:
             self._wait_for_room(len(times))
             self._check_times(times)  # another thread may have published meanwhile
             rad_s = speeds * self._rad_s_per_unit
-            self._outbox.add(Block(times, commands, rad_s, self._published, self._line, others))
+            samples = PushedSamples(fans=self.fans, t_ns=times, command=commands, speed_rad_s=rad_s, **others)
+            self._outbox.add(samples, self._line)
             self._published += len(times)
             self._newest_t_ns = int(times[-1]) if len(times) else self._newest_t_ns
             self._wake()
@@ -220,12 +222,8 @@ class Tray:
     def _by_fan(self, values: Values, samples: int, what: str) -> NDArray[np.float64]:
         """(samples, fans) of float64."""
         array, fans = np.array(values, np.float64), self.fans
-        if array.shape == (fans,) and samples == 1:
-            return array[np.newaxis]
-        if array.shape == (samples,) and fans == 1:
-            return array[:, np.newaxis]
-        if array.shape == () and (samples, fans) == (1, 1):
-            return array.reshape(1, 1)
+        if array.ndim < 2 and array.size == samples * fans and 1 in (samples, fans):
+            return array.reshape(samples, fans)
         if array.shape != (samples, fans):
             raise errors.FanCountError(
                 f"tray {self.name}: {what} has shape {array.shape}; {samples} samples of {fans} fans have shape "
@@ -321,35 +319,21 @@ class Tray:
                 if self._stopped:
                     return
                 outbox = self._outbox
-                message: Block | None = None
-                newest_t_ns = 0
                 if is_there and outbox.may_send and outbox.waiting:
-                    message, newest_t_ns = outbox.take()
-                elif not (is_there and outbox.may_send and outbox.sent and time.monotonic() - asked_s > ASK_AGAIN_S):
+                    message = outbox.take()
+                elif is_there and outbox.may_send and outbox.sent and time.monotonic() - asked_s > ASK_AGAIN_S:
+                    asked_s = time.monotonic()
+                    message = PushedSamples(fans=self.fans, first_number=self._published)
+                else:
                     self._changed.wait_for(lambda: self._has_news, WATCH_S)
                     continue
-            if message is None:
-                asked_s = time.monotonic()
-                none = np.zeros((0, self.fans))
-                message = Block(np.zeros(0, np.int64), none, none, self._published, self._line)
-            self._send(message, newest_t_ns)
+            self._send(message)
 
-    def _send(self, block: Block, newest_t_ns: int) -> None:
-        sequence, (samples, fans) = self._publisher.published, block.command.shape
-        payload = encode(
-            PushedSamples(
-                header=Header(self._producer, sequence, self.name),
-                fans=fans,
-                t_ns=block.t_ns,
-                first_number=block.first_number,
-                newest_t_ns=newest_t_ns,
-                command=block.command,
-                speed_rad_s=block.speed_rad_s,
-                **block.others,
-            )
-        )
+    def _send(self, message: PushedSamples) -> None:
+        sequence = self._publisher.published
+        payload = encode(replace(message, header=Header(self._producer, sequence, self.name)))
         with self._changed:
-            self._outbox.add_sent(sequence, samples, len(payload))
+            self._outbox.add_sent(sequence, len(message.t_ns), len(payload))
         self._publisher.put(payload)
 
     def _take_health(self, health: Health) -> bool:

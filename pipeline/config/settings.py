@@ -231,13 +231,13 @@ class TrayConfig(Section):
     @property
     def tachos(self) -> tuple[Tacho, ...]:
         """How the speed is measured, one for all fans or one for each."""
-        return self.tacho or self.source.stated_tachos(self.fans) or INSTANTANEOUS
+        return self.tacho or self.source.stated_tachos or INSTANTANEOUS
 
     @property
     def stated_tachos(self) -> tuple[Tacho, ...]:
         """The same where the source states what it measures, one for all fans if they agree; empty where it does not:
         what its samples then say of themselves is no more than this file does."""
-        if self.source.stated_tachos(self.fans) is None:
+        if not self.source.stated_tachos:
             return ()
         return self.tachos[:1] if len(set(self.tachos)) == 1 else self.tachos
 

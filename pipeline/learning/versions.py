@@ -7,11 +7,10 @@ FOLDER/TRAY-1.onnx     the first version, and so on
 from __future__ import annotations
 
 import fcntl
-import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Literal, TypeAlias
+from typing import IO, Literal, TypeAlias
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -250,12 +249,7 @@ class TwinVersions:
         Raises:
             UserError: another process makes one, or the folder cannot be written.
         """
-        try:
-            self.folder.mkdir(parents=True, exist_ok=True)
-            lock = (self.folder / "learn.lock").open("ab")
-        except OSError as error:
-            raise self._cannot_write(error) from error
-        with lock:
+        with self._lock_file("learn.lock") as lock:
             try:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError as error:
@@ -341,16 +335,16 @@ class TwinVersions:
     @contextmanager
     def _changing(self) -> Iterator[VersionList]:
         """The list, while no other process changes it."""
+        with self._lock_file(f"{LIST_NAME}.lock") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            yield self.read()
+
+    def _lock_file(self, name: str) -> IO[bytes]:
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            descriptor = os.open(self.folder / f"{LIST_NAME}.lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+            return (self.folder / name).open("ab")
         except OSError as error:
             raise self._cannot_write(error) from error
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX)
-            yield self.read()
-        finally:
-            os.close(descriptor)
 
     def _write(self, listed: VersionList) -> None:
         try:

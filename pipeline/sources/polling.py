@@ -21,6 +21,7 @@ from dataclasses import replace
 
 from pydantic import Field
 
+from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.sources.source import (
     LinkDown,
     LinkUp,
@@ -51,7 +52,7 @@ class PolledConfig(SourceConfig, frozen=True):
     period_s: float = Field(default=0.5, gt=0, le=SLOWEST_S, description="time between two readings")
 
 
-class DeviceError(Exception):
+class DeviceError(UserError):
     """A request that failed: one line that says why, and what to do. is_lost: there is no connection any more."""
 
     def __init__(self, reason: str, *, is_lost: bool = False) -> None:
@@ -268,4 +269,4 @@ class PollingSource(ABC):
 def _reason(error: Exception) -> str:
     """Reason of an error in one line."""
     text = " ".join(str(error).split())
-    return text if isinstance(error, DeviceError) else f"unexpected {type(error).__name__}: {text}; waiting for it"
+    return text if isinstance(error, UserError) else f"unexpected {type(error).__name__}: {text}; waiting for it"

@@ -45,11 +45,11 @@ class SourceConfig(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
         """Why `fantwin command` cannot reach the fans, in a few words; empty if it can."""
         return ""
 
-    def stated_tachos(self, fans: int) -> tuple[Tacho, ...] | None:
-        """Tachos of this source, one for all fans or one for each; None if the kind of source does not determine them.
+    @property
+    def stated_tachos(self) -> tuple[Tacho, ...]:
+        """Tachos of this source, one for all fans or one for each; empty if the kind of source does not determine them.
         `tacho` of the [[tray]] overrides them."""
-        del fans
-        return None
+        return ()
 
 
 def too_many_fans(kind: str, fans: int, most: int) -> str:
@@ -164,8 +164,6 @@ class ReadingBatch:
     items: Sequence[Reading | Rejected]
     byte_count: int = 0
     """bytes received, where the source counts them"""
-    tachos: tuple[Tacho, ...] = ()
-    """tachos that the device itself states, one for all fans or one for each; empty where it states none"""
     device_counts: Mapping[str, int] = field(default_factory=dict)
     """the advance of the counters of the device itself, such as that of damaged frames, since the batch before"""
 

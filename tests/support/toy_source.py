@@ -24,8 +24,9 @@ class ToyConfig(SourceConfig, frozen=True):
     speeds: tuple[float, ...]
     average_s: float | None = None
 
-    def stated_tachos(self, fans: int) -> tuple[Tacho, ...] | None:
-        return None if self.average_s is None else (Tacho(kind="average", window_s=self.average_s),) * fans
+    @property
+    def stated_tachos(self) -> tuple[Tacho, ...]:
+        return () if self.average_s is None else (Tacho(kind="average", window_s=self.average_s),)
 
 
 class ToySource:
@@ -36,7 +37,6 @@ class ToySource:
 
     def __init__(self, config: ToyConfig, context: SourceContext) -> None:
         self._config, self._fans = config, context.fans
-        self.says: tuple[Tacho, ...] = ()
         self.sent: list[tuple[tuple[float, ...], tuple[float, ...]]] = []
 
     def start(self, deliver: Callable[[SourceEvent], None]) -> None:
@@ -45,7 +45,7 @@ class ToySource:
             Reading((0.5,) * self._fans, (speed,) * self._fans, sequence=2 * number)
             for number, speed in enumerate(self._config.speeds)
         )
-        deliver(ReadingBatch(NS_PER_S, tuple(readings), tachos=self.says))
+        deliver(ReadingBatch(NS_PER_S, tuple(readings)))
 
     def stop(self) -> None:
         pass

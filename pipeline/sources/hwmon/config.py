@@ -55,8 +55,8 @@ class HwmonConfig(PolledConfig, frozen=True):
         """Commands are written only if `writable` is set."""
         return "" if self.writable else "its source does not have writable = true"
 
-    def stated_tachos(self, fans: int) -> tuple[Tacho, ...] | None:
+    @property
+    def stated_tachos(self) -> tuple[Tacho, ...]:
         """Tachos as the driver of the chip measures, where that is known."""
-        del fans
         chip = chip_of(self.chip)
-        return (chip.tacho,) if chip and chip.tacho else None
+        return (chip.tacho,) if chip and chip.tacho else ()

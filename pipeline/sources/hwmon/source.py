@@ -164,7 +164,7 @@ class HwmonSource(PollingSource):
             chip = self._find()
         except DeviceError as error:
             return [str(error)]
-        found = []
+        found: list[str] = []
         for kind, suffix, numbers in self._files():
             lacking = [number for number in dict.fromkeys(numbers) if number not in chip.numbers(kind, suffix)]
             found += [f"{chip.name} has no {kind}{number}{suffix}: correct {_SETTING[kind]}" for number in lacking]
@@ -187,20 +187,17 @@ class HwmonSource(PollingSource):
         try:
             chips = chip_folders(self._root)
         except OSError as error:
-            raise DeviceError(f"{self._root}: {error.strerror}; correct root", is_lost=True) from error
+            raise DeviceError(f"{self._root}: {error.strerror}; correct root") from error
         found = [chip for chip in chips if chip.is_called(config.chip, config.device)]
         if len(found) > 1:
             devices = ", ".join(repr(device_words(chip, chips)) for chip in found)
-            raise DeviceError(
-                f"{len(found)} chips are called {config.chip}: name one by device = {devices}", is_lost=True
-            )
+            raise DeviceError(f"{len(found)} chips are called {config.chip}: name one by device = {devices}")
         if not found:
             there = ", ".join(dict.fromkeys(chip.name for chip in chips)) or "none"
             of_device = f" with device {config.device}" if config.device else ""
             raise DeviceError(
                 f"no chip is called {config.chip}{of_device} in {self._root}; there are: {there}; load its driver, or "
-                "see `fantwin doctor find`",
-                is_lost=True,
+                "see `fantwin doctor find`"
             )
         return found[0]
 

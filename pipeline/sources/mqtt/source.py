@@ -109,8 +109,13 @@ class MqttSource:
         self._is_refused = False
         """true if the broker has refused the client; it ends the connection next"""
         self._stopping = False
-        self._context = context
-        self._client = self._new_client(config.client_id)
+        self._folder = context.folder
+        self._client = client = new_client(config, context.folder, config.client_id, is_kept=bool(config.client_id))
+        client.on_connect = self._on_connect
+        client.on_connect_fail = self._on_connect_fail
+        client.on_disconnect = self._on_disconnect
+        client.on_subscribe = self._on_subscribe
+        client.on_message = self._on_message
 
     @property
     def name(self) -> str:
@@ -160,18 +165,8 @@ class MqttSource:
     def check(self) -> list[str]:
         """Problems before the start: the broker does not answer, or does not accept this client."""
         # with an id of its own: the broker ends the connection of another client with the same one
-        client = new_client(self._config, self._context.folder)
+        client = new_client(self._config, self._folder)
         return connection_problems(client, self._config, self.name)
-
-    def _new_client(self, client_id: str) -> Client:
-        folder, is_kept = self._context.folder, bool(client_id)
-        client = new_client(self._config, folder, client_id, is_kept=is_kept)
-        client.on_connect = self._on_connect
-        client.on_connect_fail = self._on_connect_fail
-        client.on_disconnect = self._on_disconnect
-        client.on_subscribe = self._on_subscribe
-        client.on_message = self._on_message
-        return client
 
     def _publish(self, topic: str, text: str) -> bool:
         return self._client.publish(topic, text, qos=QOS).rc == 0

@@ -11,7 +11,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from fantwin.pipeline.errors import UserError, refusals
+from fantwin.pipeline.errors import refusals
 from fantwin.pipeline.extras import require
 from fantwin.pipeline.sources.polling import DeviceError, PollingSource
 from fantwin.pipeline.sources.redfish.config import RedfishConfig
@@ -51,15 +51,15 @@ class RedfishSource(PollingSource):
         return "source.fans, source.command"
 
     def connect(self) -> None:
-        """Log in, and find the chassis."""
+        """Log in, and find the chassis. Raises UserError, too, where the password cannot be read."""
         import sushy  # noqa: PLC0415  slow to import
         from sushy.auth import BasicAuth, SessionOrBasicAuth  # noqa: PLC0415
 
         config = self._config
         logging.getLogger("sushy").setLevel(logging.CRITICAL)  # a failure is a line of this source already
-        user, password = config.username, self._password()
+        user, password = config.username, config.password(self._folder)
         if user and config.parts.scheme == "http":
-            raise DeviceError(f"{config.address} would send the password in the clear: use https", is_lost=True)
+            raise DeviceError(f"{config.address} would send the password in the clear: use https")
         # sushy takes 0 for its own number of attempts, and waits between them; the poller tries again by itself
         options: dict[str, Any] = {
             "verify": str(self._folder / config.ca) if config.ca and config.verify else config.verify,
@@ -108,12 +108,6 @@ class RedfishSource(PollingSource):
         """Problems before the start: the password cannot be read. The controller is not asked."""
         return refusals(lambda: self._config.password(self._folder))
 
-    def _password(self) -> str | None:
-        try:
-            return self._config.password(self._folder)
-        except UserError as error:
-            raise DeviceError(str(error), is_lost=True) from error
-
     def _asked(self, request: Any) -> Any:
         """Send a request and return the answer. Raises DeviceError, whose text has no credentials."""
         from sushy import exceptions  # noqa: PLC0415
@@ -157,7 +151,7 @@ class RedfishSource(PollingSource):
         if not wanted and len(found) == 1:
             return next(iter(found.values()))
         which = f"no chassis {wanted!r} with fans" if wanted else f"{len(found)} chassis with fans"
-        raise DeviceError(f"{which}; there are: {names}; name one by source.chassis", is_lost=True)
+        raise DeviceError(f"{which}; there are: {names}; name one by source.chassis")
 
     def _fan_objects(self) -> list[Json]:
         subsystem = _link(self._chassis.get("ThermalSubsystem"))

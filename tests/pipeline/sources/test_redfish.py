@@ -12,6 +12,7 @@ import trustme
 
 from fantwin.pipeline.config.loading import parse_config
 from fantwin.pipeline.config.settings import ConfigError
+from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.sources.polling import DeviceError
 from fantwin.pipeline.sources.redfish.config import RedfishConfig
 from fantwin.pipeline.sources.redfish.source import RedfishSource
@@ -110,7 +111,7 @@ def test_a_password_comes_from_a_file_of_its_owner_and_goes_over_a_verified_line
     with redfish_server(controller, tls) as address:
         url = address.replace("//", "//operator@")
         settings = {"folder": tmp_path, "ca": "ca.pem", "password_file": "bmc.secret"}
-        with pytest.raises(DeviceError, match="others may read it: chmod 600"):
+        with pytest.raises(UserError, match="others may read it: chmod 600"):
             connected(url, **settings)
         assert "others may read it" in device(url, **settings).check()[0]
         file.chmod(0o600)
