@@ -120,9 +120,12 @@ class HttpSource:
         )
 
     async def _get(self, request: Request) -> Response:
-        return self._unauthorized(request) or _answer(
-            200, {"tray": self._context.tray, **self._limits(), **self._counts()}
-        )
+        limits = self._context.limits
+        about = {**asdict(limits), "speed_unit": self._context.speed_unit} if limits else {}
+        with self._changed:
+            about |= {"accepted": self._accepted, "refused": self._refused}
+            about |= {"turned_away": self._turned_away, "waiting": len(self._waiting)}
+        return self._unauthorized(request) or _answer(200, {"tray": self._context.tray, **about})
 
     async def _post(self, request: Request) -> Response:
         refusal = self._unauthorized(request)
@@ -170,19 +173,6 @@ class HttpSource:
         if not self._token or hmac.compare_digest(given, f"Bearer {self._token}".encode()):
             return None
         return _answer(401, {"error": "send the header Authorization: Bearer TOKEN"}, {"WWW-Authenticate": "Bearer"})
-
-    def _limits(self) -> dict[str, Any]:
-        limits = self._context.limits
-        return {**asdict(limits), "speed_unit": self._context.speed_unit} if limits else {}
-
-    def _counts(self) -> dict[str, int]:
-        with self._changed:
-            return {
-                "accepted": self._accepted,
-                "refused": self._refused,
-                "turned_away": self._turned_away,
-                "waiting": len(self._waiting),
-            }
 
     def _run(self, deliver: Callable[[SourceEvent], None]) -> None:
         """Deliver samples until it is stopped and none waits; try again while it cannot listen."""

@@ -102,8 +102,6 @@ class MqttSource:
             for fan in range(context.fans if config.has_values else 1)
         }
         """subscribed topics; of numbers, with the fan of the topic, and whether it is its speed"""
-        self._foreign: deque[str] = deque(maxlen=MOST_RECENT)
-        """topics that are not of this tray, and were unsubscribed"""
         self._recent: deque[tuple[str, bytes]] = deque(maxlen=MOST_RECENT)
         self._is_up = False
         self._is_refused = False
@@ -204,8 +202,7 @@ class MqttSource:
         try:
             topic = message.topic
             batches = self.batches(topic, payload, received_t_ns, message.retain, message.dup)
-            if not self._is_own(topic) and topic not in self._foreign:
-                self._foreign.append(topic)
+            if not self._is_own(topic):
                 self._client.unsubscribe(topic)
         except Exception as error:  # noqa: BLE001  it would end the thread, and with it the source
             detail = f"unexpected {type(error).__name__}: {error}"
