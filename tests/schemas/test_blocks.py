@@ -42,24 +42,12 @@ def grid(samples: int, fans: int = 2, period_ns: int = 10) -> Grid:
     )
 
 
-def raw(samples: int, clock: bool = True, sequence: bool = True) -> Raw:
-    numbers, nothing = np.arange(samples, dtype=np.uint32), np.zeros(0, np.uint32)
-    return Raw(
-        fans=1,
-        host_receive_t_ns=np.arange(samples),
-        device_clock_us=numbers if clock else nothing,
-        device_sequence=numbers if sequence else nothing,
-        command=np.zeros((samples, 1)),
-        speed_rad_s=np.zeros((samples, 1)),
-    )
-
-
-def prediction(twin: str = "t", sigma: float = 1.0) -> Prediction:
+def raw(**present: Any) -> Raw:
     one = np.zeros((1, 1))
-    speeds = dict.fromkeys(("command", "measured_speed_rad_s", "predicted_speed_rad_s", "valid", "invalid_reason"), one)
-    return Prediction(
-        fans=1, period_ns=1, t_ns=np.zeros(1, np.int64), sigma_rad_s=np.array([sigma]), twin=twin, **speeds
-    )
+    return Raw(fans=1, host_receive_t_ns=np.zeros(1, np.int64), command=one, speed_rad_s=one, **present)
+
+
+COUNT = np.zeros(1, np.uint32)
 
 
 @given(MESSAGES, st.lists(st.integers(0, 5), max_size=3))
@@ -82,13 +70,13 @@ def test_samples_are_joined_in_the_order_given_under_the_first_header() -> None:
 @pytest.mark.parametrize(
     ("one", "other"),
     [
-        (grid(1), raw(1)),
+        (grid(1), raw()),
         (grid(1, fans=2), grid(1, fans=3)),
         (grid(1, period_ns=10), grid(1, period_ns=11)),
-        (raw(2), raw(2, clock=False)),
-        (raw(2, sequence=False), raw(2)),
-        (prediction(twin="a"), prediction(twin="b")),
-        (prediction(sigma=1.0), prediction(sigma=2.0)),
+        (raw(device_clock_us=COUNT), raw()),
+        (raw(), raw(device_sequence=COUNT)),
+        (Prediction(fans=1, period_ns=1, twin="a"), Prediction(fans=1, period_ns=1, twin="b")),
+        (Prediction(fans=1, period_ns=1, sigma_rad_s=np.ones(1)), Prediction(fans=1, period_ns=1)),
         (Command(fans=1, t_ns=0), Command(fans=1, t_ns=0)),
     ],
 )

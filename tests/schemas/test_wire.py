@@ -66,22 +66,15 @@ def framed(payload: bytes) -> bytes:
     return b"\0" + cobs.encode(payload + struct.pack("<I", zlib.crc32(payload))) + b"\0"
 
 
+@pytest.mark.parametrize("protocol", PROTOCOLS)
 @given(data=st.lists(st.floats(width=32), min_size=1, max_size=8))
-def test_commands_and_set_points_come_back_exactly_in_binary(data: list[float]) -> None:
-    for frame in (CommandFrame(tuple(data)), SetPointFrame(tuple(data))):
-        (back,) = Decoder("binary", len(data), "device").feed(encode("binary", frame))
-        assert same(back, frame)
-
-
-@given(data=st.lists(st.floats(width=32), min_size=1, max_size=8))
-def test_commands_and_set_points_come_back_fan_by_fan_in_text(data: list[float]) -> None:
+def test_commands_and_set_points_come_back_in_text_fan_by_fan(protocol: Protocol, data: list[float]) -> None:
     for frame in (CommandFrame(tuple(data)), SetPointFrame(tuple(data))):
         merged = [math.nan] * len(data)
-        for line in Decoder("text", len(data), "device").feed(encode("text", frame)):
-            assert isinstance(line, type(frame))
-            values = line.command if isinstance(line, CommandFrame) else line.set_point
-            (fan,) = np.flatnonzero(~np.isnan(values))
-            merged[fan] = values[fan]
+        for back in Decoder(protocol, len(data), "device").feed(encode(protocol, frame)):
+            assert isinstance(back, type(frame))
+            values = back.command if isinstance(back, CommandFrame) else back.set_point
+            merged = [old if math.isnan(new) else new for old, new in zip(merged, values, strict=True)]
         assert repr(merged) == repr(data)
 
 

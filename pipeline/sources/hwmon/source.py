@@ -73,8 +73,6 @@ class HwmonSource(PollingSource):
         self._modes_file = context.run_folder / f"hwmon-{context.tray}.json" if context.run_folder else None
         self._before: dict[int, FoundPwm] = {}
         """mode of each pwm before it was written, also by a process that was killed"""
-        self._taken_over: set[int] = set()
-        """the pwms that this connection has made manual"""
         self._written = False
 
     @property
@@ -91,7 +89,6 @@ class HwmonSource(PollingSource):
         """Find the chip."""
         self._chip = chip = self._find()
         # What is not manual any more has been given back, or the driver was loaded again.
-        self._taken_over = set()
         kept = self._kept_modes(chip).items()
         self._before = {number: found for number, found in kept if self._mode(chip, number) in (None, MANUAL)}
 
@@ -230,8 +227,7 @@ class HwmonSource(PollingSource):
         return rpm * self._units_per_rpm
 
     def _take_over(self, chip: ChipFolder, number: int) -> None:
-        if number in self._taken_over:
-            return
+        """Make a pwm manual, after it is kept how it was found."""
         enable, mode = chip.path / f"pwm{number}_enable", self._mode(chip, number)
         has_enable = enable.exists()
         if number not in self._before:
@@ -241,15 +237,9 @@ class HwmonSource(PollingSource):
             except OSError:
                 pwm = None
             self._before[number] = FoundPwm(mode=automatic if has_enable and mode is None else mode, pwm=pwm)
-        if self._modes_file:
-            found = FoundModes(chip=chip.name, device=chip.device, pwms=self._before)
-            try:
-                replace_file(self._modes_file, found.model_dump_json().encode())
-            except OSError as error:
-                raise DeviceError(f"the mode of pwm{number} cannot be kept in run_folder: {error.strerror}") from error
+            self._keep_modes(chip)
         if has_enable and mode != MANUAL:
             _write(chip, enable.name, MANUAL)
-        self._taken_over.add(number)
 
     def _kept_modes(self, chip: ChipFolder) -> dict[int, FoundPwm]:
         """Modes that an earlier process has not given back, by the number of the pwm."""
@@ -258,6 +248,14 @@ class HwmonSource(PollingSource):
         except (OSError, ValidationError):
             return {}
         return found.pwms if found and (found.chip, found.device) == (chip.name, chip.device) else {}
+
+    def _keep_modes(self, chip: ChipFolder) -> None:
+        if self._modes_file:
+            found = FoundModes(chip=chip.name, device=chip.device, pwms=self._before)
+            try:
+                replace_file(self._modes_file, found.model_dump_json().encode())
+            except OSError as error:
+                raise DeviceError(f"the modes of pwms cannot be kept in run_folder: {error.strerror}") from error
 
     def _mode(self, chip: ChipFolder, number: int) -> int | None:
         """Content of pwmN_enable; None if there is no such file, or it cannot be read."""

@@ -11,9 +11,8 @@ import math
 import os
 import struct
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.extras import require
@@ -32,21 +31,8 @@ TIMEOUT_S = 0.5
 _FORMATS = {"u16": ">H", "s16": ">h", "u32": ">I", "s32": ">i", "f32": ">f"}
 
 
-@dataclass(frozen=True)
-class _Place:
-    """Place of a register: the device, its table, and the address."""
-
-    unit: int
-    table: str
-    address: int
-
-
-@dataclass(frozen=True)
-class _Request:
-    """Registers that are read together."""
-
-    first: _Place
-    count: int
+_Place: TypeAlias = tuple[int, str, int]
+"""of a register: the unit id of its device, its table, and the address"""
 
 
 class ModbusSource(PollingSource):
@@ -63,7 +49,7 @@ class ModbusSource(PollingSource):
         self._config = config
         self._port = str(context.folder / config.port) if config.port else ""
         self._units_per_rpm = context.units_per_rpm
-        self._requests = tuple(_requests(config.fan))
+        self._requests = _requests(config.fan)
         self._client: ModbusBaseSyncClient | None = None
 
     @property
@@ -89,8 +75,8 @@ class ModbusSource(PollingSource):
         """Commands, speeds and what else has registers."""
         words: dict[_Place, int] = {}
         refused: list[str] = []
-        for request in self._requests:
-            self._ask(request, words, refused)
+        for first, count in self._requests:
+            self._ask(first, count, words, refused)
         fans = self._config.fan
         command = tuple(_value(words, fan.unit, fan.command) for fan in fans)
         if any(map(math.isnan, command)):
@@ -143,18 +129,18 @@ class ModbusSource(PollingSource):
             retries=0,
         )
 
-    def _ask(self, request: _Request, words: dict[_Place, int], refused: list[str]) -> None:
-        """Add the words that a request gives, none if the device refuses it."""
-        unit, table, address = request.first.unit, request.first.table, request.first.address
+    def _ask(self, first: _Place, count: int, words: dict[_Place, int], refused: list[str]) -> None:
+        """Add the words of registers that follow one another, none if the device refuses the request."""
+        unit, table, address = first
         client = self._client
         assert client is not None
         read = client.read_holding_registers if table == "holding" else client.read_input_registers
-        answer = self._answer(unit, lambda: read(address, count=request.count, device_id=unit))
+        answer = self._answer(unit, lambda: read(address, count=count, device_id=unit))
         if answer.isError():
             refused.append(f"unit {unit} refuses {table} register {address} (exception {answer.exception_code})")
             return
-        for number, word in enumerate(answer.registers[: request.count]):
-            words[_Place(unit, table, address + number)] = word
+        for number, word in enumerate(answer.registers[:count]):
+            words[unit, table, address + number] = word
 
     def _write(self, unit: int, register: Register, value: float) -> None:
         client = self._client
@@ -196,30 +182,29 @@ def _size(register: Register) -> int:
     return struct.calcsize(_FORMATS[register.type]) // 2
 
 
-def _requests(fans: tuple[ModbusFan, ...]) -> Iterator[_Request]:
-    """The registers of all fans, those together that follow one another in one table of one device."""
+def _requests(fans: tuple[ModbusFan, ...]) -> list[tuple[_Place, int]]:
+    """The first register and the number of each request: those of all fans, together that follow one another."""
     places = {
         (fan.unit, register.table, register.address + word)
         for fan in fans
         for register in _registers(fan)
         for word in range(_size(register))
     }
-    first: _Place | None = None
-    count = 0
+    requests: list[tuple[_Place, int]] = []
     for place in sorted(places):
-        if first and place == (first.unit, first.table, first.address + count) and count < MOST_REGISTERS:
-            count += 1
-            continue
-        if first:
-            yield _Request(first, count)
-        first, count = _Place(*place), 1
-    if first:
-        yield _Request(first, count)
+        if requests:
+            first, count = requests[-1]
+            unit, table, address = first
+            if place == (unit, table, address + count) and count < MOST_REGISTERS:
+                requests[-1] = first, count + 1
+                continue
+        requests.append((place, 1))
+    return requests
 
 
 def _value(words: dict[_Place, int], unit: int, register: Register) -> float:
     """NaN where a register was refused, or holds no number."""
-    found = [words.get(_Place(unit, register.table, register.address + word)) for word in range(_size(register))]
+    found = [words.get((unit, register.table, register.address + word)) for word in range(_size(register))]
     if register.word_order == "little":
         found.reverse()
     if None in found:

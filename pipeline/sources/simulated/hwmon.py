@@ -13,7 +13,7 @@ import shutil
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
@@ -28,7 +28,6 @@ FULL_SPEED, MANUAL, AUTOMATIC = 0, 1, 2
 HIGHEST_PWM = 255
 FAULT_FILE = "fault"
 _CHIPS_OF_ONE_FAN = ("pwmfan",)
-_WIDTH = 8  # bytes of a file that is written: all at once, so that no reader finds half of it
 _MARK = ".simulated-hwmon"
 
 
@@ -47,17 +46,12 @@ class _Channel:
     folder: Path
     number: int
     last_pwm: int = HIGHEST_PWM
-    descriptors: dict[str, int] = field(default_factory=dict)
 
     def write(self, file: str, value: float) -> None:
-        """NaN: the file is empty."""
-        descriptor = self.descriptors.get(file)
-        if descriptor is None:
-            descriptor = os.open(self.folder / file, os.O_RDWR | os.O_CREAT, 0o644)
-            self.descriptors[file] = descriptor
-        text = "" if math.isnan(value) else str(round(value))
-        os.pwrite(descriptor, f"{text:<{_WIDTH - 1}}\n".encode(), 0)
-        os.ftruncate(descriptor, _WIDTH)
+        """Replace the file, so that no reader finds half of it; NaN: it is empty."""
+        new = self.folder / "new"
+        new.write_text("\n" if math.isnan(value) else f"{round(value)}\n", encoding="ascii")
+        new.replace(self.folder / file)
 
     def read(self, file: str, otherwise: int) -> int:
         """The number that somebody wrote; `otherwise` while that is being written, or is none."""
@@ -65,10 +59,6 @@ class _Channel:
             return int((self.folder / file).read_text(encoding="ascii", errors="replace"))
         except (OSError, ValueError):
             return otherwise
-
-    def close(self) -> None:
-        for descriptor in self.descriptors.values():
-            os.close(descriptor)
 
 
 class HwmonTree:
@@ -115,8 +105,6 @@ class HwmonTree:
 
     def close(self) -> None:
         """Remove the tree, as a driver that is unloaded does."""
-        for channel in self._channels:
-            channel.close()
         shutil.rmtree(self.root, ignore_errors=True)
 
     def _chip(self, number: int, name: str) -> Path:

@@ -1,170 +1,117 @@
-"""The serial adapter on real pseudo-terminals: it waits, reads, writes, and reopens it when the device returns."""
+"""The serial adapter on real pseudo-terminals: beside what holds for all sources, how it opens, drains and writes."""
 
 from __future__ import annotations
 
 import os
-import queue
 import threading
-import tty
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TypeVar, cast
+from typing import cast
 
 import pytest
 import serial
 
 from fantwin.pipeline.sources.serial.port import ReceivedBytes, SerialPort
 from fantwin.pipeline.sources.source import LinkDown, LinkUp
+from tests.support.running_chain import eventually
+from tests.support.source_worlds import SerialWorld
 
 TIMEOUT_S = 20.0  # of a wait that normally ends at once
-T = TypeVar("T")
 
 
-class Device:
-    """The far end of a pseudo-terminal whose near end is found at `path` while it is plugged in."""
+class Line(SerialPort):
+    """A port, and what it has delivered."""
 
     def __init__(self, path: Path) -> None:
-        self.path = path
-        self._ends: tuple[int, int] | None = None
+        super().__init__(str(path), 115200)
+        self.items: list[LinkUp | LinkDown | ReceivedBytes] = []
 
-    def plug_in(self) -> None:
-        master, slave = os.openpty()
-        tty.setraw(slave)
-        self._ends = master, slave
-        self.path.symlink_to(os.ttyname(slave))
+    def begin(self) -> None:
+        self.start(self.items.append)
+        eventually(lambda: self.items, "it is open, or not")
 
-    def unplug(self) -> None:
-        if self._ends:
-            self.path.unlink()
-            for end in self._ends:
-                os.close(end)
-            self._ends = None
-
-    def send(self, data: bytes) -> None:
-        assert self._ends
-        assert os.write(self._ends[0], data) == len(data)
-
-    def receive(self, size: int) -> bytes:
-        assert self._ends
-        data = b""
-        while len(data) < size:
-            data += os.read(self._ends[0], size - len(data))
-        return data
-
-
-class Items:
-    """The items that a link delivered, in order."""
-
-    def __init__(self) -> None:
-        self.queue: queue.Queue[LinkUp | LinkDown | ReceivedBytes] = queue.Queue()
-
-    def next(self, kind: type[T]) -> T:
-        item = self.queue.get(timeout=TIMEOUT_S)
-        assert isinstance(item, kind), item
-        return item
-
-    def bytes(self, size: int) -> bytes:
-        data = b""
-        while len(data) < size:
-            data += self.next(ReceivedBytes).data
-        return data
-
-    def skip_until(self, kind: type[T]) -> T:
-        while not isinstance(item := self.queue.get(timeout=TIMEOUT_S), kind):
-            pass
-        return item
-
-    def rest(self) -> list[LinkUp | LinkDown | ReceivedBytes]:
-        return [self.queue.get_nowait() for _ in range(self.queue.qsize())]
+    @property
+    def data(self) -> bytes:
+        return b"".join(item.data for item in self.items if isinstance(item, ReceivedBytes))
 
 
 @pytest.fixture
-def device(tmp_path: Path) -> Iterator[Device]:
-    device = Device(tmp_path / "ttyFAN")
+def device(tmp_path: Path) -> Iterator[SerialWorld]:
+    device = SerialWorld(tmp_path)
+    device.plug_in()
     yield device
     device.unplug()
 
 
-@pytest.fixture
-def line(device: Device) -> Iterator[SerialPort]:
-    line = SerialPort(str(device.path), 115200)
-    yield line
-    line.stop()
-
-
 def test_a_port_in_use_is_opened_when_it_is_free_and_a_file_that_is_no_port_is_reported(
-    device: Device, line: SerialPort, tmp_path: Path
+    device: SerialWorld, tmp_path: Path
 ) -> None:
-    device.plug_in()
-    first, items = Items(), Items()
-    other = SerialPort(str(device.path), 115200)
-    other.start(first.queue.put)
-    first.next(LinkUp)
-    line.start(items.queue.put)
-    assert items.next(LinkDown).reason == "in use by another program; stop that one"
+    other, line = Line(device.path), Line(device.path)
+    other.begin()
+    line.begin()
+    assert line.items == [LinkDown("in use by another program; stop that one")]
     other.stop()
-    items.next(LinkUp)
-    assert line.write(bytes(range(256))) and device.receive(256) == bytes(range(256))
+    eventually(lambda: line.items[1:] == [LinkUp()], "it is open")
+    assert line.write(bytes(range(256)))
+    received = b""
+    while len(received) < 256:
+        received += os.read(device.far, 256)
+    assert received == bytes(range(256))
     line.stop()
     (file := tmp_path / "file").touch()
-    no_port = SerialPort(str(file), 115200)
-    no_port.start(items.queue.put)
-    reason = items.skip_until(LinkDown).reason
-    assert reason.startswith("cannot be opened (") and reason.endswith("check [[tray]] port and baud")
+    no_port = Line(file)
+    no_port.begin()
+    (down,) = no_port.items
+    assert isinstance(down, LinkDown) and down.reason.startswith("cannot be opened (")
+    assert down.reason.endswith("check [[tray]] port and baud")
     no_port.stop()
 
 
-def test_stop_delivers_the_bytes_that_had_arrived_and_no_more(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stop_delivers_the_bytes_that_had_arrived_and_no_more(
+    device: SerialWorld, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("fantwin.pipeline.sources.serial.port.DRAIN_LIMIT_S", TIMEOUT_S)  # a pause ends it
-    device.plug_in()
-    items = Items()
-    line = SerialPort(str(device.path), 115200)
+    line = Line(device.path)
     stopper = threading.Thread(target=line.stop)
     data = bytes(range(256)) * 12
 
     def deliver(item: LinkUp | LinkDown | ReceivedBytes) -> None:
-        items.queue.put(item)
+        line.items.append(item)
         if isinstance(item, ReceivedBytes) and not stopper.ident:  # as a stage that is behind when it is stopped
-            device.send(data)
+            os.write(device.far, data)
             stopper.start()
             assert line._stopping.wait(TIMEOUT_S)
 
     line.start(deliver)
-    items.next(LinkUp)
-    device.send(b"!")
-    items.next(ReceivedBytes)
-    assert items.bytes(len(data)) == data
+    eventually(lambda: line.items == [LinkUp()], "it is open")
+    os.write(device.far, b"!")
+    eventually(lambda: line.data == b"!" + data, "all comes")
     stopper.join(TIMEOUT_S)
-    device.send(b"too late")
-    assert items.rest() == []
+    os.write(device.far, b"too late")
+    assert line.data == b"!" + data
     assert not line.write(b"too late")
 
 
-def test_stop_ends_although_the_device_never_pauses(device: Device) -> None:
-    device.plug_in()
-    line = SerialPort(str(device.path), 115200)
-    items = Items()
+def test_stop_ends_although_the_device_never_pauses(device: SerialWorld) -> None:
+    line = Line(device.path)
 
     def deliver(item: LinkUp | LinkDown | ReceivedBytes) -> None:
-        items.queue.put(item)
-        device.send(b"and on")
+        line.items.append(item)
+        os.write(device.far, b"and on")
 
     line.start(deliver)
-    items.next(LinkUp)
-    items.next(ReceivedBytes)
+    eventually(lambda: len(line.data) > 20, "it sends")
     line.stop()
-    assert items.rest()
 
 
-def test_write_reports_a_device_that_accepts_no_bytes_instead_of_blocking(device: Device, line: SerialPort) -> None:
-    device.plug_in()
-    items = Items()
-    line.start(items.queue.put)
-    items.next(LinkUp)
+def test_write_reports_a_device_that_accepts_no_bytes_instead_of_blocking(device: SerialWorld) -> None:
+    line = Line(device.path)
+    line.begin()
     assert not all(line.write(bytes(4096)) for _ in range(100)), "a terminal holds less than that"
+    line.stop()
 
 
-def test_a_byte_that_came_just_before_the_device_was_disconnected_is_delivered():
+def test_a_byte_that_came_just_before_the_device_was_disconnected_is_delivered() -> None:
     class Unplugged:
         """A pipe whose far end has been closed."""
 
