@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import re
 import threading
 from collections.abc import Callable, Iterator
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -187,3 +189,37 @@ def test_settings_are_frozen_and_an_unknown_one_is_refused_by_name(kind: str, ma
         parse_source({**settings, "no_such_key": 1})
     with pytest.raises(ValueError, match="frozen"):
         config.kind = "other"  # pyright: ignore[reportAttributeAccessIssue]
+
+
+FAN = {"speed": {"address": 1}, "command": {"address": 2}}
+NO_SUCH_REGISTER = {"speed": {"address": 1, "scale": 0}, "command": {"address": 2}}
+BROKER = {"url": "mqtt://broker"}
+IMPOSSIBLE: list[tuple[str, dict[str, Any], str]] = [
+    ("serial", {"baud": 0}, "baud"),
+    ("modbus", {"host": "drive", "fan": [NO_SUCH_REGISTER]}, "scale is 0"),
+    ("modbus", {"fan": [FAN]}, "give either host"),
+    ("modbus", {"host": "drive:port", "fan": [FAN]}, "give a name or address, with its port"),
+    ("modbus", {"host": "fe80::1", "fan": [FAN]}, "plc1, plc1:1502 or [fe80::1]"),
+    ("modbus", {"port": "ttyUSB0", "framing": "7E1", "fan": [FAN]}, "framing"),
+    ("redfish", {"url": "https://a:b@bmc1"}, "a configuration is recorded"),
+    ("redfish", {"url": "bmc1"}, "write the address"),
+    ("redfish", {"url": "https://a@bmc1"}, "needs password_file"),
+    ("http", {"host": "0.0.0.0"}, "can be reached from other hosts: give token_file"),
+    ("http", {"host": "board.plant"}, "can be reached from other hosts: give token_file"),
+    ("http", {"key": "x"}, "give certificate and key"),
+    ("mqtt", {**BROKER}, "give topic"),
+    ("mqtt", {**BROKER, "topic": "a", "speed_topic": "b/{fan}"}, "give topic"),
+    ("mqtt", {**BROKER, "speed_topic": "b/{fan}"}, "give speed_topic and command_topic"),
+    ("mqtt", {**BROKER, "speed_topic": "b/rpm", "command_topic": "b/{fan}"}, "speed_topic needs {fan}"),
+    ("mqtt", {**BROKER, "speed_topic": "b/{fan}", "command_topic": "b/{fan}"}, "are the same"),
+    ("mqtt", {**BROKER, "topic": "a", "send_topic": "b/#"}, "without + and #"),
+    ("mqtt", {**BROKER, "topic": "a", "password_file": "x"}, "needs a user in url"),
+    ("mqtt", {**BROKER, "topic": "a", "ca": "x"}, "need mqtts://"),
+    ("mqtt", {"url": "mqtts://broker", "topic": "a", "key": "x"}, "give certificate and key"),
+]
+
+
+@pytest.mark.parametrize(("kind", "settings", "words"), IMPOSSIBLE)
+def test_settings_that_cannot_be_are_refused_with_what_to_do(kind: str, settings: dict[str, Any], words: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(words)):
+        parse_source({"kind": kind, **settings})

@@ -8,8 +8,6 @@ from typing import Any
 
 import pytest
 
-from fantwin.pipeline.config.loading import parse_config
-from fantwin.pipeline.config.settings import ConfigError
 from fantwin.pipeline.sources.modbus.config import ModbusConfig
 from fantwin.pipeline.sources.modbus.source import ModbusSource
 from fantwin.pipeline.sources.polling import DeviceError
@@ -104,23 +102,6 @@ def test_registers_of_all_types_are_read_by_one_request_and_a_command_moves_the_
     read, write = bytes.fromhex("0303000a000725e8"), bytes.fromhex("031000640001020384b787")
     assert line.transferred["device"].startswith(read + write + read)
     assert line.transferred["host"].startswith(bytes.fromhex("03030e"))
-
-
-def test_settings_of_a_line_that_cannot_be_are_one_line() -> None:
-    tray = '[[tray]]\nname = "a"\nfans = 1\nsource = { kind = "modbus", host = "drive", fan = [ %s ] }\n'
-    fan = "{ speed = { address = 1, scale = 2.0 }, command = { address = 2 } }"
-    for change, words in (
-        (("address = 1,", "adress = 1,"), r"fan.0.speed.adress'; did you mean 'address'\?"),
-        (("scale = 2.0", "scale = 0"), "scale is 0"),
-        (('host = "drive",', ""), "give either host"),
-        (('"drive"', '"drive:port"'), "source.host = 'drive:port': give a name or address, with its port"),
-        (('"drive"', '"fe80::1"'), r"plc1, plc1:1502 or \[fe80::1\]"),
-        (('host = "drive"', 'port = "ttyUSB0", framing = "7E1"'), "source.framing = '7E1'"),
-        (("fans = 1", "fans = 2"), "carries at most 1 fans"),
-    ):
-        with pytest.raises(ConfigError, match=words) as caught:
-            parse_config((tray % fan).replace(*change), Path("fantwin.toml"))
-        assert "\n" not in str(caught.value)
 
 
 def test_a_unit_that_is_too_slow_on_a_serial_line_is_a_failed_poll_and_the_next_one_works(

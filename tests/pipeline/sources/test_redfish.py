@@ -10,8 +10,6 @@ from typing import Any
 import pytest
 import trustme
 
-from fantwin.pipeline.config.loading import parse_config
-from fantwin.pipeline.config.settings import ConfigError
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.sources.polling import DeviceError
 from fantwin.pipeline.sources.redfish.config import RedfishConfig
@@ -127,14 +125,3 @@ def test_a_password_comes_from_a_file_of_its_owner_and_goes_over_a_verified_line
     with pytest.raises(DeviceError, match="would send the password in the clear"):
         connected("http://operator@127.0.0.1:9", folder=tmp_path, password_file="bmc.secret")
     assert SECRET not in caplog.text
-
-
-def test_the_configuration_keeps_no_password() -> None:
-    tray = '[[tray]]\nname = "a"\nfans = 1\nsource = { kind = "redfish", url = "%s" }\n'
-    for url, words in (
-        ("https://a:b@bmc1", "a configuration is recorded"),
-        ("bmc1", "write the address"),
-        ("https://a@bmc1", "needs password_file"),
-    ):
-        with pytest.raises(ConfigError, match=words):
-            parse_config(tray % url, Path("f"))

@@ -9,15 +9,13 @@ from pathlib import Path
 import pytest
 from serial.tools import list_ports
 from serial.tools.list_ports_common import ListPortInfo
-from typer.testing import CliRunner
 
-from fantwin.pipeline.cli import main as command_line
 from fantwin.pipeline.config.loading import load_config, parse_config
-from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.sources.hwmon.config import HwmonConfig
 from fantwin.pipeline.sources.hwmon.discovery import discover_hwmon, discover_serial
 from fantwin.pipeline.sources.kinds import build_source
 from fantwin.pipeline.sources.source import SourceContext
+from tests.support.fantwin_command import error_of, fantwin
 from tests.support.hwmon_trees import add_chip, board
 
 
@@ -61,10 +59,9 @@ def test_no_tree_one_without_fans_and_one_that_may_not_be_written_say_what_is_mi
 
 
 def test_the_command_writes_a_new_configuration_and_prints_json(root: Path, tmp_path: Path) -> None:
-    command_line._register(["doctor"] if not command_line.app.registered_commands else ["doctor", "info"])
     file = tmp_path / "fantwin.toml"
-    words = ["doctor", "find", "--root", str(root), "--json", "--write", str(file), "--writable"]
-    result = CliRunner().invoke(command_line.app, words)
+    words = ("doctor", "find", "--root", root, "--json", "--write", file, "--writable")
+    result = fantwin(*words)
     assert result.exit_code == 0, result.output
     shown = json.loads(result.stdout)
     assert [each["tray"]["name"] for each in shown if each["kind"] == "hwmon"] == ["nct6798", "nct6798-2", "thinkpad"]
@@ -73,31 +70,21 @@ def test_the_command_writes_a_new_configuration_and_prints_json(root: Path, tmp_
     assert all(isinstance(tray.source, HwmonConfig) and tray.source.writable for tray in config.trays)
     assert "left out: acpitz" not in result.stderr, "it has no fans"
     text = file.read_text(encoding="utf-8")
-    again = CliRunner().invoke(command_line.app, words)
-    assert again.exit_code == 0
-    assert f"{file}: exists, has all hwmon chips with fans, and was not changed" in again.stderr
+    assert f"{file}: exists, has all hwmon chips with fans, and was not changed" in fantwin(*words).stderr
     add_chip(root, 9, "emc2305", "i2c-3/3-0020", {"fan1_input": 3000, "pwm1": 128})
-    lacking = CliRunner().invoke(command_line.app, words)
-    assert isinstance(lacking.exception, UserError)
-    assert "it lacks emc2305: paste the [[tray]] that is shown" in str(lacking.exception)
+    assert "it lacks emc2305: paste the [[tray]] that is shown" in error_of(*words)
     assert file.read_text(encoding="utf-8") == text
     file.write_text("", encoding="utf-8")
-    empty = CliRunner().invoke(command_line.app, words)
-    assert "it lacks emc2305, nct6798, nct6798-2, thinkpad" in str(empty.exception)
+    assert "it lacks emc2305, nct6798, nct6798-2, thinkpad" in error_of(*words)
 
 
 @pytest.mark.parametrize("content", [b"no configuration [", b"\xff\xfe"])
 def test_a_file_that_is_no_configuration_is_not_changed(root: Path, tmp_path: Path, content: bytes) -> None:
-    command_line._register(["doctor"] if not command_line.app.registered_commands else ["doctor", "info"])
     file = tmp_path / "fantwin.toml"
     file.write_bytes(content)
-    error = (
-        CliRunner().invoke(command_line.app, ["doctor", "find", "--root", str(root), "--write", str(file)]).exception
-    )
-    assert isinstance(error, UserError)
-    assert str(error).startswith(f"{file}: exists, cannot be read as a configuration (")
-    assert str(error).endswith("), and was not changed: name a new file")
-    assert "\n" not in str(error)
+    error = error_of("doctor", "find", "--root", root, "--write", file)
+    assert error.startswith(f"{file}: exists, cannot be read as a configuration (")
+    assert error.endswith("), and was not changed: name a new file")
     assert file.read_bytes() == content
 
 
@@ -110,12 +97,6 @@ def test_a_port_of_which_nothing_is_known_is_no_tray_and_what_is_not_written_is_
     known, unknown = discover_serial()
     assert known.tray["source"]["port"] == "/dev/ttyUSB0"
     assert not unknown.tray and unknown.title == "/dev/ttyS0" and "no device is known" in unknown.missing[0]
-    command_line._register(["doctor"] if not command_line.app.registered_commands else ["doctor", "info"])
-    words = ["doctor", "find", "--root", str(root), "--write", str(tmp_path / "fantwin.toml")]
-    lines = CliRunner().invoke(command_line.app, words).stdout.splitlines()
-    assert [
-        line
-        for line in lines
-        if line.startswith("left out: /dev/ttyUSB0: FT232R USB UART: the device there is only guessed")
-    ]
-    assert [line for line in lines if line.startswith("left out: /dev/ttyS0: no device is known there")]
+    shown = fantwin("doctor", "find", "--root", root, "--write", tmp_path / "fantwin.toml").stdout
+    assert "\nleft out: /dev/ttyUSB0: FT232R USB UART: the device there is only guessed" in shown
+    assert "\nleft out: /dev/ttyS0: no device is known there" in shown
