@@ -21,10 +21,9 @@ from fantwin.pipeline.sources.source import (
     LinkUp,
     Reading,
     ReadingBatch,
-    Rejected,
     SourceContext,
-    SourceEvent,
 )
+from tests.support.delivered import Delivered
 from tests.support.running_chain import eventually
 from tests.support.source_worlds import WORLDS, World, speeds_of
 
@@ -40,7 +39,7 @@ class Running:
         self.world = world
         config = parse_source({"kind": kind, **world.settings})
         self.source = build_source(config, SourceContext(2, "rpm", world.folder, "tray1"))
-        self.events: list[SourceEvent] = []
+        self.events = Delivered()
 
     def start(self) -> None:
         self.source.start(self.events.append)
@@ -49,23 +48,15 @@ class Running:
         """The reading of a sample that the device shows."""
         self.world.show(number, self.source, self.events.append)
         wanted = speeds_of(number)
-        eventually(lambda: any(reading.speed == pytest.approx(wanted) for reading in self.readings), f"{number} came")
-        return next(reading for reading in self.readings if reading.speed == pytest.approx(wanted))
-
-    @property
-    def items(self) -> list[Reading | Rejected]:
-        return [item for event in self.events if isinstance(event, ReadingBatch) for item in event.items]
-
-    @property
-    def readings(self) -> list[Reading]:
-        return [item for item in self.items if isinstance(item, Reading)]
-
-    @property
-    def links(self) -> list[LinkUp | LinkDown]:
-        return [event for event in self.events if not isinstance(event, ReadingBatch)]
+        eventually(
+            lambda: any(reading.speed == pytest.approx(wanted) for reading in self.events.readings), f"{number} came"
+        )
+        return next(reading for reading in self.events.readings if reading.speed == pytest.approx(wanted))
 
     def wait_for_link(self, kind: type[LinkUp | LinkDown]) -> None:
-        eventually(lambda: self.links and isinstance(self.links[-1], kind), f"the link is {kind.__name__}")
+        eventually(
+            lambda: self.events.links and isinstance(self.events.links[-1], kind), f"the link is {kind.__name__}"
+        )
 
 
 @pytest.fixture
@@ -102,9 +93,9 @@ def test_readings_come_in_order_as_the_device_gave_them(kind: str, made: Callabl
         assert running.show(number).command == pytest.approx((running.world.command,) * 2)
     received = [event.received_t_ns for event in running.events if isinstance(event, ReadingBatch)]
     assert received == sorted(received)
-    numbers = [each.sequence for each in running.readings if each.sequence is not None]
+    numbers = [each.sequence for each in running.events.readings if each.sequence is not None]
     assert all(later > earlier for earlier, later in pairwise(numbers))
-    clocks_us = [each.clock_us for each in running.readings if each.clock_us is not None]
+    clocks_us = [each.clock_us for each in running.events.readings if each.clock_us is not None]
     assert all(0 < (later - earlier) % 2**32 < 2**31 for earlier, later in pairwise(clocks_us))
 
 
@@ -118,8 +109,8 @@ def test_what_is_no_sample_is_counted_with_a_reason_and_costs_no_other(
     running.wait_for_link(LinkUp)
     running.show(1)
     running.world.garble(running.source, running.events.append)
-    eventually(lambda: [item for item in running.items if isinstance(item, Rejected)], "it is refused")
-    refused = next(item for item in running.items if isinstance(item, Rejected))
+    eventually(lambda: running.events.refused, "it is refused")
+    refused = running.events.refused[0]
     assert refused.kind and refused.detail and "\n" not in refused.detail
     running.show(2)
 
@@ -134,7 +125,7 @@ def test_a_device_that_is_gone_is_reported_in_one_line_and_found_again(
     running.wait_for_link(LinkDown)
     threading.Event().wait(SEVERAL_ATTEMPTS_S)
     if running.world.says_once:
-        assert len(running.links) == 1
+        assert len(running.events.links) == 1
     running.world.plug_in()
     running.wait_for_link(LinkUp)
     running.show(1)
@@ -144,7 +135,7 @@ def test_a_device_that_is_gone_is_reported_in_one_line_and_found_again(
         running.world.plug_in()
         running.wait_for_link(LinkUp)
         running.show(2)
-    for link in running.links:
+    for link in running.events.links:
         assert isinstance(link, LinkUp) or (link.reason and "\n" not in link.reason)
 
 

@@ -12,7 +12,8 @@ import pytest
 
 from fantwin.pipeline.sources import polling
 from fantwin.pipeline.sources.polling import DeviceError, PolledConfig, PollingSource
-from fantwin.pipeline.sources.source import LinkDown, LinkUp, Reading, ReadingBatch, Rejected, SourceEvent
+from fantwin.pipeline.sources.source import LinkDown, LinkUp, Reading, ReadingBatch, SourceEvent
+from tests.support.delivered import Delivered
 from tests.support.running_chain import DEADLINE_S
 
 PERIOD_S = 0.02
@@ -58,11 +59,9 @@ def failing(reason: str = "timeout", *, is_lost: bool = False) -> Callable[[], f
     return fail
 
 
-def polled(
-    device: Device, until: Callable[[list[SourceEvent]], bool], limit_s: float = DEADLINE_S
-) -> list[SourceEvent]:
+def polled(device: Device, until: Callable[[Delivered], bool], limit_s: float = DEADLINE_S) -> Delivered:
     """The events up to the one with which `until` holds."""
-    events: list[SourceEvent] = []
+    events = Delivered()
     is_there = threading.Event()
 
     def deliver(event: SourceEvent) -> None:
@@ -75,16 +74,6 @@ def polled(
     device.stop()
     assert device.connected == device.disconnected, "each connection is left in order"
     return events
-
-
-def readings(events: list[SourceEvent]) -> list[Reading]:
-    batches = (event for event in events if isinstance(event, ReadingBatch))
-    return [item for batch in batches for item in batch.items if isinstance(item, Reading)]
-
-
-def rejected(events: list[SourceEvent]) -> list[Rejected]:
-    batches = (event for event in events if isinstance(event, ReadingBatch))
-    return [item for batch in batches for item in batch.items if isinstance(item, Rejected)]
 
 
 @pytest.fixture(autouse=True)
@@ -103,8 +92,8 @@ def test_the_time_of_a_reading_is_the_middle_of_its_request(monkeypatch: pytest.
         ahead_s += 100.0
         return 2.0
 
-    events = polled(Device(slow), lambda found: len(readings(found)) == 2)
-    for reading, began_s in zip(readings(events), asked_s, strict=False):
+    events = polled(Device(slow), lambda found: len(found.readings) == 2)
+    for reading, began_s in zip(events.readings, asked_s, strict=False):
         assert reading.clock_us is not None
         after_s = ((reading.clock_us - began_s * 1e6) % 2**32) / 1e6
         assert 49.0 < after_s < 60.0, "half of 100 s, on any machine"
@@ -112,9 +101,9 @@ def test_the_time_of_a_reading_is_the_middle_of_its_request(monkeypatch: pytest.
 
 def test_a_poll_that_fails_is_a_gap_in_the_sequence_and_counted() -> None:
     device = Device(lambda: 1.0, failing(), failing(), lambda: 3.0)
-    events = polled(device, lambda found: len(readings(found)) == 2)
-    assert [each.kind for each in rejected(events)].count("failed_polls") == 2
-    first, second = readings(events)[:2]
+    events = polled(device, lambda found: len(found.readings) == 2)
+    assert [each.kind for each in events.refused].count("failed_polls") == 2
+    first, second = events.readings[:2]
     assert first.sequence == 0 and second.sequence is not None and second.sequence >= 3
 
 
@@ -127,9 +116,8 @@ def test_a_device_that_keeps_failing_is_lost_or_fails_unexpectedly_is_a_link_dow
     three = [failing("no answer")] * 3
     lost = (failing("gone", is_lost=True), lambda: 3.0, broken, lambda: 4.0)
     device = Device(lambda: 1.0, *three, failing("still none"), lambda: 2.0, *lost)
-    events = polled(device, lambda found: len(readings(found)) == 4)
-    links = [event for event in events if not isinstance(event, ReadingBatch)]
-    assert links == [
+    events = polled(device, lambda found: len(found.readings) == 4)
+    assert events.links == [
         LinkUp(),
         LinkDown("no answer"),
         LinkDown("still none"),
@@ -146,9 +134,9 @@ def test_polls_that_are_late_are_left_out_and_counted_as_lost() -> None:
         time.sleep(3.5 * PERIOD_S)
         return 2.0
 
-    events = polled(Device(lambda: 1.0, slow, lambda: 3.0), lambda found: len(readings(found)) == 3)
-    assert len([each for each in rejected(events) if each.kind == "skipped_polls"]) >= 3
-    sequences = [each.sequence for each in readings(events)]
+    events = polled(Device(lambda: 1.0, slow, lambda: 3.0), lambda found: len(found.readings) == 3)
+    assert len([each for each in events.refused if each.kind == "skipped_polls"]) >= 3
+    sequences = [each.sequence for each in events.readings]
     assert sequences[2] is not None and sequences[2] >= 5
 
 
@@ -168,7 +156,7 @@ def test_commands_are_written_between_polls_and_the_sender_sees_a_refusal(monkey
 
 def test_stop_does_not_wait_for_the_next_poll_and_delivers_nothing_afterwards() -> None:
     source = Device(period_s=30.0)
-    events: list[SourceEvent] = []
+    events = Delivered()
     source.start(events.append)
     while len(events) < 2:
         time.sleep(0.001)

@@ -24,12 +24,12 @@ from fantwin.pipeline.sources.json_samples import LARGEST_BYTES
 from fantwin.pipeline.sources.source import (
     LinkUp,
     Reading,
-    ReadingBatch,
     ReadingLimits,
     SourceContext,
     SourceEvent,
 )
 from fantwin.stages.acquisition import STAGE
+from tests.support.delivered import Delivered
 from tests.support.ports import free_port
 from tests.support.running_acquisition import push_config
 from tests.support.running_chain import eventually
@@ -45,8 +45,8 @@ def source_of(folder: Path = Path(), **settings: Any) -> HttpSource:
 
 
 @contextmanager
-def running(source: HttpSource, deliver: Any = None) -> Iterator[list[SourceEvent]]:
-    events: list[SourceEvent] = []
+def running(source: HttpSource, deliver: Any = None) -> Iterator[Delivered]:
+    events = Delivered()
     source.start(deliver or events.append)
     if deliver is None:
         eventually(lambda: events, "it listens, or not")
@@ -93,7 +93,7 @@ def test_an_answer_says_what_became_of_each_sample() -> None:
         assert (counts["tray"], counts["fans"], counts["speed_unit"]) == ("tray1", 2, "rpm")
         eventually(lambda: len(events) >= 9, "all are delivered, so that acquisition counts them, too")
     assert isinstance(events[0], LinkUp)
-    assert isinstance(events[1], ReadingBatch) and isinstance(events[1].items[0], Reading)
+    assert isinstance(events.items[0], Reading)
 
 
 def test_an_acquisition_that_is_behind_turns_samples_away_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -19,12 +19,10 @@ from fantwin.pipeline.sources.mqtt.config import MqttConfig
 from fantwin.pipeline.sources.mqtt.source import FanValues, MqttSource
 from fantwin.pipeline.sources.source import (
     LinkUp,
-    Reading,
-    ReadingBatch,
     Rejected,
     SourceContext,
-    SourceEvent,
 )
+from tests.support.delivered import Delivered
 from tests.support.mqtt_broker import MqttBroker
 from tests.support.ports import free_port
 from tests.support.running_chain import eventually
@@ -56,17 +54,6 @@ def source_of(port: int, folder: Path = Path(), **settings: Any) -> MqttSource:
     return MqttSource(config, SourceContext(2, "rpm", folder))
 
 
-class Events(list[SourceEvent]):
-    """What a source has delivered."""
-
-    def of(self, kind: type[Any]) -> list[Any]:
-        return [event for event in self if isinstance(event, kind)]
-
-    @property
-    def items(self) -> list[Reading | Rejected]:
-        return [item for batch in self.of(ReadingBatch) for item in batch.items]
-
-
 def message_of(topic: str, payload: bytes) -> paho.MQTTMessage:
     message = paho.MQTTMessage(topic=topic.encode())
     message.payload = payload
@@ -74,8 +61,8 @@ def message_of(topic: str, payload: bytes) -> paho.MQTTMessage:
 
 
 @contextmanager
-def running(source: MqttSource) -> Iterator[Events]:
-    events = Events()
+def running(source: MqttSource) -> Iterator[Delivered]:
+    events = Delivered()
     source.start(events.append)
     eventually(lambda: events, "it is connected, or not")
     yield events
@@ -107,12 +94,12 @@ def test_a_message_that_the_broker_sends_again_is_left_out(broker: MqttBroker) -
 def test_a_topic_of_a_former_subscription_is_refused_and_unsubscribed(
     settings: dict[str, Any], own: str, foreign: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    source, events, unsubscribed = source_of(1, **settings), Events(), list[str]()
+    source, events, unsubscribed = source_of(1, **settings), Delivered(), list[str]()
     monkeypatch.setattr(source._client, "unsubscribe", unsubscribed.append)
     source._deliver = events.append
     for topic in (foreign, own, foreign):
         source._on_message(None, None, message_of(topic, b"100" if settings is NUMBERS else SAMPLE.encode()))
-    kinds = [item.kind for item in events.items if isinstance(item, Rejected)]
+    kinds = [item.kind for item in events.refused]
     assert kinds.count("foreign_topic") == 2 and "malformed" not in kinds
     assert set(unsubscribed) == {foreign}
 
@@ -126,11 +113,11 @@ def test_numbers_of_single_fans_become_readings_of_the_tray(broker: MqttBroker, 
         for fan, rpm in ((1, "1001"), (2, "2000"), (1, "1002"), (1, "1003"), (2, "2001"), (2, "fast")):
             publish(f"plant/fan{fan}/rpm", rpm)
         eventually(lambda: getattr(events.items[-1], "kind", "") == "malformed" if events.items else False, "all came")
-    readings = [item for item in events.items if isinstance(item, Reading)]
+    readings = events.readings
     assert [reading.command for reading in readings] == [(0.4, 0.6)] * 3
     speeds = [tuple("-" if math.isnan(v) else f"{v:g}" for v in reading.speed) for reading in readings]
     assert speeds == [("1001", "2000"), ("1002", "-"), ("1003", "2001")]
-    kinds = [item.kind for item in events.items if isinstance(item, Rejected)]
+    kinds = [item.kind for item in events.refused]
     assert kinds == ["retained", "no_command", "malformed"]
     publish("plant/fan1/pwm", "", retain=True)
     publish("plant/fan2/rpm", "", retain=True)
@@ -195,7 +182,7 @@ def test_with_a_client_id_the_broker_keeps_messages_while_acquisition_is_away(tm
         client.loop_stop()
         with running(source_of(port, **settings)) as events:
             eventually(lambda: len(events.items) == 3, "what was published meanwhile comes")
-        assert [item.clock_us for item in events.items if isinstance(item, Reading)] == [0, 1_000_000, 2_000_000]
+        assert [reading.clock_us for reading in events.readings] == [0, 1_000_000, 2_000_000]
     finally:
         process.terminate()
         process.wait()
