@@ -62,17 +62,15 @@ def parse_samples(text: bytes) -> list[TimedReading | Rejected]:
             raise JsonSamplesError('a sample is {"t": ..., "command": [...], "speed": [...]}, or a list of such')
         try:
             timed = _timed_reading(sample)
-            if (
-                timed.t_ns is not None
-                and newest_t_ns is not None
-                and not 0 < timed.t_ns - newest_t_ns < LARGEST_PERIOD_NS
-            ):
-                found.append(Rejected("time_order", "t does not increase, or by more than a day", is_sample=True))
-                continue
-            newest_t_ns = newest_t_ns if timed.t_ns is None else timed.t_ns
-            found.append(timed)
         except ValueError as error:
             found.append(Rejected("malformed", str(error), is_sample=True))
+            continue
+        if timed.t_ns is not None:
+            if newest_t_ns is not None and not 0 < timed.t_ns - newest_t_ns < LARGEST_PERIOD_NS:
+                found.append(Rejected("time_order", "t does not increase, or by more than a day", is_sample=True))
+                continue
+            newest_t_ns = timed.t_ns
+        found.append(timed)
     return found
 
 
