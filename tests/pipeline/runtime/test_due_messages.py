@@ -33,7 +33,7 @@ def raw(tray: str, sequence: int, samples: int = 1, fans: int = 2, producer: str
 
 
 def request(tray: str, sequence: int) -> Envelope:
-    return envelope("request", Request(t_ns=1, action=Action.RESET, header=Header("operator", sequence, tray)))
+    return envelope("request", Request(t_ns=1, action=Action.IN_SERVICE, header=Header("operator", sequence, tray)))
 
 
 def envelope(topic: str, message: Message) -> Envelope:
