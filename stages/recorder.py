@@ -17,7 +17,8 @@ import shutil
 from contextlib import suppress
 
 from fantwin.pipeline.config.registry import RECORDER, STAGES
-from fantwin.pipeline.recordings.clips.alarm_clips import AlarmClips, listed_clips
+from fantwin.pipeline.recordings.clips.alarm_clips import AlarmClips
+from fantwin.pipeline.recordings.clips.clip import clips_in, list_path
 from fantwin.pipeline.recordings.clips.cutting import ClipCutter
 from fantwin.pipeline.recordings.clips.tracker import ClipTracker
 from fantwin.pipeline.recordings.disk import DiskError
@@ -80,12 +81,8 @@ def _clips_of(parts: RecordingParts, config: RecorderConfig) -> AlarmClips:
     most_bytes = 0
     with suppress(DiskError):  # it does not say its size: the health reports that
         most_bytes = round(parts.disk_bytes() * config.keep_share_of_disk * CLIPS_SHARE)
-    listed = listed_clips(parts.path)
-    tracker = ClipTracker(listed, most_bytes)
-    clips = AlarmClips(tracker, parts.path, ClipCutter(parts.path, parts.free_bytes, config.min_free_bytes).cut)
-    if parts.last_part:
-        clips.continue_after(parts.last_part)
-    return clips
+    tracker = ClipTracker(clips_in(list_path(parts.path)), most_bytes)
+    return AlarmClips(tracker, parts.path, ClipCutter(parts.path, parts.free_bytes, config.min_free_bytes).cut)
 
 
 def check(context: Context) -> list[str]:

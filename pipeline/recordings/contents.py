@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from fantwin.pipeline.recordings.disk import is_being_written
-from fantwin.pipeline.recordings.indexed import IndexedRecording, PartIndex
+from fantwin.pipeline.recordings.indexed import IndexedRecording
 from fantwin.pipeline.recordings.reading import METADATA_NAME
 from fantwin.pipeline.recordings.records import CORRUPT_DATA_ERRORS, indexed_reader
 from fantwin.pipeline.recordings.run_recordings import RECORDING_KEY
@@ -122,11 +122,9 @@ def damage_of(found: Scan) -> tuple[str, ...]:
         (not found.is_ended, TRUNCATED),
         (found.is_ended and not found.has_index, NO_INDEX),
         (found.discarded_bytes, f"{NOT_A_RECORD}: {found.discarded_bytes}"),
-        (found.damaged_chunks, f"damaged chunks: {found.damaged_chunks}"),
-        (found.damaged_records, f"damaged records: {found.damaged_records}"),
-        (found.damaged_attachments, f"damaged attachments: {found.damaged_attachments}"),
+        *((count, f"damaged {kind}: {count}") for kind, count in found.damaged.items()),
         (found.lacking and not found.is_damaged, f"messages that its ledger counts and that are gone: {found.lacking}"),
-        (found.nameless, f"messages of channels without a name: {found.nameless}"),
+        (found.nameless, f"messages whose channel is damaged: {found.nameless}"),
         (found.counts.undecodable, f"messages that do not have the type of their channel: {found.counts.undecodable}"),
     )
     return tuple(line for is_so, line in lines if is_so)
@@ -195,7 +193,7 @@ def _by_index(path: Path, file: BinaryIO) -> Contents | None:
     if any(counts.messages > held.get(key, 0) for key, counts in sum_by_key(streams.items()).items()):
         return None  # somebody has removed messages: reading all of it tells which
     last = MessageCounts()
-    for envelope in IndexedRecording(PartIndex(path, summary.channels, summary.chunk_indexes), (HEALTH, TWIN)):
+    for envelope in IndexedRecording(path, (HEALTH, TWIN)):
         last.add(envelope.key, envelope.received_t_ns, envelope.payload)
     return Contents(
         path=path,

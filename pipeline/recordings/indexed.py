@@ -1,37 +1,32 @@
 """A recording read by its index: only the chunks that have messages of the topics asked for.
 
-Messages of a topic of which a recording has few are found so without reading the rest.
+Messages of a topic of which a recording has few are found so without reading the rest. A file without an index, such as
+one that is still being written, gets one in memory: from the headers of its chunks, of which few are opened.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+import struct
+from collections.abc import Collection, Iterator
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Self
 
-from mcap.records import Channel, ChunkIndex
+from mcap.opcode import Opcode
+from mcap.records import Channel, Chunk, ChunkIndex
 
 from fantwin.pipeline.recordings.reading import Reading, read_recording
 from fantwin.pipeline.recordings.records import (
     ACTIVE_SUFFIX,
     CORRUPT_DATA_ERRORS,
+    RecordReader,
     chunk_at,
-    indexed_reader,
     may_hold,
+    parse,
+    records_in,
+    summary_of,
 )
 from fantwin.schemas.codec import CodecError
 from fantwin.schemas.envelope import Envelope
-
-
-@dataclass(frozen=True)
-class PartIndex:
-    """Where the chunks of a file are."""
-
-    path: Path
-    channels: Mapping[int, Channel]
-    chunks: Sequence[ChunkIndex]
 
 
 class IndexedRecording:
@@ -43,31 +38,25 @@ class IndexedRecording:
         chunks: those that may hold messages of these channels.
     """
 
-    def __init__(self, index: PartIndex, topics: Collection[str] | None = None, tray: str | None = None) -> None:
-        """topics, tray: those wanted; None: all. The health of stages belongs to no tray, and is wanted with any."""
-        self._path = index.path
-        self.reading = Reading(index.path, topics, tray)
+    def __init__(self, path: Path, topics: Collection[str] | None = None, tray: str | None = None) -> None:
+        """topics, tray: those wanted; None: all. The health of stages belongs to no tray, and is wanted with any.
+
+        Raises:
+            OSError, RecordingError: the file cannot be read, is not a recording, or is of an unknown format.
+        """
+        self._path = path
+        self.reading = Reading(path, topics, tray)
         self.channels: dict[int, tuple[str, str]] = {}
-        for channel in index.channels.values():
+        summary = summary_of(path)
+        channels, chunks = summary.channels, summary.chunk_indexes
+        if not chunks:
+            channels, chunks = _index_of(path)
+        for channel in channels.values():
             self.reading.add_channel(channel, self.channels)
-        in_order = sorted(index.chunks, key=lambda chunk: chunk.chunk_start_offset)
+        in_order = sorted(chunks, key=lambda chunk: chunk.chunk_start_offset)
         self.chunks = [chunk for chunk in in_order if may_hold(chunk, self.channels.keys())]
         self.first_ns = min((chunk.message_start_time for chunk in in_order), default=0)
         self.last_ns = max((chunk.message_end_time for chunk in in_order), default=0)
-
-    @classmethod
-    def of(cls, path: Path, topics: Collection[str] | None = None, tray: str | None = None) -> Self | None:
-        """None if the file has no index that lists chunks.
-
-        Raises:
-            OSError: it cannot be read.
-            RecordingError: it is of an unknown format.
-        """
-        with suppress(LookupError, *CORRUPT_DATA_ERRORS), path.open("rb") as file:
-            summary = indexed_reader(file).get_summary()
-            if summary and summary.chunk_indexes:
-                return cls(PartIndex(path, summary.channels, summary.chunk_indexes), topics, tray)
-        return None
 
     @property
     def file(self) -> Path:
@@ -75,10 +64,6 @@ class IndexedRecording:
         if self._path.name.endswith(ACTIVE_SUFFIX) and not self._path.exists():
             return self._path.with_name(self._path.name.removesuffix(ACTIVE_SUFFIX))
         return self._path
-
-    def channels_of(self, key: str) -> set[int]:
-        """The numbers of the channels of a key."""
-        return {number for number, (name, _) in self.channels.items() if name == key}
 
     def envelopes(self, chunk: ChunkIndex) -> list[Envelope]:
         """The wanted messages of a chunk, as bytes.
@@ -97,20 +82,58 @@ class IndexedRecording:
             yield from self.envelopes(chunk)
 
 
+def _index_of(path: Path) -> tuple[dict[int, Channel], list[ChunkIndex]]:
+    """The channels and chunks of a file without an index. Only chunks that describe a channel are opened."""
+    channels: dict[int, Channel] = {}
+    chunks: list[ChunkIndex] = []
+    reader = RecordReader(path)
+    for record in reader:
+        if isinstance(record.parsed, Channel):
+            channels[record.parsed.id] = record.parsed
+        elif isinstance(chunk := record.parsed, Chunk):
+            chunks.append(
+                ChunkIndex(
+                    chunk_length=record.end - record.offset,
+                    chunk_start_offset=record.offset,
+                    compression=chunk.compression,
+                    compressed_size=len(chunk.data),
+                    message_end_time=chunk.message_end_time,
+                    message_index_length=0,
+                    message_index_offsets={},
+                    message_start_time=chunk.message_start_time,
+                    uncompressed_size=chunk.uncompressed_size,
+                )
+            )
+        elif record.opcode == Opcode.MESSAGE_INDEX and chunks:
+            chunks[-1].message_index_offsets[struct.unpack_from("<H", record.content)[0]] = record.offset
+    for number, chunk in enumerate(chunks):
+        held = chunk.message_index_offsets
+        if reader.damaged_ranges or number == len(chunks) - 1:
+            held.clear()  # some may be missing: `may_hold` then takes it for any channel
+        if not (held and held.keys() <= channels.keys()):
+            channels |= _channels_in(path, chunk)
+    return channels, chunks
+
+
+def _channels_in(path: Path, chunk: ChunkIndex) -> dict[int, Channel]:
+    """The channels that a chunk describes; none if it is damaged."""
+    with suppress(*CORRUPT_DATA_ERRORS), path.open("rb") as file:
+        data = chunk_at(file, chunk)
+        described = (data[start:end] for _, opcode, start, end in records_in(data) if opcode == Opcode.CHANNEL)
+        return {channel.id: channel for channel in (parse(Channel, content) for content in described)}
+    return {}
+
+
 def rare_messages(path: Path, topic: str) -> list[Envelope]:
     """The messages of a topic in the order they were recorded; those that cannot be decoded are left out.
 
-    They are found by the file's index. If it has none, as after a crash, or something is damaged, the whole file is
-    read.
+    They are found by the file's index. If something is damaged, the whole file is read.
 
     Raises:
         RecordingError: the file cannot be read or is not a recording.
     """
-    try:
-        if indexed := IndexedRecording.of(path, (topic,)):
-            return [envelope for envelope in indexed if envelope.message]
-    except (OSError, CodecError, *CORRUPT_DATA_ERRORS):
-        pass  # reading all of it reports what is wrong
+    with suppress(OSError, CodecError, *CORRUPT_DATA_ERRORS):
+        return [envelope for envelope in IndexedRecording(path, (topic,)) if envelope.message]
     return list(read_recording(path, (topic,)))
 
 
@@ -121,26 +144,23 @@ def last_messages(path: Path, topic: str) -> dict[str, bytes]:
         RecordingError: the file cannot be read or is not a recording.
     """
     found: dict[str, bytes] = {}
-    try:
-        if indexed := IndexedRecording.of(path, (topic,)):
-            for chunk in reversed(indexed.chunks):
-                missing = {number for number, (key, _) in indexed.channels.items() if key not in found}
-                if missing and may_hold(chunk, missing):
-                    found = {envelope.key: envelope.payload for envelope in indexed.envelopes(chunk)} | found
-            return found
-    except (OSError, *CORRUPT_DATA_ERRORS):
-        pass
+    with suppress(OSError, *CORRUPT_DATA_ERRORS):
+        indexed = IndexedRecording(path, (topic,))
+        for chunk in reversed(indexed.chunks):
+            missing = {number for number, (key, _) in indexed.channels.items() if key not in found}
+            if missing and may_hold(chunk, missing):
+                found = {envelope.key: envelope.payload for envelope in indexed.envelopes(chunk)} | found
+        return found
     return {envelope.key: envelope.payload for envelope in rare_messages(path, topic)}
 
 
 def last_message_ns(path: Path) -> int:
-    """When the last message of a finished recording was received; 0 if its index does not say it.
+    """When the last message of a recording was received; 0 without any.
 
     Raises:
-        RecordingError: it is of an unknown format.
+        RecordingError: it is not a recording, or of an unknown format.
     """
     try:
-        indexed = IndexedRecording.of(path)
+        return IndexedRecording(path).last_ns
     except OSError:
         return 0
-    return indexed.last_ns if indexed else 0

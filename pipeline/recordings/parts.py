@@ -153,8 +153,8 @@ class RecordingParts:
         except OSError as error:
             raise refused(f"{path}: cannot be written", error, "name another file or folder") from error
         last = self._last_part()
-        self._last = self.last_part = last.path if last else None
-        """the part before the next one, and before the first one"""
+        self._last = last.path if last else None
+        """the part before the next one"""
         self._writer: RecordingWriter | None = None
         self.before = last.next if last else {}
         """the sequence number due of each stream after the last part"""

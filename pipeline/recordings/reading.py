@@ -25,6 +25,7 @@ from fantwin.pipeline.recordings.records import (
     RecordReader,
     chunk_data,
     parse,
+    summary_of,
 )
 from fantwin.schemas.codec import CodecError
 from fantwin.schemas.envelope import Envelope
@@ -99,7 +100,8 @@ class Reading:
             self.damaged_chunks = corrupt + len(reader.damaged_ranges)
             if self.damaged_chunks and not has_summary:
                 has_summary = True
-                self._add_channels_of_summary(channels)
+                for channel in summary_of(self.path).channels.values():
+                    self.add_channel(channel, channels)
             try:
                 if isinstance(record.parsed, Chunk):
                     envelopes = self.envelopes_in(chunk_data(record.parsed), channels)
@@ -132,12 +134,6 @@ class Reading:
                 self.add_channel(parse(Channel, data[at : at + length]), channels)
             at += length
         return envelopes
-
-    def _add_channels_of_summary(self, channels: dict[int, tuple[str, str]]) -> None:
-        """Add the channels that the summary at the end of the file declares again, if there is one."""
-        for record in RecordReader(self.path):
-            if record.opcode == Opcode.CHANNEL:
-                self.envelopes_in(record.data, channels)
 
     def add_channel(self, channel: Channel, channels: dict[int, tuple[str, str]]) -> None:
         """Add a channel to `channels`, by its id, if its messages are wanted."""

@@ -11,7 +11,6 @@ from fantwin.pipeline.recordings.clips.alarm_clips import AlarmClips
 from fantwin.pipeline.recordings.disk import DiskError
 from fantwin.pipeline.recordings.disk_room import DiskRoom
 from fantwin.pipeline.recordings.held_messages import HeldMessages
-from fantwin.pipeline.recordings.indexed import PartIndex
 from fantwin.pipeline.recordings.interference import Interference
 from fantwin.pipeline.recordings.parts import RecordingParts
 from fantwin.pipeline.recordings.reading import RecordingError
@@ -131,9 +130,7 @@ class Recorder(Core):
             self._unflushed_ns = None if self._unflushed_ns is None else self._flushed_ns  # due at once
         self._now_ns = now_ns
         if self._part and self._is_flush_due():
-            self._unflushed_ns, self._flushed_ns = None, now_ns
-            self._unflushed_bytes, self._is_urgent = 0, False
-            self._attempt(self._part.flush)
+            self._flush()
         if now_ns - self._checked_ns >= DISK_CHECK_NS:
             self._checked_ns = now_ns
             if self._part:
@@ -148,8 +145,7 @@ class Recorder(Core):
             if not self._problem:
                 self._attempt(lambda: self._begin({}))
         if self._clips:
-            held_since_ns = self._held.first_received_t_ns
-            self._clips.tick(now_ns, self._index, self._unflushed_ns if held_since_ns is None else held_since_ns)
+            self._clips.tick(now_ns, self._flush)
         return ()
 
     def close(self) -> Sequence[Message]:
@@ -160,7 +156,7 @@ class Recorder(Core):
             self._attempt(lambda: self._end_part(has_ended=True))
         self._counts["lost_unwritten"] += len(self._held.take_all())
         if self._clips:
-            self._clips.close(self._index)
+            self._clips.close()
         return ()
 
     def abort(self) -> None:
@@ -201,8 +197,15 @@ class Recorder(Core):
         """Whether a recorder before this one has recorded the message."""
         return item.header.sequence < self._before.get((item.key, item.header.producer), 0)
 
-    def _index(self) -> PartIndex | None:
-        return self._part.index() if self._part else None
+    def _flush(self) -> bool:
+        """Bring all messages to the disk; False if it refuses."""
+        if self._part:
+            self._unflushed_ns, self._flushed_ns = None, self._now_ns
+            self._unflushed_bytes, self._is_urgent = 0, False
+            if self._clips:
+                self._clips.save()
+            self._attempt(self._part.flush)
+        return not self.unsaved()
 
     def _record(self, envelope: Envelope) -> None:
         if self._part is None:
@@ -237,8 +240,7 @@ class Recorder(Core):
     def _is_flush_due(self) -> bool:
         """Return whether a message would be unflushed for too long at the next tick; not at every tick behind a
         backlog."""
-        is_clip_running = self._clips is not None and self._clips.tracker.needed_since_ns is not None
-        is_soon = self._is_urgent or is_clip_running or self._unflushed_bytes >= FLUSH_BYTES
+        is_soon = self._is_urgent or self._unflushed_bytes >= FLUSH_BYTES
         flush_ns = self._soon_ns if is_soon else self._flush_ns
         return (
             self._unflushed_ns is not None
@@ -259,6 +261,8 @@ class Recorder(Core):
         if self._part is None:
             return
         try:
+            if self._clips:
+                self._clips.save()
             for health in self._healths.take_waiting():
                 self._part.add(health)
             self._part.finish(has_ended=has_ended)

@@ -40,8 +40,7 @@ class RecorderConfig(StageConfig):
         default=120.0,
         gt=0,
         description="longest time between flushes to the disk; a crash of the machine loses at most this much. A "
-        f"flush comes after {FLUSH_S:g} s if {FLUSH_BYTES >> 10} KiB, an alarm, a request, a twin or a problem waits, "
-        "or while a clip is running",
+        f"flush comes after {FLUSH_S:g} s if {FLUSH_BYTES >> 10} KiB, an alarm, a request, a twin or a problem waits",
     )
     keep_days: float = Field(
         default=14.0, ge=0, description="older recordings are deleted; 0: none is deleted because of its age"

@@ -26,6 +26,7 @@ from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.reader import McapReader, SeekingReader
 from mcap.records import Attachment, Channel, Chunk, ChunkIndex, Header, McapRecord, Metadata, Schema
+from mcap.summary import Summary
 from mcap.writer import MCAP0_MAGIC
 from zstandard import ZstdDecompressor, ZstdError, frame_content_size
 
@@ -281,6 +282,19 @@ def indexed_reader(file: BinaryIO) -> McapReader:
         _check_format(_second_record(file), file.name)
     file.seek(0)
     return SeekingReader(file, record_size_limit=LARGEST_RECORD_BYTES)
+
+
+def summary_of(path: Path) -> Summary:
+    """The summary section of a file; an empty one if it has none that can be read.
+
+    Raises:
+        OSError, RecordingError: the file cannot be read, or is of an unknown format.
+    """
+    with path.open("rb") as file:
+        try:
+            return indexed_reader(file).get_summary() or Summary()
+        except (LookupError, *CORRUPT_DATA_ERRORS):
+            return Summary()
 
 
 def _second_record(file: BinaryIO) -> McapRecord | None:

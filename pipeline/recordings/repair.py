@@ -1,7 +1,7 @@
 """Repair of truncated and damaged recordings: every intact message is kept, and the file gets a ledger, index and end.
 
-What a killed recorder left is repaired in place: that needs little room and no copy. Every other repair writes a new
-file. Nothing is removed before its replacement is on the disk. See docs/reference/recordings.md.
+What a killed recorder left is ended in place, without an index: that needs little room and no copy. Every other repair
+writes a new file. Nothing is removed before its replacement is on the disk. See docs/reference/recordings.md.
 """
 
 from __future__ import annotations
@@ -21,7 +21,6 @@ from mcap.writer import MCAP0_MAGIC, Writer
 from fantwin.pipeline.files import sync_folder
 from fantwin.pipeline.recordings.contents import NOT_A_RECORD, losses_outside_counts
 from fantwin.pipeline.recordings.disk import AtomicAppendFile, not_being_written, refused
-from fantwin.pipeline.recordings.ending import write_ending
 from fantwin.pipeline.recordings.records import (
     ACTIVE_SUFFIX,
     MESSAGE,
@@ -32,7 +31,7 @@ from fantwin.pipeline.recordings.records import (
 )
 from fantwin.pipeline.recordings.scan import Scan, scan
 from fantwin.pipeline.recordings.sequence_ledger import LEDGER_NAME, ledger_metadata
-from fantwin.pipeline.recordings.writing import CHUNK_BYTES, free_name
+from fantwin.pipeline.recordings.writing import CHUNK_BYTES, free_name, write_short_ending
 
 ORIGINAL_SUFFIX = ".original"
 _UNFINISHED_SUFFIX = ".recovering"
@@ -88,8 +87,9 @@ def repair_in_place(active: Path) -> Recovery | None:
             return None
         if found.is_damaged:
             return _recover(active, None)
-        if not found.is_intact:
-            write_ending(file, found, _ledger_of(found))
+        if not found.reader.is_complete:
+            file.cut(found.data_end)
+            write_short_ending(file, _ledger_of(found))
         name = _finished_name(active)
         active.rename(name)
         sync_folder(name.parent)
@@ -160,10 +160,10 @@ def _write_repaired(found: Scan, file: BinaryIO) -> None:
     """Write everything intact in a file, and a ledger that names what was lost."""
     writer = Writer(file, CHUNK_BYTES)
     writer.start(found.profile, "fantwin")
-    schemas = {s.id: writer.register_schema(s.name, s.encoding, s.data) for s in found.index.schemas.values()}
+    schemas = {s.id: writer.register_schema(s.name, s.encoding, s.data) for s in found.schemas.values()}
     channels = {
         c.id: writer.register_channel(c.topic, c.message_encoding, schemas.get(c.schema_id, 0), c.metadata)
-        for c in found.index.channels.values()
+        for c in found.channels.values()
     }
     for record in RecordReader(found.path, for_repair=True):
         if record.offset in found.damaged_offsets:

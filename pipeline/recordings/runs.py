@@ -7,7 +7,7 @@ The time of a sample is computed as in the pipeline, from the device clock if th
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
@@ -88,19 +88,14 @@ def read_runs(
         payloads = pending.setdefault(tray_of(envelope.key), [])
         payloads.append(envelope.payload)
         if len(payloads) == MERGED_MESSAGES:
-            if messages := _decoded(payloads, reading):
-                by_tray.setdefault(tray_of(envelope.key), []).extend(messages)
+            if decoded := _decoded(payloads, reading):
+                by_tray.setdefault(tray_of(envelope.key), []).extend(decoded)
             payloads.clear()
     for name, payloads in pending.items():
-        if messages := by_tray.get(name, []) + _decoded(payloads, reading):
-            by_tray[name] = messages
-    if not by_tray:
-        why = left_out_hint([path], ("raw",)) or "correct --tray, or name another recording"
-        raise RecordingError(f"{path}: no raw samples{f' of tray {tray!r}' if tray else ''} in this recording: {why}")
-    if len(by_tray) > 1:
-        raise RecordingError(f"{path}: several trays, {', '.join(sorted(by_tray))}: choose one with --tray")
-    ((name, messages),) = by_tray.items()
-    found = recorded_tray(path, name, messages, reading.damage, fans).between(from_s, to_s)
+        if decoded := by_tray.get(name, []) + _decoded(payloads, reading):
+            by_tray[name] = decoded
+    name = only_tray(path, by_tray, tray)
+    found = recorded_tray(path, name, by_tray[name], reading.damage, fans).between(from_s, to_s)
     if not found.runs:
         raise no_samples(path, from_s, to_s)
     return found
@@ -113,6 +108,21 @@ def _decoded(payloads: Sequence[bytes], reading: Reading) -> list[Raw]:
     except CodecError:
         reading.undecodable += len(payloads) == 1
         return [raw for payload in payloads for raw in _decoded([payload], reading)] if len(payloads) > 1 else []
+
+
+def only_tray(path: Path, trays: Collection[str], chosen: str | None = None) -> str:
+    """The tray that has raw samples. chosen: the only one that was looked for.
+
+    Raises:
+        RecordingError: there is none, or there are several.
+    """
+    if not trays:
+        why = left_out_hint([path], ("raw",)) or "correct --tray, or name another recording"
+        of_tray = f" of tray {chosen!r}" if chosen else ""
+        raise RecordingError(f"{path}: no raw samples{of_tray} in this recording: {why}")
+    if len(trays) > 1:
+        raise RecordingError(f"{path}: several trays, {', '.join(sorted(trays))}: choose one with --tray")
+    return next(iter(trays))
 
 
 def no_samples(path: Path, from_s: float, to_s: float) -> RecordingError:

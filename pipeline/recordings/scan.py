@@ -4,24 +4,12 @@ from __future__ import annotations
 
 import struct
 from collections import Counter
-from collections.abc import Collection
 from dataclasses import dataclass, field
 from pathlib import Path
 from zlib import crc32
 
 from mcap.opcode import Opcode
-from mcap.records import (
-    Attachment,
-    AttachmentIndex,
-    Channel,
-    Chunk,
-    ChunkIndex,
-    Header,
-    Metadata,
-    MetadataIndex,
-    Schema,
-)
-from mcap.summary import Summary
+from mcap.records import Attachment, Channel, Chunk, Header, Metadata, Schema
 from mcap.writer import MCAP0_MAGIC
 
 from fantwin.pipeline.recordings.reading import METADATA_NAME, left_out_of
@@ -32,9 +20,9 @@ from fantwin.pipeline.recordings.records import (
     RecordingError,
     RecordReader,
     chunk_data,
-    indexed_reader,
     parse,
     records_in,
+    summary_of,
 )
 from fantwin.pipeline.recordings.sequence_ledger import (
     BEFORE_NAME,
@@ -50,6 +38,8 @@ from fantwin.pipeline.recordings.sequence_ledger import (
 )
 from fantwin.schemas.streams import StreamId
 
+_KINDS = {int(Opcode.CHUNK): "chunks", int(Opcode.ATTACHMENT): "attachments"}
+
 
 @dataclass
 class Scan:
@@ -58,10 +48,10 @@ class Scan:
     path: Path
     reader: RecordReader
     profile: str = ""
-    index: Summary = field(default_factory=Summary)
-    """of what is intact, without statistics"""
-    written: Counter[int] = field(default_factory=Counter[int])
-    """intact messages by channel"""
+    schemas: dict[int, Schema] = field(default_factory=dict[int, Schema])
+    channels: dict[int, Channel] = field(default_factory=dict[int, Channel])
+    messages: int = 0
+    """intact ones, on channels of any origin"""
     first_ns: int | None = None
     """first and last time of receipt; None without a message"""
     last_ns: int | None = None
@@ -79,12 +69,10 @@ class Scan:
     is_ended: bool = False
     """the data has its end: nothing was recorded after what is here"""
     has_index: bool = False
-    damaged_chunks: int = 0
-    damaged_attachments: int = 0
-    damaged_records: int = 0
-    """others"""
+    damaged: Counter[str] = field(default_factory=Counter[str])
+    """chunks, attachments and other records that are damaged"""
     nameless: int = 0
-    """messages whose channel was described in a damaged chunk"""
+    """messages whose channel was described in a damaged chunk, and nowhere else"""
     discarded_bytes: int = 0
     """in records that are not whole"""
     damaged_offsets: set[int] = field(default_factory=set)
@@ -95,8 +83,7 @@ class Scan:
     @property
     def is_damaged(self) -> bool:
         """Something in the middle cannot be read."""
-        records = self.damaged_chunks + self.damaged_attachments + self.damaged_records
-        return bool(self.reader.damaged_ranges or records or self.nameless)
+        return bool(self.reader.damaged_ranges or self.damaged or self.nameless)
 
     @property
     def is_intact(self) -> bool:
@@ -110,11 +97,6 @@ class Scan:
         return sum(
             max(0, counts.messages - found.get(stream, StreamCounts()).messages) for stream, counts in recorded.items()
         )
-
-    @property
-    def messages(self) -> int:
-        """Number of messages, on channels of any origin."""
-        return self.written.total()
 
     @property
     def streams(self) -> dict[StreamId, StreamCounts]:
@@ -133,7 +115,12 @@ def scan(path: Path) -> Scan:
     """
     found = Scan(path, RecordReader(path, for_repair=True))
     try:
-        footer = _read_to_footer(found)
+        footer: Record | None = None
+        for record in found.reader:
+            if found.is_ended:
+                footer = record
+            else:
+                _add(found, record)
         found.has_index = footer is not None and found.reader.is_complete and _has_valid_summary(path, footer)
     except OSError as error:  # it was finished, and given its name, while it was read
         raise RecordingError(f"{path}: cannot read the recording: {error.strerror}; is it finished now?") from error
@@ -143,156 +130,78 @@ def scan(path: Path) -> Scan:
     return found
 
 
-def _read_to_footer(found: Scan) -> Record | None:
-    scanner = _Scanner(found)
-    footer: Record | None = None
-    for record in found.reader:
-        if found.is_ended:
-            footer = record
-        else:
-            scanner.add(record)
-    scanner.end_chunk()
-    return footer
+def _add(found: Scan, record: Record) -> None:
+    """Add a record of the data section."""
+    try:
+        _add_intact(found, record)
+    except CORRUPT_DATA_ERRORS:
+        found.damaged[_KINDS.get(record.opcode, "records")] += 1
+        found.damaged_offsets.add(record.offset)
+        found.discarded_bytes += record.end - record.offset
+    else:
+        found.data_end = found.data_end if found.is_ended else record.end
 
 
-class _Scanner:
-    """Adds the records of the data section to a Scan."""
+def _add_intact(found: Scan, record: Record) -> None:
+    match record.parsed:
+        case Chunk() as chunk:
+            _add_records(found, chunk_data(chunk))
+        case Metadata(name=name, metadata=metadata):
+            _add_metadata(found, name, metadata)
+        case Attachment(name=name):
+            found.attachments.append(name)
+        case Header(profile=profile) if record.offset == len(MCAP0_MAGIC):
+            found.profile = profile
+        case Schema() | Channel():
+            _add_records(found, record.data)
+        case None if record.opcode == Opcode.MESSAGE:
+            if MESSAGE.unpack_from(record.content)[0] not in found.channels:
+                raise ValueError("a message without a channel")
+            _add_records(found, record.data)
+        case None if record.opcode == Opcode.MESSAGE_INDEX:
+            pass
+        case None if record.opcode == Opcode.DATA_END and len(record.content) == 4:
+            found.is_ended = True
+        case _:
+            raise ValueError(f"a record of kind {record.opcode} in the data section, or a damaged one")
 
-    def __init__(self, found: Scan) -> None:
-        self._found = found
-        self._summary: Summary | None = None
-        self._nameless: set[int] = set()
-        self._channels: Collection[int] = ()
-        """of the last chunk"""
 
-    def add(self, record: Record) -> None:
-        found = self._found
-        try:
-            self._add(record)
-        except CORRUPT_DATA_ERRORS:
-            found.damaged_offsets.add(record.offset)
-            found.discarded_bytes += record.end - record.offset
-            found.damaged_chunks += record.opcode == Opcode.CHUNK
-            found.damaged_attachments += record.opcode == Opcode.ATTACHMENT
-            found.damaged_records += record.opcode not in (Opcode.CHUNK, Opcode.ATTACHMENT)
+def _add_metadata(found: Scan, name: str, metadata: dict[str, str]) -> None:
+    if name == LEDGER_NAME:
+        found.recorded = counts_from_metadata(metadata)
+        found.has_ended = ENDED in metadata
+        found.recovered = recovered_from_metadata(metadata)
+        found.is_ended = True
+    elif name == METADATA_NAME:
+        found.metadata.update(metadata)
+        found.counts.ledger.left_out = left_out_of(metadata)
+    elif name == BEFORE_NAME:
+        found.before = before_from_metadata(metadata)
+        found.counts.ledger = SequenceLedger(found.before, found.counts.ledger.left_out)
 
-    def _add(self, record: Record) -> None:
-        found, index, length = self._found, self._found.index, record.end - record.offset
-        match record.parsed:
-            case Chunk() as chunk:
-                self._add_chunk(record, chunk)
-            case Metadata(name=name, metadata=metadata) if name == LEDGER_NAME:
-                found.recorded = counts_from_metadata(metadata)
-                found.has_ended = ENDED in metadata
-                found.recovered = recovered_from_metadata(metadata)
-                found.is_ended = True
-                return
-            case Metadata() as metadata:
-                self._add_metadata(metadata)
-                index.metadata_indexes.append(MetadataIndex(record.offset, length, metadata.name))
-            case Attachment() as a:
-                found.attachments.append(a.name)
-                index.attachment_indexes.append(
-                    AttachmentIndex(record.offset, length, a.log_time, a.create_time, len(a.data), a.name, a.media_type)
-                )
-            case Schema() | Channel() as description:
-                self._describe(description)
-            case Header(profile=profile) if record.offset == len(MCAP0_MAGIC):
-                found.profile = profile
-            case None if record.opcode == Opcode.MESSAGE:
-                self._add_unchunked(record)
-            case None if record.opcode == Opcode.MESSAGE_INDEX and index.chunk_indexes:
-                chunk_index = index.chunk_indexes[-1]
-                (channel,) = struct.unpack_from("<H", record.content)
-                chunk_index.message_index_offsets[channel] = record.offset
-                chunk_index.message_index_length += length
-            case None if record.opcode == Opcode.MESSAGE_INDEX:
-                pass
-            case None if record.opcode == Opcode.DATA_END and len(record.content) == 4:
-                found.is_ended = True
-                return
-            case _:
-                raise ValueError(f"a record of kind {record.opcode} in the data section, or a damaged one")
-        found.data_end = record.end
 
-    def _add_metadata(self, metadata: Metadata) -> None:
-        found = self._found
-        if metadata.name == METADATA_NAME:
-            found.metadata.update(metadata.metadata)
-            found.counts.ledger.left_out = left_out_of(metadata.metadata)
-        elif metadata.name == BEFORE_NAME:
-            found.before = before_from_metadata(metadata.metadata)
-            found.counts.ledger = SequenceLedger(found.before, found.counts.ledger.left_out)
-
-    def _add_unchunked(self, record: Record) -> None:
-        """A message outside of chunks, as other writers may write them."""
-        channel, _, received_t_ns, _ = MESSAGE.unpack_from(record.content)
-        if channel not in self._found.index.channels:
-            raise ValueError("a message without a channel")
-        key = self._found.index.channels[channel].topic
-        self._found.counts.add(key, received_t_ns, record.content[MESSAGE.size :])
-        self._found.written[channel] += 1
-        self._add_times(received_t_ns, received_t_ns)
-
-    def _add_chunk(self, record: Record, chunk: Chunk) -> None:
-        found, channels, data = self._found, self._found.index.channels, chunk_data(chunk)
-        self.end_chunk()
-        written: Counter[int] = Counter()
-        for _, opcode, start, end in records_in(data):
-            if opcode == Opcode.MESSAGE:
-                channel, _, received_t_ns, _ = MESSAGE.unpack_from(data, start)
-                if channel not in channels:
-                    self._describe_from_summary(channel)
-                written[channel] += 1
-                found.counts.add(channels[channel].topic, received_t_ns, data[start + MESSAGE.size : end])
-            elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                self._describe(parse(Schema if opcode == Opcode.SCHEMA else Channel, data[start:end]))
-        found.nameless += sum(written[channel] for channel in written.keys() & self._nameless)
-        found.written.update(written)
-        self._channels = written.keys()
-        if written:
-            self._add_times(chunk.message_start_time, chunk.message_end_time)
-        found.index.chunk_indexes.append(
-            ChunkIndex(
-                message_start_time=chunk.message_start_time,
-                message_end_time=chunk.message_end_time,
-                chunk_start_offset=record.offset,
-                chunk_length=record.end - record.offset,
-                message_index_offsets={},
-                message_index_length=0,
-                compression=chunk.compression,
-                compressed_size=len(chunk.data),
-                uncompressed_size=chunk.uncompressed_size,
-            )
-        )
-
-    def end_chunk(self) -> None:
-        """Forget the message indexes of the last chunk if some are missing: a reader then looks for each channel."""
-        for last in self._found.index.chunk_indexes[-1:]:
-            if last.message_index_offsets.keys() != self._channels:
-                last.message_index_offsets, last.message_index_length = {}, 0
-
-    def _add_times(self, first_ns: int, last_ns: int) -> None:
-        found = self._found
-        found.first_ns = first_ns if found.first_ns is None else min(found.first_ns, first_ns)
-        found.last_ns = last_ns if found.last_ns is None else max(found.last_ns, last_ns)
-
-    def _describe(self, description: Schema | Channel) -> None:
-        if isinstance(description, Schema):
-            self._found.index.schemas[description.id] = description
-        else:
-            self._found.index.channels[description.id] = description
-
-    def _describe_from_summary(self, number: int) -> None:
-        """A channel that was described in a damaged chunk: taken from the summary, or else left without a name."""
-        self._summary = self._summary or summary_of(self._found.path)
-        channel = self._summary.channels.get(number)
-        if channel is None:
-            self._nameless.add(number)
-            channel = Channel(number, f"lost/{number}", "", {}, 0)
-        elif channel.schema_id in self._summary.schemas:
-            self._describe(self._summary.schemas[channel.schema_id])
-        self._describe(channel)
+def _add_records(found: Scan, data: bytes) -> None:
+    """Add the records of a chunk, or one that is in no chunk."""
+    for _, opcode, start, end in records_in(data):
+        if opcode == Opcode.SCHEMA:
+            schema = parse(Schema, data[start:end])
+            found.schemas[schema.id] = schema
+        elif opcode == Opcode.CHANNEL:
+            channel = parse(Channel, data[start:end])
+            found.channels[channel.id] = channel
+        elif opcode == Opcode.MESSAGE:
+            number, _, received_t_ns, _ = MESSAGE.unpack_from(data, start)
+            if number not in found.channels and not found.nameless:  # it was described in a damaged chunk
+                summary = summary_of(found.path)
+                found.channels = summary.channels | found.channels
+                found.schemas = summary.schemas | found.schemas
+            if number not in found.channels:
+                found.nameless += 1
+                continue
+            found.messages += 1
+            found.first_ns = received_t_ns if found.first_ns is None else min(found.first_ns, received_t_ns)
+            found.last_ns = received_t_ns if found.last_ns is None else max(found.last_ns, received_t_ns)
+            found.counts.add(found.channels[number].topic, received_t_ns, data[start + MESSAGE.size : end])
 
 
 def _has_valid_summary(path: Path, footer: Record) -> bool:
@@ -303,12 +212,3 @@ def _has_valid_summary(path: Path, footer: Record) -> bool:
         file.seek(start)
         summary = file.read(max(0, footer.end - 4 - start))
     return not crc or crc32(summary) == crc
-
-
-def summary_of(path: Path) -> Summary:
-    """The summary section of a file; an empty one if it has none that can be read."""
-    with path.open("rb") as file:
-        try:
-            return indexed_reader(file).get_summary() or Summary()
-        except CORRUPT_DATA_ERRORS:
-            return Summary()

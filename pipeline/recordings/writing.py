@@ -15,17 +15,15 @@ from functools import cache
 from itertools import chain, count
 from pathlib import Path
 from types import TracebackType
-from typing import IO, NamedTuple, NoReturn, Self, cast
+from typing import IO, NoReturn, Self, cast
 
-from mcap.records import Channel, ChunkIndex
+from mcap.records import DataEnd, Footer, Metadata
 from mcap.well_known import MessageEncoding, SchemaEncoding
-from mcap.writer import Writer
+from mcap.writer import MCAP0_MAGIC, Writer
 from mcap_protobuf.schema import build_file_descriptor_set
 
 from fantwin.pipeline.files import sync_folder
 from fantwin.pipeline.recordings.disk import AtomicAppendFile, Disk, refused
-from fantwin.pipeline.recordings.ending import write_short_ending
-from fantwin.pipeline.recordings.indexed import PartIndex
 from fantwin.pipeline.recordings.records import (
     FORMAT_KEY,
     MADE_BY_KEY,
@@ -34,6 +32,7 @@ from fantwin.pipeline.recordings.records import (
     RECORD,
     RecordingError,
     active_path,
+    record_bytes,
     this_program,
 )
 from fantwin.pipeline.recordings.sequence_ledger import BEFORE_NAME, LEDGER_NAME, SequenceLedger, ledger_metadata
@@ -95,12 +94,11 @@ class RecordingWriter:
         """messages that were flushed and are lost with the file, because it could not be restored"""
         self._filling: list[Envelope] = []
         """the messages of the chunk that is not written yet"""
-        self._unsynced: list[_WrittenChunk] = []
-        """chunks that are written and may not be on the disk yet"""
+        self._unsynced: list[Envelope] = []
+        """the messages that are written and may not be on the disk yet"""
         self._unsynced_bytes = 0
         self._overwrite = overwrite
         self._ended = False
-        self._chunks: list[ChunkIndex] = []
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
         self._chunk_bytes = 0
@@ -140,12 +138,7 @@ class RecordingWriter:
     @property
     def pending(self) -> list[Envelope]:
         """The messages that are not flushed to the disk, in order."""
-        return [*chain.from_iterable(chunk.messages for chunk in self._unsynced), *self._filling]
-
-    def index(self) -> PartIndex:
-        """What is flushed to the disk, and where."""
-        channels = {id: Channel(id, key, MessageEncoding.Protobuf, {}, 0) for key, id in self._channels.items()}
-        return PartIndex(self._active, channels, list(self._chunks))
+        return [*self._unsynced, *self._filling]
 
     def add(self, envelope: Envelope) -> None:
         """Add a message. MCAP has no times before 1970 (the message itself keeps them) and a 32 bit sequence.
@@ -259,7 +252,7 @@ class RecordingWriter:
                 self._file.cut(start)
             self._sync()  # the chunks before it are still saved
             raise self._end_early(error) from error
-        self._unsynced.append(_WrittenChunk(start, self._filling))
+        self._unsynced += self._filling
         self._unsynced_bytes += self._chunk_bytes
         self._filling, self._chunk_bytes = [], 0
 
@@ -271,21 +264,14 @@ class RecordingWriter:
             self._take_back()
             raise self._end_early(error) from error
         self.stay_in_place()
-        for chunk in self._unsynced:
-            self._count(chunk)
-        self._unsynced, self._unsynced_bytes, self._synced_size = [], 0, self._file.size
-
-    def _count(self, chunk: _WrittenChunk) -> None:
-        for envelope in chunk.messages:
+        for envelope in self._unsynced:
             header = envelope.header
             self.ledger.add(envelope.key, header.producer, header.sequence, envelope.received_t_ns)
             if envelope.topic == HEALTH:
                 assert isinstance(envelope.message, Health)
                 self.ledger.add_health(envelope.message)
-        self.written.update(envelope.topic for envelope in chunk.messages)
-        times = [max(0, envelope.received_t_ns) for envelope in chunk.messages]
-        held = {self._channels[key]: 0 for key in {envelope.key for envelope in chunk.messages}}
-        self._chunks.append(ChunkIndex(0, chunk.offset, "zstd", 0, max(times), 0, held, min(times), 0))
+        self.written.update(envelope.topic for envelope in self._unsynced)
+        self._unsynced, self._unsynced_bytes, self._synced_size = [], 0, self._file.size
 
     def _take_back(self) -> None:
         """Remove what may not be on the disk from the file; it is pending again."""
@@ -341,11 +327,16 @@ class RecordingWriter:
             self._file.close()
 
 
-class _WrittenChunk(NamedTuple):
-    """A chunk, to be counted once it is on the disk."""
-
-    offset: int
-    messages: list[Envelope]
+def write_short_ending(file: AtomicAppendFile, ledger: Mapping[str, str]) -> None:
+    """End a file that its writer cannot finish, without an index, as far as the disk allows: readers read it in full.
+    It needs little room and no copy."""
+    end = record_bytes(DataEnd(0), Footer(0, 0, 0)) + MCAP0_MAGIC
+    for data in (record_bytes(Metadata(LEDGER_NAME, dict(ledger))) + end, end, b""):
+        with suppress(OSError):
+            file.write(data)
+            break
+    with suppress(OSError):
+        file.sync()
 
 
 @cache

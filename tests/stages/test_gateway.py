@@ -305,7 +305,7 @@ def test_clips_of_alarms_are_listed_and_downloaded_and_nothing_else_of_the_disk_
     size, window = len(content), (RAISED_NS, RAISED_NS + 9, RAISED_NS)
     kept = Clip("tray1-3-x.mcap", TRAY, *window, alarms, is_due=False, size_bytes=size)
     others = [replace(kept, name="../secret.json"), replace(kept, name="gone.mcap"), replace(kept, tray="tray9")]
-    (folder / "recording.json").write_text(clips_as_text([kept, *others]))
+    (folder / "recording.json").write_bytes(clips_as_text([kept, *others]))
     (folder / kept.name).write_text(content)
     (tmp_path / "runs" / "secret.json").write_text("secret")
     text = f'[[tray]]\nname = "{TRAY}"\nfans = 4\n[recorder]\n[gateway]\n'

@@ -11,7 +11,6 @@ import numpy as np
 
 from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.recordings.disk import DiskError
-from fantwin.pipeline.recordings.indexed import PartIndex
 from fantwin.pipeline.recordings.parts import RecordingParts
 from fantwin.pipeline.recordings.reading import RecordingError
 from fantwin.pipeline.recordings.recorder import Recorder
@@ -82,9 +81,6 @@ class Part(RecordingWriter):
     @property
     def pending(self) -> list[Envelope]:
         return self.waiting
-
-    def index(self) -> PartIndex:
-        return PartIndex(self.path, {}, ())
 
     def add(self, envelope: Envelope) -> None:
         self._touch()

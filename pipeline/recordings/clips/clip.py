@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Collection, Iterable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from itertools import chain, count
 from pathlib import Path
 from typing import Any
+
+from pydantic import TypeAdapter
 
 from fantwin.pipeline.recordings.dates import format_utc
 from fantwin.pipeline.recordings.reading import read_metadata
@@ -21,8 +25,6 @@ CLIP_KEY = "clip"
 CLIP_SNAPSHOT_KEY = "clip_snapshot_t_ns"
 """in the metadata of a clip that begins in the middle of a scorer's session: time of the snapshot in it from which the
 session continues"""
-NOT_A_LIST = (OSError, ValueError, TypeError, KeyError)
-"""what `clips_in` raises where there is no list of clips"""
 
 
 @dataclass(frozen=True)
@@ -62,10 +64,10 @@ class Clip:
 
     def with_acknowledged(self, alarm: Alarm) -> Clip:
         """After a message that says that nothing about this fan waits for an operator."""
-        alarms = list(self.alarms)
-        for place, each in enumerate(self.alarms):
-            if each.fan == alarm.fan and not each.acknowledged and each.t_ns <= alarm.t_ns:
-                alarms[place] = replace(each, acknowledged=True)
+        alarms = (
+            replace(each, acknowledged=each.acknowledged or (each.fan == alarm.fan and each.t_ns <= alarm.t_ns))
+            for each in self.alarms
+        )
         return replace(self, alarms=tuple(alarms))
 
     def about(self) -> dict[str, Any]:
@@ -74,15 +76,12 @@ class Clip:
         return {"tray": self.tray, "since_ns": self.since_ns, "until_ns": self.until_ns, "alarms": of_alarms}
 
 
-def clip_name(alarm: Alarm, taken: Iterable[str]) -> str:
+def clip_name(alarm: Alarm, taken: Collection[str]) -> str:
     """TRAY-FAN-UTCTIME.mcap; with a number if that is taken."""
     at = datetime.fromtimestamp(alarm.t_ns / NS_PER_S, UTC).strftime("%Y%m%dT%H%M%SZ")
     stem = f"{alarm.header.tray}-{alarm.fan}-{at}"
-    names = set(taken)
-    number = 1
-    while (name := f"{stem}.mcap" if number == 1 else f"{stem}-{number}.mcap") in names:
-        number += 1
-    return name
+    names = chain([f"{stem}.mcap"], (f"{stem}-{number}.mcap" for number in count(2)))
+    return next(name for name in names if name not in taken)
 
 
 def clip_folder(recording: Path) -> Path:
@@ -95,31 +94,26 @@ def list_path(recording: Path) -> Path:
     return clip_folder(recording) / f"{recording.stem}.json"
 
 
-def clips_as_text(clips: Iterable[Clip]) -> str:
+_LIST = TypeAdapter(dict[str, list[Clip]])
+
+
+def clips_as_text(clips: Iterable[Clip]) -> bytes:
     """The content of a list of clips."""
-    return json.dumps({"clips": [asdict(clip) for clip in clips]}, indent=1)
+    return _LIST.dump_json({"clips": list(clips)}, indent=1)
 
 
 def clips_in(path: Path) -> list[Clip]:
-    """The clips of a list, the oldest first.
-
-    Raises one of NOT_A_LIST.
-    """
-    return [
-        Clip(**{**values, "alarms": tuple(ClipAlarm(**alarm) for alarm in values["alarms"])})
-        for values in json.loads(path.read_text())["clips"]
-    ]
+    """The clips of a list, the oldest first; none where there is no list that can be read."""
+    with suppress(OSError, ValueError, KeyError):
+        return _LIST.validate_json(path.read_bytes())["clips"]
+    return []
 
 
 def kept_clips(folder: Path) -> list[Clip]:
     """The clips of all recordings of a folder that have a file, the newest first; of lists that cannot be read none."""
     found: list[Clip] = []
     for path in sorted(folder.glob("*.json")):
-        try:
-            clips = clips_in(path)
-        except NOT_A_LIST:
-            continue
-        named = [clip for clip in clips if clip.size_bytes and Path(clip.name).name == clip.name]
+        named = [clip for clip in clips_in(path) if clip.size_bytes and Path(clip.name).name == clip.name]
         found += [clip for clip in named if (folder / clip.name).is_file()]
     return sorted(found, key=lambda clip: clip.since_ns, reverse=True)
 

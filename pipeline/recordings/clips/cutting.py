@@ -22,19 +22,23 @@ from fantwin.pipeline.files import sync_folder
 from fantwin.pipeline.recordings.clips.clip import CLIP_KEY, CLIP_SNAPSHOT_KEY, Clip, clip_folder
 from fantwin.pipeline.recordings.clips.tracker import SET_BACK_NS, CutResult
 from fantwin.pipeline.recordings.disk import DiskError, is_being_written, refused
-from fantwin.pipeline.recordings.indexed import IndexedRecording, PartIndex
+from fantwin.pipeline.recordings.excerpts import CLOCK_MARGIN_S
+from fantwin.pipeline.recordings.indexed import IndexedRecording
 from fantwin.pipeline.recordings.parts import part_files
 from fantwin.pipeline.recordings.reading import TACHO_KEY, RecordingMetadata, read_metadata
-from fantwin.pipeline.recordings.records import CORRUPT_DATA_ERRORS, RecordingError, active_path, may_hold
+from fantwin.pipeline.recordings.records import (
+    CORRUPT_DATA_ERRORS,
+    RecordingError,
+    UnreadableError,
+    active_path,
+    may_hold,
+)
 from fantwin.pipeline.recordings.run_recordings import RECORDING_KEY
-from fantwin.pipeline.recordings.scan import scan
 from fantwin.pipeline.recordings.writing import RecordingWriter
 from fantwin.schemas.envelope import Envelope
-from fantwin.schemas.topics import BY_NAME, HEALTH, tray_key
+from fantwin.schemas.topics import BY_NAME, HEALTH
 from fantwin.schemas.units import NS_PER_S
 
-CLOCK_MARGIN_S = 90.0
-"""the sliding window of the device clock, and time to approach its line (pipeline.recordings.excerpts)"""
 LEAD_S = 200.0
 """snapshots of large trays are three minutes apart at 100 Hz"""
 LEAD_NS = round((CLOCK_MARGIN_S + LEAD_S) * NS_PER_S)
@@ -69,20 +73,20 @@ class ClipCutter:
     min_free_bytes: int = 0
     margin_s: float = CLOCK_MARGIN_S
 
-    def cut(self, clip: Clip, open_part: PartIndex | None = None) -> CutResult:
-        """Write a clip, and say what came of it. open_part: of the part that is being written, what is flushed."""
+    def cut(self, clip: Clip) -> CutResult:
+        """Write a clip, and say what came of it."""
         folder = clip_folder(self.recording)
         unfinished = folder / f"{UNFINISHED}{clip.name}"
         try:
             folder.mkdir(parents=True, exist_ok=True)
             self._require(self.min_free_bytes + ROOM_BYTES)
-            lacks = self._write(clip, unfinished, open_part)
+            lacks = self._write(clip, unfinished)
             size_bytes = unfinished.stat().st_size
             unfinished.replace(folder / clip.name)
             sync_folder(folder)
             return CutResult(clip.name, size_bytes, lacks)
         except RecordingError as error:
-            failed = CutResult(clip.name, problem=str(error), may_pass=isinstance(error, DiskError))
+            failed = CutResult(clip.name, problem=str(error), may_pass=isinstance(error, DiskError | UnreadableError))
         except OSError as error:
             why = refused(f"{folder}: cannot be written", error, "make room, or correct the folder")
             failed = CutResult(clip.name, problem=str(why), may_pass=True)
@@ -91,26 +95,21 @@ class ClipCutter:
                 path.unlink(missing_ok=True)
         return failed
 
-    def _write(self, clip: Clip, path: Path, open_part: PartIndex | None) -> str:
+    def _write(self, clip: Clip, path: Path) -> str:
         """Write a clip to a file. Returns what it lacks. Raises RecordingError, OSError."""
         margin_ns, lead_ns = round(self.margin_s * NS_PER_S), round(LEAD_S * NS_PER_S)
-        parts = _parts_since(self.recording, open_part, clip.tray, clip.judged_since_ns - lead_ns - margin_ns)
-        site = next((key.split("/")[1] for part in parts for key, _ in part.channels.values()), "")
-        snapshot = _last_before(parts, tray_key(site, clip.tray, "snapshot"), clip.judged_since_ns)
+        parts = _parts_since(self.recording, clip.tray, clip.judged_since_ns - lead_ns - margin_ns)
+        snapshot = _last_before(parts, "snapshot", clip.judged_since_ns)
         from_ns = max(snapshot.received_t_ns, clip.judged_since_ns - lead_ns) if snapshot else clip.judged_since_ns
         start_ns = from_ns - margin_ns
         within = [part for part in parts if part.first_ns <= clip.until_ns and part.last_ns >= start_ns]
         if not within:
             raise RecordingError("nothing of that time is recorded any more")
-        try:
-            of_part = read_metadata(within[0].file)
-        except RecordingError as error:  # deleted to make room: at the next attempt it is not among the parts
-            raise DiskError(str(error)) from error
-        metadata, attachments = _about(of_part, clip, start_ns)
+        metadata, attachments = _about(read_metadata(within[0].file), clip, start_ns)
         judged_after_ns = snapshot.newest_t_ns if snapshot else None
         if judged_after_ns is not None:
             metadata[CLIP_SNAPSHOT_KEY] = str(judged_after_ns)
-        twin = _last_before(parts, tray_key(site, clip.tray, "twin"), start_ns)
+        twin = _last_before(parts, "twin", start_ns)
         lacks, topics = "", set[str]()
         with RecordingWriter(path, metadata, attachments, t_ns=start_ns, overwrite=True) as writer:
             for each in filter(None, (twin, snapshot)):
@@ -150,7 +149,7 @@ def remove_unfinished(folder: Path) -> None:
                 path.unlink()
 
 
-def _parts_since(recording: Path, open_part: PartIndex | None, tray: str, t_ns: int) -> list[IndexedRecording]:
+def _parts_since(recording: Path, tray: str, t_ns: int) -> list[IndexedRecording]:
     """The parts with a message from this time on, and PARTS_SEARCHED before them, the oldest first; of a tray.
 
     Where the host's clock was set back after a part, it is the last: all before it have later times, and may be
@@ -158,7 +157,7 @@ def _parts_since(recording: Path, open_part: PartIndex | None, tray: str, t_ns: 
     """
     found: list[IndexedRecording] = []
     before = 0
-    for part in _parts_backwards(recording, open_part, tray):
+    for part in _parts_backwards(recording, tray):
         was_set_back = bool(found) and part.first_ns > found[-1].first_ns + SET_BACK_NS
         found.append(part)
         before += part.last_ns < t_ns
@@ -167,32 +166,25 @@ def _parts_since(recording: Path, open_part: PartIndex | None, tray: str, t_ns: 
     return found[::-1]
 
 
-def _parts_backwards(recording: Path, open_part: PartIndex | None, tray: str) -> Iterator[IndexedRecording]:
+def _parts_backwards(recording: Path, tray: str) -> Iterator[IndexedRecording]:
     """The parts of a recording, the newest first; those that cannot be read are left out."""
-    files = sorted(part_files(recording), reverse=True)
-    if open_part and open_part.chunks and open_part.path in (path for _, path in files):
-        yield IndexedRecording(open_part, tray=tray)
-    for _, path in files:
-        if path.suffix == recording.suffix:
-            with suppress(OSError, RecordingError):
-                if read_metadata(path).metadata.get(RECORDING_KEY) == recording.name:
-                    part = IndexedRecording.of(path, tray=tray)
-                    if part is None:
-                        found = scan(path).index
-                        part = IndexedRecording(PartIndex(path, found.channels, found.chunk_indexes), tray=tray)
-                    if part.chunks:
-                        yield part
+    for _, path in sorted(part_files(recording), reverse=True):
+        with suppress(OSError, RecordingError):
+            if read_metadata(path).metadata.get(RECORDING_KEY) == recording.name:
+                part = IndexedRecording(path, tray=tray)
+                if part.chunks:
+                    yield part
 
 
-def _last_before(parts: Sequence[IndexedRecording], key: str, t_ns: int) -> Envelope | None:
-    """The last message of a key that was received up to this time."""
+def _last_before(parts: Sequence[IndexedRecording], topic: str, t_ns: int) -> Envelope | None:
+    """The last message of a topic that was received up to this time."""
     for part in reversed(parts):
-        numbers = part.channels_of(key)
+        numbers = {number for number, (_, name) in part.channels.items() if name == topic}
         for chunk in reversed(part.chunks):
             if chunk.message_start_time > t_ns or not may_hold(chunk, numbers):
                 continue
             with suppress(OSError, *CORRUPT_DATA_ERRORS):
-                found = [each for each in part.envelopes(chunk) if each.key == key and each.received_t_ns <= t_ns]
+                found = [each for each in part.envelopes(chunk) if each.topic == topic and each.received_t_ns <= t_ns]
                 if found:
                     return found[-1]
     return None

@@ -106,7 +106,7 @@ def test_beyond_the_limit_acknowledged_clips_go_and_without_any_new_ones_are_not
     for number in range(3):
         follow(of, alarm(number, number * 200.0))
         cut(of, number * 200.0 + 70)
-    assert of.to_delete() is None
+    assert of.oldest_acknowledged is None
     follow(of, alarm(3, 600.0))
     assert cut(of, 670) == []
     assert of.counts["clips_not_kept"] == 1
@@ -114,10 +114,10 @@ def test_beyond_the_limit_acknowledged_clips_go_and_without_any_new_ones_are_not
     assert len(of.clips) == 3
     acknowledged = alarm(1, 700.0, transition=Transition.ACKNOWLEDGED, acknowledged=True)
     follow(of, acknowledged)
-    clip = of.to_delete()
-    assert clip and clip.alarms[0].fan == 1
+    clip = of.oldest_acknowledged
+    assert of.is_full and clip and clip.alarms[0].fan == 1
     of.deleted(clip)
-    assert of.to_delete() is None
+    assert not of.is_full
     assert of.problem() == ""
     follow(of, alarm(4, 800.0))
     assert len(cut(of, 870)) == 1
@@ -149,7 +149,7 @@ def test_only_clips_with_a_file_are_listed_and_damaged_lists_have_none(tmp_path:
     of = tracker()
     follow(of, alarm(), alarm(1, 200.0), alarm(2, 400.0))
     cut(of, 470)
-    (tmp_path / "recording.json").write_text(clips_as_text(of.clips))
+    (tmp_path / "recording.json").write_bytes(clips_as_text(of.clips))
     (tmp_path / "1-of-2.recording.json").write_text('{"clips": [{"name": 3}]}')
     for clip in of.clips[:2]:
         (tmp_path / clip.name).touch()

@@ -9,7 +9,7 @@ from typing import NoReturn
 import pytest
 from mcap.opcode import Opcode
 
-from fantwin.pipeline.recordings.contents import contents_of
+from fantwin.pipeline.recordings.contents import NO_INDEX, contents_of
 from fantwin.pipeline.recordings.parts import RecordingParts
 from fantwin.pipeline.recordings.reading import RecordingError, read_metadata, read_recording
 from fantwin.pipeline.recordings.records import RecordReader
@@ -108,7 +108,7 @@ def test_the_file_of_a_killed_recorder_is_repaired_and_continued(tmp_path):
     assert [(recovery.path.name, recovery.found.messages) for recovery in place.repaired] == [("r.mcap", 40)]
     assert sequences(tmp_path / "r.mcap") == list(range(40))
     assert read_recording(tmp_path / "r.mcap").damage == ""
-    assert contents_of(tmp_path / "r.mcap").damage == ()
+    assert contents_of(tmp_path / "r.mcap").damage == (NO_INDEX,)
     assert names(tmp_path) == ["r.mcap"]
 
 

@@ -63,7 +63,7 @@ def test_a_file_truncated_at_any_byte_is_recovered_up_to_its_last_intact_chunk_a
     assert scan(output).is_intact
     assert truncated.read_bytes() == content[:size]
     assert repaired is not None and repaired.path.name == "a.mcap"
-    assert read_by_others(repaired.path) == read_by_others(output)
+    assert [each.payload for each in read_recording(repaired.path)] == [each.payload for each in read_recording(output)]
     assert read_metadata(repaired.path) == read_metadata(output)
     in_place, copy = contents_of(repaired.path), contents_of(output)
     assert (in_place.streams, in_place.recovered) == (copy.streams, copy.recovered)
@@ -175,8 +175,8 @@ def test_a_changed_byte_costs_at_most_its_record(tmp_path, whole, at, value):
     recover(path, output)
     messages = read_by_others(output)
     assert len(messages) >= 41 - 6, "at most one chunk"
-    assert scan(output).is_intact or scan(output).nameless
-    assert {name for name, _ in messages} <= {RAW_KEY, ALARM_KEY, "lost/1"}
+    assert scan(output).is_intact
+    assert {name for name, _ in messages} <= {RAW_KEY, ALARM_KEY}
 
 
 def test_a_damaged_metadata_record_is_left_out(tmp_path):
@@ -185,7 +185,7 @@ def test_a_damaged_metadata_record_is_left_out(tmp_path):
         writer.add_message(RAW_KEY, raw(7), 1000)
     content = path.read_bytes()
     path.write_bytes(content.replace(b"acquisition-1\x01\x00\x00\x007", b"acquisition-1\x01\x00\x00\x00x"))
-    assert recover(path).found.damaged_records == 1
+    assert recover(path).found.damaged == {"records": 1}
     assert scan(path).is_intact
     assert len(read_by_others(path)) == 1
 

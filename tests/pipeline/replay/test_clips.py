@@ -41,7 +41,7 @@ def cut(source: Path, folder: Path, left_out: tuple[str, ...] = ()) -> Path:
     """The clip of the first alarm of a recording, from its parts, the last of which is still being written."""
     clip = clip_of(first_raised(source), before_s=0.5, after_s=2.0)
     core = record(source, folder / "recording.mcap", left_out, part_s=1.0)
-    result = cutter(folder / "recording.mcap", margin_s=MARGIN_S).cut(clip, core._index())
+    result = cutter(folder / "recording.mcap", margin_s=MARGIN_S).cut(clip)
     core.close()
     assert result.size_bytes == (folder / "clips" / clip.name).stat().st_size
     assert not result.problem
