@@ -5,8 +5,10 @@ from __future__ import annotations
 import os
 import secrets
 import stat
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from fantwin.pipeline.errors import UserError
 
@@ -84,6 +86,21 @@ def make_folder(folder: Path) -> Path:
     except OSError as error:
         raise UserError(f"{folder}: cannot be created: {error.strerror}; name another folder with -o") from error
     return folder
+
+
+@contextmanager
+def temporary_folder(beside: Path) -> Iterator[Path]:
+    """A folder in another one, which is created if it is missing; deleted with its content at the end.
+
+    Raises:
+        UserError: it cannot be created.
+    """
+    try:
+        temporary = TemporaryDirectory(dir=make_folder(beside), prefix=".fantwin-")
+    except OSError as error:
+        raise UserError(f"{beside}: cannot be written: {error.strerror}; name another folder with -o") from error
+    with temporary as name:
+        yield Path(name)
 
 
 def sync_folder(folder: Path) -> None:

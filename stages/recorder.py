@@ -50,25 +50,8 @@ def build(context: Context) -> BuiltStage:
         metadata[LEFT_OUT_KEY] = ",".join(left_out)
     try:
         parts = RecordingParts(context.own_file(config.file), metadata, attachments, session=secrets.token_hex(4))
-        for recovery in parts.repaired:
-            found = recovery.found
-            _LOG.warning(
-                "a recorder was killed; its recording was repaired and is %s: %d messages; bytes of an unfinished "
-                "chunk discarded: %d",
-                recovery.path,
-                found.messages,
-                found.discarded_bytes,
-            )
-        for path, why in parts.unreadable.items():
-            _LOG.warning(
-                "a recorder was killed; its recording cannot be repaired and was renamed to %s: %s", path.name, why
-            )
-        for path in parts.unrepaired:
-            _LOG.warning(
-                "a recorder was killed; the disk refuses the repair of its recording, which stays %s: make room and "
-                "start again, or use `fantwin info --repair`",
-                path,
-            )
+        for line in parts.remarks:
+            _LOG.warning("%s", line)
         own = {tray_key(context.site, tray.name, topic) for tray in context.trays for topic in KEEPS}
         kept = {key: last for topic in KEEPS for key, last in parts.last_messages(topic).items() if key in own}
         clips = _clips_of(parts, config) if config.clips else None
@@ -81,7 +64,7 @@ def _clips_of(parts: RecordingParts, config: RecorderConfig) -> AlarmClips:
     most_bytes = 0
     with suppress(DiskError):  # it does not say its size: the health reports that
         most_bytes = round(parts.disk_bytes() * config.keep_share_of_disk * CLIPS_SHARE)
-    tracker = ClipTracker(clips_in(list_path(parts.path)), most_bytes)
+    tracker = ClipTracker(clips_in(list_path(parts.path)), most_bytes, kept_s=86_400 * config.keep_days)
     return AlarmClips(tracker, parts.path, ClipCutter(parts.path, parts.free_bytes, config.min_free_bytes).cut)
 
 

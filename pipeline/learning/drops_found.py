@@ -12,7 +12,7 @@ import numpy as np
 from fantwin.pipeline.learning.versions import Drop
 from fantwin.pipeline.prediction.tray_twin import TrayTwin, load_tray_twin
 from fantwin.pipeline.replay.offline.calibration_of_twin import calibration_in
-from fantwin.pipeline.replay.offline.healthy_runs import FreeLimit
+from fantwin.pipeline.replay.offline.healthy_runs import Limit
 from fantwin.pipeline.tray_scoring.healthy_twin import modelled_fans
 from fantwin.schemas.enums import InvalidReason
 from fantwin.schemas.messages import Array, Prediction
@@ -60,7 +60,7 @@ def smallest_drops(twin: TrayTwin, calibration: Calibration) -> Array:
     fans = each.of(np.full(count, fan))
     period_ns = round(NS_PER_S / twin.card.rate_hz)
     bin_ns = bin_ns_of(period_ns, float(fans.held_s.min()))
-    limit = FreeLimit(calibration.priors, 86400.0 / calibration.false_alarms_per_day)
+    limit = Limit(calibration.priors, 86400.0 / calibration.false_alarms_per_day).free()
     decision = limit.decision(fans, bin_ns, period_ns)
     bins = Bins(bin_ns, fans.top_rad_s, fans.reads_balance, None)
     speed_rad_s, drop = np.repeat(SPEEDS, len(DROPS)) * fans.top_rad_s, np.tile(DROPS, len(SPEEDS))

@@ -13,9 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from fantwin.pipeline.recordings.parts import Seen, in_order
-from fantwin.pipeline.recordings.reading import RecordingError, read_recording
-from fantwin.schemas.envelope import Envelope
+from fantwin.pipeline.recordings.parts import Seen, in_order, read_parts
+from fantwin.pipeline.recordings.reading import RecordingError
 from fantwin.schemas.fields import (
     LARGEST_ENUM_VALUE,
     Array,
@@ -89,7 +88,8 @@ class Arrays:
     def __iter__(self) -> Iterator[Block]:
         self.damage, self.duplicated = [], 0
         gathered: dict[tuple[str, str, str], _Gathered] = {}
-        for envelope in self._envelopes():
+        seen = Seen()
+        for envelope in read_parts(self.paths, self.topics, self.damage, self.tray, seen):
             if not _rows(envelope.message):
                 continue
             source = (*_site_and_tray(envelope.key), envelope.topic)
@@ -102,24 +102,9 @@ class Arrays:
             pending.add(envelope.message)
             if pending.rows >= self.rows:
                 yield gathered.pop(source).block()
+        self.duplicated = seen.repeated
         for rest in gathered.values():
             yield rest.block()
-
-    def _envelopes(self) -> Iterator[Envelope]:
-        """The messages of all parts, each once."""
-        seen: dict[tuple[str, str], Seen] = {}
-        for path in self.paths:
-            reading = read_recording(path, self.topics)
-            for envelope in reading:
-                if self.tray is not None and _site_and_tray(envelope.key)[1] not in ("", self.tray):
-                    continue
-                header = envelope.message.header
-                if seen.setdefault((envelope.key, header.producer), Seen()).is_new(header.sequence):
-                    yield envelope
-                else:
-                    self.duplicated += 1
-            if reading.damage:
-                self.damage.append(reading.damage)
 
 
 def read_arrays(recording: Path | Iterable[Path], topic: str, tray: str | None = None, rows: int = 4096) -> Arrays:

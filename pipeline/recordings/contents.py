@@ -10,7 +10,7 @@ from typing import BinaryIO
 from fantwin.pipeline.recordings.disk import is_being_written
 from fantwin.pipeline.recordings.indexed import IndexedRecording
 from fantwin.pipeline.recordings.reading import METADATA_NAME
-from fantwin.pipeline.recordings.records import CORRUPT_DATA_ERRORS, indexed_reader
+from fantwin.pipeline.recordings.records import CORRUPT_DATA_ERRORS, check_format, indexed_reader
 from fantwin.pipeline.recordings.run_recordings import RECORDING_KEY
 from fantwin.pipeline.recordings.scan import Scan, scan
 from fantwin.pipeline.recordings.sequence_ledger import (
@@ -82,6 +82,7 @@ def contents_of(path: Path) -> Contents:
     Raises:
         RecordingError: it cannot be read, or is not an MCAP file.
     """
+    check_format(path)
     try:
         with path.open("rb") as file:
             found = _by_index(path, file)
@@ -130,7 +131,7 @@ def damage_of(found: Scan) -> tuple[str, ...]:
     return tuple(line for is_so, line in lines if is_so)
 
 
-def losses(found: Scan) -> list[str]:
+def losses_of(found: Scan) -> list[str]:
     """What is missing, or may be, one line each; empty if nothing is."""
     missing = [
         f"{key}: {messages_as_text(counts.missing)} of {producer} missing in between"

@@ -1,8 +1,7 @@
-"""The limits on a part and on the disk space of recordings and clips, and the deletions that keep them.
+"""The limits on a part and on the disk space of recordings, and the deletions that keep them.
 
 The oldest recordings are deleted when they are older than `keep_days`, when all recordings and clips of the folder
-exceed `keep_share_of_disk`, or when the disk is nearly full. A clip is deleted with the parts of its time, once its
-alarms are acknowledged.
+exceed `keep_share_of_disk`, or when the disk is nearly full. The last finished part stays.
 """
 
 from __future__ import annotations
@@ -11,13 +10,10 @@ import logging
 import math
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NamedTuple
 
-from fantwin.pipeline.recordings.clips.alarm_clips import AlarmClips
-from fantwin.pipeline.recordings.clips.clip import Clip
-from fantwin.pipeline.recordings.disk import Disk, DiskError
+from fantwin.pipeline.recordings.disk import Disk
 from fantwin.pipeline.recordings.parts import LEAST_PART_S, PART_BYTES, PART_S, RecordingParts
 from fantwin.pipeline.recordings.recorder_config import CLIPS_SHARE, PARTS_WITHIN_LIMITS, RecorderConfig
 from fantwin.pipeline.recordings.records import RecordingError
@@ -30,27 +26,13 @@ AGED_S = 3600.0
 _LOG = logging.getLogger(__name__)
 
 
-class _Oldest(NamedTuple):
-    """The part or clip that may be deleted next."""
-
-    last_ns: int
-    part: StoredPart | None = None
-    clip: Clip | None = None
-    is_needed: bool = False
-    """a clip that is still to be cut needs this part"""
-
-
 class DiskRoom:
     """Deletes what exceeds the limits, and says when the disk has too little free space."""
 
     def __init__(
-        self,
-        parts: RecordingParts,
-        config: RecorderConfig,
-        clips: AlarmClips | None,
-        monotonic_s: Callable[[], float] = time.monotonic,
+        self, parts: RecordingParts, config: RecorderConfig, monotonic_s: Callable[[], float] = time.monotonic
     ) -> None:
-        self._parts, self._config, self._clips, self._monotonic_s = parts, config, clips, monotonic_s
+        self._parts, self._config, self._monotonic_s = parts, config, monotonic_s
         self._aged_s = -math.inf
         """time of the last deletion by age alone, by `monotonic_s`"""
         self._spared: Path | None = None
@@ -61,7 +43,6 @@ class DiskRoom:
         self._stored = Stored()
         self._limit_bytes = 0
         self._now_ns = 0
-        self._beyond = ""
         self.counts: Counter[str] = Counter()
 
     @property
@@ -76,37 +57,30 @@ class DiskRoom:
         return max(LEAST_PART_S, min(PART_S, kept_s / PARTS_WITHIN_LIMITS))
 
     def keep_limits(self, now_ns: int, *, has_ended_part: bool = False) -> None:
-        """Delete what is too old, and the oldest that is too much; room for the part that is written is left. The last
-        finished part stays. has_ended_part: a part has just ended, so that one may go by age.
+        """Delete what is too old, and the oldest that is too much; room for the part that is written is left.
+        has_ended_part: a part has just ended, so that one may go by age.
         """
         self._now_ns, self.problem = now_ns, ""
-        try:
-            self._limit_bytes = round(self._parts.disk_bytes() * self._config.keep_share_of_disk)
-        except DiskError as error:
-            self._report(error)
-            return
         if has_ended_part:
             self._aged_s = -math.inf
         since_ns = now_ns - self._config.keep_days * DAY_NS if self._config.keep_days else -math.inf
-        while True:
-            oldest = self._oldest()
-            if oldest is None or oldest.is_needed or self._is_last(oldest):
-                break
-            is_too_much = self._is_too_much()
-            if not is_too_much and not (oldest.last_ns < since_ns and self._may_go_by_age(oldest)):
-                break
-            old = f"older than {self._config.keep_days:g} days (recorder.keep_days)"
-            if not self._delete(oldest, self._too_much() if is_too_much else old):
-                break
-            if oldest.part and not is_too_much:
-                self._aged_s = self._monotonic_s()
-        if not self.problem:
-            self._warn_of_what_is_kept(since_ns, is_all=oldest is None or self._is_last(oldest))
+        try:
+            self._limit_bytes = round(self._parts.disk_bytes() * self._config.keep_share_of_disk)
+            while len(parts := self._look()) > 1:
+                if self._is_too_much():
+                    self._delete(parts[0], self._too_much())
+                elif parts[0].last_ns < since_ns and self._monotonic_s() - self._aged_s >= AGED_S:
+                    self._delete(parts[0], f"older than {self._config.keep_days:g} days (recorder.keep_days)")
+                    self._aged_s = self._monotonic_s()
+                else:
+                    break
+        except RecordingError as error:
+            self._report(error)
 
     def shortage(self, more_bytes: int) -> str:
-        """Why the free space is not enough for `more_bytes`; empty if it is, or if a file was deleted for it.
+        """Why the free space is not enough for `more_bytes`; empty if it is, or if a part was deleted for it.
 
-        One file is deleted for each call, because its space may become free a little later. The last finished part is
+        One part is deleted for each call, because its space may become free a little later. The last finished part is
         kept: if other programs fill the disk, no recording would be left otherwise.
 
         Raises:
@@ -119,12 +93,15 @@ class DiskRoom:
             return ""
         self._parts.disk_bytes()  # raises if the file system does not say its size: nothing is free there either
         self.problem = ""
-        oldest = self._oldest()
-        if oldest and oldest.part and self._is_last(oldest):
-            self._spared = oldest.part.path
-        is_spared = oldest is not None and oldest.part is not None and oldest.part.path == self._spared
-        if oldest and not is_spared and self._delete(oldest, "the disk runs short (recorder.min_free_bytes)"):
-            return ""
+        try:
+            parts = self._look()
+            if len(parts) == 1:
+                self._spared = parts[0].path
+            if parts and parts[0].path != self._spared:
+                self._delete(parts[0], "the disk runs short (recorder.min_free_bytes)")
+                return ""
+        except RecordingError as error:
+            self._report(error)
         return (
             f"{free / 1e6:,.1f} MB are free on the disk, but {wanted / 1e6:,.1f} MB are required "
             f"(recorder.min_free_bytes), and {self.problem or 'there is no older recording to delete: make room'}"
@@ -134,7 +111,9 @@ class DiskRoom:
         """What recordings take of what they may, for people; empty where `problem` says why that is not known."""
         if self.problem or not self._limit_bytes:
             return []
-        return [usage(self._stored, self._limit_bytes, self._config, self._now_ns), *filter(None, [self._beyond])]
+        beyond = f"{self._too_much()}, and nothing more may be deleted: acknowledge alarms, or allow more"
+        found = [usage(self._stored, self._limit_bytes, self._config, self._now_ns)]
+        return [*found, beyond] if self._is_too_much() else found
 
     def _is_too_much(self) -> bool:
         """Clips count up to their share: those of other recorders may take more, and would push out every part."""
@@ -145,75 +124,20 @@ class DiskRoom:
     def _too_much(self) -> str:
         return f"recordings and clips would exceed {in_bytes(self._limit_bytes)} (recorder.keep_share_of_disk)"
 
-    def _oldest(self) -> _Oldest | None:
-        """The oldest part, or an older clip whose alarms are acknowledged. A part that a clip still needs goes last."""
-        try:
-            self._stored = self._parts.stored()
-        except RecordingError as error:
-            self._report(error)
-            return None
-        part = next(iter(self._stored.parts), None)
-        is_needed = part is not None and self._clips is not None and self._clips.needs(part.last_ns)
-        clip = self._clips.tracker.oldest_acknowledged if self._clips else None
-        if clip and (part is None or is_needed or clip.until_ns <= part.last_ns):
-            return _Oldest(clip.until_ns, clip=clip)
-        return _Oldest(part.last_ns, part, is_needed=is_needed) if part else None
+    def _look(self) -> Sequence[StoredPart]:
+        self._stored = self._parts.stored()
+        return self._stored.parts
 
-    def _is_last(self, oldest: _Oldest) -> bool:
-        """Whether it is the only finished part."""
-        return oldest.part is not None and len(self._stored.parts) == 1
-
-    def _may_go_by_age(self, oldest: _Oldest) -> bool:
-        return oldest.part is None or self._monotonic_s() - self._aged_s >= AGED_S
+    def _delete(self, part: StoredPart, why: str) -> None:
+        self._parts.delete(part)
+        self.counts["parts_deleted"] += 1
+        _LOG.warning("%s, the oldest part, was deleted: %s", part.path.name, why)
 
     def _report(self, error: RecordingError) -> None:
         self.problem = str(error)
         if self.problem != self._logged:
             self._logged = self.problem
             _LOG.warning("%s", self.problem)
-
-    def _delete(self, oldest: _Oldest, why: str) -> bool:
-        """Delete it; False if that is not possible."""
-        try:
-            if oldest.clip and self._clips:
-                self._clips.delete(oldest.clip)
-                _LOG.warning(
-                    "clip %s, the oldest whose alarms are acknowledged, was deleted: %s", oldest.clip.name, why
-                )
-            elif oldest.part:
-                self._parts.delete(oldest.part)
-                self.counts["parts_deleted"] += 1
-                if self._clips and oldest.is_needed:
-                    self._clips.tracker.part_deleted()
-                _LOG.warning("%s, the oldest part, was deleted: %s", oldest.part.path.name, why)
-        except RecordingError as error:
-            self._report(error)
-            return False
-        return True
-
-    def _warn_of_what_is_kept(self, since_ns: float, *, is_all: bool) -> None:
-        """Warn once of files beyond the limits that may not be deleted. is_all: no file may be deleted."""
-        before, self._beyond = self._beyond, ""
-        clips = self._clips.tracker.clips if self._clips else []
-        if kept := [clip for clip in clips if clip.until_ns < since_ns and not clip.is_acknowledged]:
-            size = sum(clip.size_bytes for clip in kept)
-            self._beyond = (
-                f"clips kept beyond {self._config.keep_days:g} days until their alarms are acknowledged: {len(kept)}, "
-                f"{in_bytes(size)}"
-            )
-        elif is_all and self._is_too_much():
-            self._beyond = (
-                f"{self._too_much()}, and nothing may be deleted, the last finished part included: "
-                "acknowledge alarms, or allow more"
-            )
-        elif self._stored.clips_bytes > self._limit_bytes * CLIPS_SHARE:
-            self._beyond = (
-                f"clips take {in_bytes(self._stored.clips_bytes)}, more than {CLIPS_SHARE:.0%} of "
-                f"{in_bytes(self._limit_bytes)} (recorder.keep_share_of_disk): acknowledge alarms, "
-                "delete clips that no list names, or allow more"
-            )
-        if self._beyond and not before:
-            _LOG.warning("%s", self._beyond)
 
 
 def usage(stored: Stored, limit_bytes: int, config: RecorderConfig, now_ns: int) -> str:

@@ -17,34 +17,22 @@ class Interference:
     def __init__(self) -> None:
         self.counts: Counter[str] = Counter()
         """files that were restored, and messages lost with their file"""
-        self._restored_reported = 0
         self._news = ""
         self._news_ns = 0
 
-    def begin_part(self) -> None:
-        """A new part is written from now on."""
-        self._restored_reported = 0
-
     def check(self, part: RecordingWriter, now_ns: int) -> None:
-        """Report that the file of the open part was restored since it was last asked."""
-        if part.restored > self._restored_reported:
-            self.counts["files_restored"] += part.restored - self._restored_reported
-            self._restored_reported, self._news_ns = part.restored, now_ns
-            self._news = (
-                f"{part.path}: another program deleted, moved or replaced the file while it was written; it was "
-                "restored with all messages; keep other programs away from it"
-            )
-
-    def end_part(self, part: RecordingWriter, now_ns: int) -> None:
-        """Report what the part that has ended has lost."""
-        self.check(part, now_ns)
+        """Report what was done to a part since it was last asked. `lost` it has only once it has ended."""
+        done = ""
+        if part.restored:
+            self.counts["files_restored"] += part.restored
+            part.restored = 0
+            done = "deleted, moved or replaced the file while it was written; it was restored with all messages"
         if part.lost:
             self.counts["lost_deleted"] += part.lost
+            done = f"deleted or cut the file while it was written; messages lost with it: {part.lost}"
+        if done:
             self._news_ns = now_ns
-            self._news = (
-                f"{part.path}: another program deleted or cut the file while it was written; messages lost with it: "
-                f"{part.lost}; keep other programs away from it"
-            )
+            self._news = f"{part.path}: another program {done}; keep other programs away from it"
 
     def clock_set_back(self, now_ns: int) -> None:
         """The host's clock was set back to `now_ns`."""

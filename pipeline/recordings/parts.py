@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from bisect import bisect_right
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import suppress
 from datetime import UTC, datetime
 from itertools import islice
@@ -22,7 +22,6 @@ from fantwin.pipeline.recordings.reading import RecordingError, read_metadata, r
 from fantwin.pipeline.recordings.records import ACTIVE_SUFFIX, UnreadableError, whole_number
 from fantwin.pipeline.recordings.repair import (
     ORIGINAL_SUFFIX,
-    Recovery,
     free_original_name,
     repair_in_place,
 )
@@ -30,6 +29,8 @@ from fantwin.pipeline.recordings.run_recordings import RECORDING_KEY, recorded_f
 from fantwin.pipeline.recordings.sequence_ledger import SequenceLedger
 from fantwin.pipeline.recordings.stored_recordings import Stored, StoredPart, StoredRecordings
 from fantwin.pipeline.recordings.writing import RecordingWriter
+from fantwin.schemas.envelope import Envelope
+from fantwin.schemas.streams import StreamId
 
 
 def in_order(parts: Iterable[Path]) -> list[Path]:
@@ -69,28 +70,46 @@ def _start_ns(path: Path) -> int:
 
 
 class Seen:
-    """The sequence numbers of a stream that have come, as ranges: one more than there are gaps."""
+    """The messages that have come: of each stream the sequence numbers as ranges, one more than there are gaps."""
 
     def __init__(self) -> None:
-        self._first: list[int] = []
-        self._next: list[int] = []
+        self.repeated = 0
+        """messages that came again"""
+        self._ranges: dict[StreamId, tuple[list[int], list[int]]] = {}
+        """of each range its first number, and the one after its last"""
 
-    def is_new(self, sequence: int) -> bool:
-        """Add a number. Returns whether it came for the first time."""
-        at = bisect_right(self._first, sequence)  # the range before it may hold or touch it
-        if at and sequence < self._next[at - 1]:
+    def is_new(self, envelope: Envelope) -> bool:
+        """Add a message. Returns whether it came for the first time."""
+        header = envelope.header
+        first, following = self._ranges.setdefault((envelope.key, header.producer), ([], []))
+        sequence = header.sequence
+        at = bisect_right(first, sequence)  # the range before it may hold or touch it
+        if at and sequence < following[at - 1]:
+            self.repeated += 1
             return False
-        joins_next = at < len(self._first) and sequence + 1 == self._first[at]
-        if at and sequence == self._next[at - 1]:
-            self._next[at - 1] = self._next.pop(at) if joins_next else sequence + 1
+        joins_next = at < len(first) and sequence + 1 == first[at]
+        if at and sequence == following[at - 1]:
+            following[at - 1] = following.pop(at) if joins_next else sequence + 1
             if joins_next:
-                del self._first[at]
+                del first[at]
         elif joins_next:
-            self._first[at] = sequence
+            first[at] = sequence
         else:
-            self._first.insert(at, sequence)
-            self._next.insert(at, sequence + 1)
+            first.insert(at, sequence)
+            following.insert(at, sequence + 1)
         return True
+
+
+def read_parts(
+    parts: Iterable[Path], topics: Collection[str], damage: list[str], tray: str | None = None, seen: Seen | None = None
+) -> Iterator[Envelope]:
+    """The messages of parts, each once: one may be in two of them after a restart. damage: gets a line for each part
+    that could not be read in full."""
+    seen = seen or Seen()
+    for part in parts:
+        reading = read_recording(part, topics, tray)
+        yield from filter(seen.is_new, reading)
+        damage += [reading.damage] if reading.damage else []
 
 
 PART_BYTES, PART_S = 100_000_000, 86_400.0
@@ -138,11 +157,9 @@ class RecordingParts:
         self._metadata = dict(metadata) | {"session": session, RECORDING_KEY: path.name}
         self._attachments = attachments
         self._part = 0
-        self.repaired: list[Recovery] = []
-        """files that killed recorders had left"""
-        self.unreadable: dict[Path, str] = {}
-        """such files that cannot be repaired, under their new names, and why"""
-        self.unrepaired: list[Path] = []
+        self.remarks: list[str] = []
+        """what became of files that killed recorders had left, a line each"""
+        self._unrepaired: list[Path] = []
         """such files whose repair the disk refuses for now; left as they are"""
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -257,19 +274,28 @@ class RecordingParts:
                     f"{path}: another recorder is writing it; stop it, or name another file"
                 ) from error
             except (DiskError, UnreadableError):
-                self.unrepaired.append(path)
-                continue
+                self._unrepaired.append(path)
+                became = (
+                    f"the disk refuses the repair of its recording, which stays {path}: make room and start again, or "
+                    "use `fantwin info --repair`"
+                )
             except RecordingError as error:
                 aside = free_original_name(path.with_name(path.name.removesuffix(ACTIVE_SUFFIX)))
-                self.unreadable[path.rename(aside)] = str(error)
+                path.rename(aside)
                 sync_folder(aside.parent)
-                continue
-            if recovery:
-                self.repaired.append(recovery)
+                became = f"its recording cannot be repaired and was renamed to {aside.name}: {error}"
+            else:
+                if recovery is None:
+                    continue
+                became = (
+                    f"its recording was repaired and is {recovery.path}: {recovery.found.messages} messages; bytes of "
+                    f"an unfinished chunk discarded: {recovery.found.discarded_bytes}"
+                )
+            self.remarks.append(f"a recorder was killed; {became}")
 
     def _last_part(self) -> Contents | None:
         """The contents of the last part of this recording."""
         for _, path in sorted(part_files(self.path), reverse=True):
-            if (path.suffix == self.path.suffix or path in self.unrepaired) and self._is_ours(path):
+            if (path.suffix == self.path.suffix or path in self._unrepaired) and self._is_ours(path):
                 return contents_of(path)
         return None

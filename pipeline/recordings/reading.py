@@ -6,10 +6,8 @@ as far as possible. See docs/reference/recordings.md.
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import islice
 from pathlib import Path
 
 from mcap.opcode import Opcode
@@ -23,6 +21,7 @@ from fantwin.pipeline.recordings.records import (
     RECORD,
     RecordingError,
     RecordReader,
+    check_format,
     chunk_data,
     parse,
     summary_of,
@@ -152,7 +151,7 @@ def read_recording(path: Path, topics: Collection[str] | None = None, tray: str 
     Raises:
         RecordingError: the file cannot be opened, is not a recording, or is of an unknown format.
     """
-    deque(islice(RecordReader(path), 2), 0)  # header and metadata
+    check_format(path)
     return Reading(path, None if topics is None else set(topics), tray)
 
 

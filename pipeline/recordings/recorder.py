@@ -66,7 +66,7 @@ class Recorder(Core):
         self._flush_ns = round(config.flush_interval_s * NS_PER_S)
         self._soon_ns = min(self._flush_ns, round(FLUSH_S * NS_PER_S))
         self._clips = clips
-        self._room = DiskRoom(parts, config, clips)
+        self._room = DiskRoom(parts, config)
         self._part: RecordingWriter | None = None
         self._least_bytes = 0
         """size below which a part does not end: its attachments alone may be more than its limit"""
@@ -180,7 +180,8 @@ class Recorder(Core):
         """The space and days that recordings take of their limits, and the topics that are left out on purpose."""
         left_out = ", ".join(self._ledger.left_out)
         of_topics = [f"not recorded: {left_out} (recorder.topics)"] if left_out else []
-        return [*self._room.notes(), *of_topics]
+        of_clips = self._clips.notes() if self._clips else []
+        return [*self._room.notes(), *of_clips, *of_topics]
 
     def unsaved(self) -> Sequence[Envelope]:
         """Messages that are not flushed to the disk yet."""
@@ -231,7 +232,6 @@ class Recorder(Core):
         self._began_ns = self._now_ns if held_since_ns is None else min(held_since_ns, self._now_ns)
         self._part = self._parts.begin(self._began_ns, self._ledger, about)
         self._least_bytes = 2 * self._part.size
-        self._interference.begin_part()
         self._counts["parts"] += 1
         self._problem = ""
         for card in self._cards.values():
@@ -271,7 +271,7 @@ class Recorder(Core):
 
     def _release_part(self) -> None:
         if self._part:
-            self._interference.end_part(self._part, self._now_ns)
+            self._interference.check(self._part, self._now_ns)
             self._recorded += self._part.written
             self._lost_in_pause += self._part.lost
             self._ledger = self._ledger.as_lost() if self._part.lost else self._ledger.for_next_part()

@@ -11,11 +11,11 @@ import re
 import struct
 from collections import deque
 from collections.abc import Collection, Iterator
-from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cache
 from importlib.metadata import version
 from io import BytesIO
+from itertools import islice
 from pathlib import Path
 from typing import BinaryIO, NamedTuple, TypeVar
 from zlib import crc32
@@ -272,38 +272,24 @@ def _decompressed(chunk: Chunk) -> bytes:
     raise ValueError(f"unknown compression {chunk.compression!r}")
 
 
-def indexed_reader(file: BinaryIO) -> McapReader:
-    """The library's reader of the index, for files from anywhere. It raises one of CORRUPT_DATA_ERRORS.
+def check_format(path: Path, *, for_repair: bool = False) -> None:
+    """Raises RecordingError: the file cannot be read, is not a recording, or is of an unknown format."""
+    deque(islice(RecordReader(path, for_repair), 2), 0)  # header and metadata
 
-    Raises:
-        RecordingError: the recording is of an unknown format.
-    """
-    with suppress(*CORRUPT_DATA_ERRORS):
-        _check_format(_second_record(file), file.name)
-    file.seek(0)
+
+def indexed_reader(file: BinaryIO) -> McapReader:
+    """The library's reader of the index, for files from anywhere. It raises one of CORRUPT_DATA_ERRORS."""
     return SeekingReader(file, record_size_limit=LARGEST_RECORD_BYTES)
 
 
-def summary_of(path: Path) -> Summary:
-    """The summary section of a file; an empty one if it has none that can be read.
-
-    Raises:
-        OSError, RecordingError: the file cannot be read, or is of an unknown format.
-    """
+def summary_of(path: Path, *, for_repair: bool = False) -> Summary:
+    """The summary section of a file; an empty one if it has none that can be read. Raises as `check_format`."""
+    check_format(path, for_repair=for_repair)
     with path.open("rb") as file:
         try:
             return indexed_reader(file).get_summary() or Summary()
         except (LookupError, *CORRUPT_DATA_ERRORS):
             return Summary()
-
-
-def _second_record(file: BinaryIO) -> McapRecord | None:
-    """The record after the header; None where it has no place of its own in the library."""
-    file.seek(len(MCAP0_MAGIC))
-    _, length = RECORD.unpack(file.read(RECORD.size))
-    file.seek(length, os.SEEK_CUR)
-    opcode, length = RECORD.unpack(file.read(RECORD.size))
-    return _parse_known(opcode, file.read(min(length, LARGEST_RECORD_BYTES)))
 
 
 @cache

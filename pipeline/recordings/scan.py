@@ -192,7 +192,7 @@ def _add_records(found: Scan, data: bytes) -> None:
         elif opcode == Opcode.MESSAGE:
             number, _, received_t_ns, _ = MESSAGE.unpack_from(data, start)
             if number not in found.channels and not found.nameless:  # it was described in a damaged chunk
-                summary = summary_of(found.path)
+                summary = summary_of(found.path, for_repair=True)
                 found.channels = summary.channels | found.channels
                 found.schemas = summary.schemas | found.schemas
             if number not in found.channels:

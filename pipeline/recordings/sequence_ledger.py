@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import json
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
+
+from pydantic import TypeAdapter
 
 from fantwin.schemas.codec import CodecError, decode, decode_header
 from fantwin.schemas.health import Health
@@ -43,7 +45,7 @@ class StreamCounts:
     last_ns: int | None = None
 
 
-_FIELDS = {field.name for field in fields(StreamCounts)}
+_COUNTS, _LINES = TypeAdapter(StreamCounts), TypeAdapter(list[str])
 
 
 class SequenceLedger:
@@ -179,21 +181,13 @@ def counts_from_metadata(metadata: Mapping[str, str]) -> dict[StreamId, StreamCo
     streams = {}
     for name, text in metadata.items():
         if name not in (ENDED, RECOVERED):
-            values = json.loads(text)
-            if not isinstance(values, dict) or values.keys() != _FIELDS:
-                raise ValueError(f"{name}: not the counts of a stream")
-            if not all(value is None or type(value) is int for value in values.values()):
-                raise ValueError(f"{name}: counts that are not whole numbers")
-            streams[_stream(name)] = StreamCounts(**values)
+            streams[_stream(name)] = _COUNTS.validate_json(text, strict=True)
     return streams
 
 
 def recovered_from_metadata(metadata: Mapping[str, str]) -> tuple[str, ...]:
     """What the ledger of a repaired file reports as lost, one line each. Raises ValueError if it is not that."""
-    lines = json.loads(metadata.get(RECOVERED, "[]"))
-    if not isinstance(lines, list) or not all(isinstance(line, str) for line in lines):
-        raise ValueError(f"{RECOVERED}: not a list of lines")
-    return tuple(lines)
+    return tuple(_LINES.validate_json(metadata.get(RECOVERED, "[]"), strict=True))
 
 
 def before_from_metadata(metadata: Mapping[str, str]) -> dict[StreamId, int]:

@@ -89,7 +89,8 @@ class RecordingWriter:
         self.written: Counter[str] = Counter()
         """messages of each topic that are flushed to the disk"""
         self.restored = 0
-        """how often another program had deleted, moved or replaced the file, and its content was written again"""
+        """how often another program had deleted, moved or replaced the file, and its content was written again; its
+        user sets it back"""
         self.lost = 0
         """messages that were flushed and are lost with the file, because it could not be restored"""
         self._filling: list[Envelope] = []

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from fantwin.pipeline.recordings.clips import tracker
 from fantwin.pipeline.recordings.clips.alarm_clips import AlarmClips
 from fantwin.pipeline.recordings.clips.clip import Clip, clips_in, kept_clips, list_path
 from fantwin.pipeline.recordings.clips.cutting import ClipCutter
@@ -20,7 +22,7 @@ from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Alarm
 from tests.support.clipped_recordings import record
 from tests.support.offline_replay import recorded, recording_of
-from tests.support.stub_disk import NOW_NS, SECOND_NS, Disk, envelope, old_parts
+from tests.support.stub_disk import NOW_NS, SECOND_NS, Disk, envelope
 
 FREE = 1 << 40
 
@@ -49,16 +51,23 @@ class Cutter:
         return CutResult(clip.name, self.size_bytes)
 
 
-def clips_of(recording: Path, free: int = FREE, after_s: float = 1.0) -> AlarmClips:
-    """Clips as a recorder has them, but short."""
-    tracker = ClipTracker(clips_in(list_path(recording)), before_s=0.5, after_s=after_s, most_bytes=0, settled_s=0.3)
-    return AlarmClips(tracker, recording, ClipCutter(recording, lambda: free, min_free_bytes=1000).cut)
+@pytest.fixture
+def clips_of(monkeypatch: pytest.MonkeyPatch) -> Callable[..., AlarmClips]:
+    """Makes clips as a recorder has them, but short."""
+
+    def make(recording: Path, after_s: float = 1.0) -> AlarmClips:
+        for name, seconds in (("BEFORE_NS", 0.5), ("AFTER_NS", after_s), ("SETTLED_NS", 0.3)):
+            monkeypatch.setattr(tracker, name, round(seconds * SECOND_NS))
+        of_recording = ClipTracker(clips_in(list_path(recording)), most_bytes=0)
+        return AlarmClips(of_recording, recording, ClipCutter(recording, lambda: FREE, min_free_bytes=1000).cut)
+
+    return make
 
 
 def with_cutter(disk: Disk, folder: Path, **config: Any) -> tuple[Recorder, AlarmClips, Cutter]:
     """A recorder whose clips are cut by a stand-in."""
     cutter = Cutter()
-    clips = AlarmClips(ClipTracker((), 0), folder / "recording.mcap", cutter.cut)
+    clips = AlarmClips(ClipTracker((), 0, kept_s=14 * 86_400.0), folder / "recording.mcap", cutter.cut)
     return Recorder(disk, RecorderConfig(**config), NOW_NS, clips=clips), clips, cutter
 
 
@@ -82,7 +91,7 @@ def crash(core: Recorder) -> None:
     core._part._file.close()  # type: ignore[attr-defined]
 
 
-def test_a_recorder_cuts_a_clip_and_lists_it_while_it_records(chain, tmp_path):
+def test_a_recorder_cuts_a_clip_and_lists_it_while_it_records(chain, tmp_path, clips_of):
     recording = tmp_path / "recording.mcap"
     core = record(chain, recording, clips=clips_of(recording), part_s=1.0)
     core.close()
@@ -94,7 +103,7 @@ def test_a_recorder_cuts_a_clip_and_lists_it_while_it_records(chain, tmp_path):
 
 
 @pytest.mark.parametrize("ends", ["by a crash", "in order"])
-def test_a_clip_that_was_due_at_the_end_of_a_recorder_is_cut_by_the_next_one(chain, tmp_path, ends):
+def test_a_clip_that_was_due_at_the_end_of_a_recorder_is_cut_by_the_next_one(chain, tmp_path, clips_of, ends):
     recording = tmp_path / "recording.mcap"
     clips = clips_of(recording, after_s=60)
     core = record(chain, recording, clips=clips)
@@ -110,48 +119,21 @@ def test_a_clip_that_was_due_at_the_end_of_a_recorder_is_cut_by_the_next_one(cha
     assert sum(1 for _ in read_recording(tmp_path / "clips" / clip.name, ("raw",))) > 300
 
 
-def test_the_disk_guard_takes_what_is_oldest_but_no_unacknowledged_clip_and_last_what_a_clip_needs(tmp_path):
-    disk = Disk()
-    core, clips, _ = with_cutter(disk, tmp_path, min_free_bytes=50_000_000)
-    now_ns = NOW_NS
-    for fan in range(2):
-        core.step(envelope(raised(fan, now_ns), "alarm", now_ns))
-        tick_until_cut(core, clips, now_ns := now_ns + 70 * SECOND_NS)
-    core.step(envelope(raised(0, now_ns, acknowledged=True, transition=Transition.ACKNOWLEDGED), "alarm", now_ns))
-    core.step(envelope(raised(2, now_ns), "alarm", now_ns))
-    acknowledged, unacknowledged, _ = [tmp_path / "clips" / clip.name for clip in clips.tracker.clips]
-    for path in (acknowledged, unacknowledged):
-        path.touch()
-    disk.free, disk.old = 1, old_parts("r-0.mcap", "r-1.mcap", last_ns=NOW_NS - 1000 * SECOND_NS)
-    core.tick(now_ns := now_ns + SECOND_NS)
-    assert disk.old_names == ["r-1.mcap"] and acknowledged.exists()  # this part is older than any clip
-    disk.old = old_parts("r-1.mcap", "r-2.mcap", last_ns=now_ns)
-    core.tick(now_ns := now_ns + SECOND_NS)
-    assert disk.old_names == ["r-1.mcap", "r-2.mcap"] and not acknowledged.exists()
-    assert core.problem() == ""
-    core.tick(now_ns := now_ns + SECOND_NS)
-    assert disk.old_names == ["r-2.mcap"]  # the running clip needs the other, but the disk is full
-    lacking = clips.tracker.clips[-1]
-    assert lacking.is_due and lacking.problem == "a part that it needs was deleted to make room"
-    core.tick(now_ns + SECOND_NS)
-    assert "NOTHING IS RECORDED" in core.problem() and unacknowledged.exists()
-    assert core.counters()["parts_deleted"] == 2 and core.counters()["clips_deleted"] == 1
-
-
-def test_a_clip_outlives_the_limit_of_days_until_it_is_acknowledged_and_that_is_said_once(tmp_path, caplog):
+def test_a_clip_outlives_the_limit_of_days_until_it_is_acknowledged_and_that_is_said(tmp_path):
     core, clips, cutter = with_cutter(Disk(), tmp_path)
     cutter.size_bytes = 5_000_000
     core.step(envelope(raised(0, NOW_NS), "alarm", NOW_NS))
     tick_until_cut(core, clips, NOW_NS + 70 * SECOND_NS)
-    now_ns = NOW_NS
-    for day in range(15, 20):
-        now_ns = NOW_NS + day * 86_400 * SECOND_NS
-        core.tick(now_ns)
-    said = "clips kept beyond 14 days until their alarms are acknowledged: 1, 5 MB"
-    assert clips.tracker.clips and core.notes()[1] == said and caplog.text.count(said) == 1
+    (clip,) = clips.tracker.clips
+    (tmp_path / "clips" / clip.name).touch()
+    now_ns = NOW_NS + 15 * 86_400 * SECOND_NS
+    core.tick(now_ns)
+    said = "clips kept beyond recorder.keep_days until their alarms are acknowledged: 1, 5 MB"
+    assert clips.tracker.clips and core.notes()[1] == said
     core.step(envelope(raised(0, NOW_NS, acknowledged=True, transition=Transition.ACKNOWLEDGED), "alarm", now_ns))
     core.tick(now_ns + 10 * SECOND_NS)
     assert not clips.tracker.clips and len(core.notes()) == 1
+    assert not (tmp_path / "clips" / clip.name).exists() and core.counters()["clips_deleted"] == 1
 
 
 def test_a_clip_is_not_cut_before_what_was_received_in_a_pause_is_on_the_disk(tmp_path):

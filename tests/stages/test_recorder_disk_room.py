@@ -50,7 +50,7 @@ def test_on_a_full_disk_the_oldest_parts_go_one_at_a_time_and_what_others_take_c
 def test_a_clock_that_is_years_ahead_costs_a_part_an_hour_and_never_the_last():
     disk, hours = Disk(), [0.0]
     disk.old = ten_days_of_parts()
-    room = DiskRoom(disk, RecorderConfig(), None, monotonic_s=lambda: hours[-1] * 3600)
+    room = DiskRoom(disk, RecorderConfig(), monotonic_s=lambda: hours[-1] * 3600)
     for look in range(60):
         room.keep_limits(NOW_NS + (3650 + look) * DAY_NS)
     assert len(disk.old) == 9

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from contextlib import suppress
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from types import TracebackType
-from typing import Annotated, Any, Self
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
@@ -18,7 +17,7 @@ from fantwin.pipeline.cli.options import JsonOption
 from fantwin.pipeline.cli.printing import show
 from fantwin.pipeline.errors import UsageError, UserError
 from fantwin.pipeline.extras import require
-from fantwin.pipeline.files import make_folder
+from fantwin.pipeline.files import temporary_folder
 from fantwin.pipeline.recordings.arrays import Block, read_topics
 from fantwin.pipeline.recordings.export_tables import Form, TableFile, open_table
 from fantwin.pipeline.recordings.left_out import left_out_hint
@@ -26,8 +25,6 @@ from fantwin.pipeline.recordings.parts import in_order
 from fantwin.pipeline.recordings.reading import read_recording
 from fantwin.pipeline.recordings.records import ACTIVE_SUFFIX
 from fantwin.pipeline.recordings.run_recordings import run_metadata
-
-_PART = ".part"
 
 
 def export(
@@ -58,10 +55,13 @@ def export(
         require("--to parquet (--to csv does not)", "logs", "pyarrow")
     parts = in_order(recordings)
     topics = list(dict.fromkeys(topic or _default_topics(parts)))
+    if output.suffix in (".csv", ".parquet") and not _is_file(output, to):
+        raise UsageError(f"{output}: name a file that ends in .{to} with -o, or a folder")
     arrays = read_topics(parts, topics, tray)
     with (
         Console(stderr=True).status(f"exporting {parts[0]}") as status,
-        _Tables(parts, to, output, replace=force) as tables,
+        temporary_folder(output.parent if _is_file(output, to) else output) as folder,
+        closing(_Tables(parts, to, output, folder, replace=force)) as tables,
     ):
         for block in arrays:
             tables.add(block)
@@ -83,36 +83,27 @@ def export(
 
 @dataclass(frozen=True)
 class _Table:
-    """A table that is being written, under a temporary name until all tables are complete."""
+    """A table that is being written: of which site, tray and topic, where it will be, and its file until then."""
 
-    site: str
-    tray: str
-    topic: str
+    of: tuple[str, str, str]
     path: Path
     file: TableFile
 
-    def belongs_to(self, block: Block) -> bool:
-        return (self.site, self.tray, self.topic) == (block.site, block.tray, block.topic)
-
     def summary(self) -> dict[str, Any]:
-        return {"file": str(self.path), "topic": self.topic, "tray": self.tray, "rows": self.file.rows}
+        _, tray, topic = self.of
+        return {"file": str(self.path), "topic": topic, "tray": tray, "rows": self.file.rows}
 
 
 class _Tables:
-    """The tables of an export. Each is created with its first rows; without `finish` all are removed again."""
+    """The tables of an export. Each is created with its first rows, in a folder of its own until all are complete."""
 
-    def __init__(self, parts: Sequence[Path], form: Form, output: Path, *, replace: bool) -> None:
-        """`output` is a folder, or one file if its suffix says so. Raises UserError if it cannot be used."""
-        if output.suffix in (".csv", ".parquet") and output.suffix != f".{form}":
-            raise UsageError(f"{output}: name a file that ends in .{form} with -o, or a folder")
+    def __init__(self, parts: Sequence[Path], form: Form, output: Path, folder: Path, *, replace: bool) -> None:
+        """output: a folder, or one file if its suffix says so. folder: of tables that are not complete yet."""
         self.begun: dict[Path, _Table] = {}
         self._metadata = run_metadata(parts)
         self._stem = parts[0].name.removesuffix(ACTIVE_SUFFIX).removesuffix(".mcap")
         self._form: Form = form
-        self._output = output
-        self._is_file = output.suffix == f".{form}"
-        self._replace = replace
-        make_folder(output.parent if self._is_file else output)
+        self._output, self._folder, self._replace = output, folder, replace
 
     @property
     def rows(self) -> int:
@@ -124,16 +115,16 @@ class _Tables:
         Raises:
             UserError: the table cannot be written, exists already, or would be the second one in a single file.
         """
-        path = self._path(block)
+        of = block.site, block.tray, block.topic
+        name = ".".join(part for part in (self._stem, _printable(block.tray), block.topic, self._form) if part)
+        path = self._output if _is_file(self._output, self._form) else self._output / name
         try:
-            if path not in self.begun:
-                self._begin(path, block)
-            table = self.begun[path]
-            if not table.belongs_to(block):
-                one, other = (_printable(each.tray or each.site) for each in (table, block))
+            table = self.begun.get(path) or self._begin(path, block, of)
+            if table.of != of:
+                one, other = (f"{topic} of {_printable(tray or site)}" for site, tray, topic in (table.of, of))
                 raise UserError(
-                    f"{path}: would hold both {table.topic} of {one} and {block.topic} of {other}: name a folder with "
-                    "-o, or choose with --topic and --tray"
+                    f"{path}: would hold both {one} and {other}: name a folder with -o, or choose with --topic and "
+                    "--tray"
                 )
             table.file.add(block)
         except OSError as error:
@@ -144,26 +135,17 @@ class _Tables:
         for path, table in self.begun.items():
             try:
                 table.file.close(damage)
-                _unfinished(path).replace(path)
+                (self._folder / path.name).replace(path)
             except OSError as error:
                 raise _cannot_write(path, error) from error
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+    def close(self) -> None:
+        """Close the files of tables that are not complete."""
         for table in self.begun.values():
             with suppress(OSError):  # a full disk refuses the buffered rest as well
                 table.file.close()
-            _unfinished(table.path).unlink(missing_ok=True)
 
-    def _path(self, block: Block) -> Path:
-        if self._is_file:
-            return self._output
-        name = ".".join(part for part in (self._stem, _printable(block.tray), block.topic, self._form) if part)
-        return self._output / name
-
-    def _begin(self, path: Path, block: Block) -> None:
+    def _begin(self, path: Path, block: Block, of: tuple[str, str, str]) -> _Table:
         if path.exists() and not self._replace:
             raise UserError(f"{path}: exists; name another folder or file with -o, or replace it with --force")
         about = {
@@ -173,8 +155,9 @@ class _Tables:
             "speed_unit": self._metadata.speed_unit(block.tray),
             "exported_by": f"fantwin {version('fantwin')}",
         }
-        file = open_table(self._form, _unfinished(path), block.topic, about)
-        self.begun[path] = _Table(block.site, block.tray, block.topic, path, file)
+        file = open_table(self._form, self._folder / path.name, block.topic, about)
+        self.begun[path] = _Table(of, path, file)
+        return self.begun[path]
 
 
 def _printable(name: str) -> str:
@@ -187,8 +170,8 @@ def _cannot_write(path: Path, error: OSError) -> UserError:
     return UserError(f"{path}: cannot be written: {reason}; name another folder with -o")
 
 
-def _unfinished(path: Path) -> Path:
-    return path.with_name(path.name + _PART)
+def _is_file(output: Path, form: Form) -> bool:
+    return output.suffix == f".{form}"
 
 
 def _default_topics(parts: Sequence[Path]) -> tuple[str]:

@@ -18,21 +18,19 @@ from fantwin.pipeline.cli.options import JsonOption
 from fantwin.pipeline.cli.printing import show
 from fantwin.pipeline.config.settings import NAME_PATTERN
 from fantwin.pipeline.errors import UsageError, UserError
-from fantwin.pipeline.recordings.reading import TACHO_KEY
-from fantwin.pipeline.recordings.writing import RecordingWriter
+from fantwin.pipeline.recordings.raw_recordings import SAMPLES_PER_MESSAGE, write_raw
 from fantwin.pipeline.sources.logs.formats import LogFormat, log_format, open_log
 from fantwin.pipeline.sources.logs.samples_of_log import read_samples
 from fantwin.pipeline.sources.tables.measured_table import Table, read_table
 from fantwin.pipeline.sources.tacho_evidence import tacho_hints
+from fantwin.schemas.blocks import cut
 from fantwin.schemas.channels import CHANNELS
-from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Array, Raw
-from fantwin.schemas.tacho import INSTANTANEOUS, Tacho, tacho_of_each_fan, tachos_to_json
-from fantwin.schemas.topics import RESERVED_TRAY_NAMES, tray_key
+from fantwin.schemas.tacho import INSTANTANEOUS, Tacho, tacho_of_each_fan
+from fantwin.schemas.topics import RESERVED_TRAY_NAMES
 from fantwin.schemas.units import NS_PER_S
 
 SITE = "imported"
-SAMPLES_PER_MESSAGE = 100
 
 
 def import_table(
@@ -201,30 +199,19 @@ def write_table(table: Table, output: Path, tray: str, tachos: tuple[Tacho, ...]
     Raises:
         RecordingError: it cannot be written.
     """
-    metadata = {
-        "source": table.path.name,
-        "site": SITE,
-        "trays": tray,
-        "speed_unit": table.speed_unit,
-    }
-    if tachos != INSTANTANEOUS:
-        metadata[f"{TACHO_KEY}.{tray}"] = tachos_to_json(tachos)
-    with RecordingWriter(output, metadata, t_ns=int(table.t_ns[0]), overwrite=True) as writer:
-        # A message has the time of its last sample. The first message has one sample only, so that the recording begins
-        # at the time of its first sample.
-        starts = [0, *range(1, len(table.t_ns), SAMPLES_PER_MESSAGE), len(table.t_ns)]
-        for sequence, (first, end) in enumerate(pairwise(starts)):
-            rows = slice(first, end)
-            auxiliary: dict[str, Any] = {name: values[rows] for name, values in table.auxiliary.items()}
-            raw = Raw(
-                header=Header("import", sequence, tray),
-                fans=table.fans,
-                host_receive_t_ns=table.t_ns[rows],
-                command=table.command[rows],
-                speed_rad_s=table.speed_rad_s[rows],
-                **auxiliary,
-            )
-            writer.add_message(tray_key(SITE, tray, "raw"), raw, int(table.t_ns[rows][-1]))
+    auxiliary: dict[str, Any] = dict(table.auxiliary)
+    whole = Raw(
+        fans=table.fans,
+        host_receive_t_ns=table.t_ns,
+        command=table.command,
+        speed_rad_s=table.speed_rad_s,
+        **auxiliary,
+    )
+    # The first message has one sample only, so that the recording begins at the time of its first sample.
+    starts = [0, *range(1, len(table.t_ns), SAMPLES_PER_MESSAGE), len(table.t_ns)]
+    raws = (cut(whole, first, end) for first, end in pairwise(starts))
+    about = {"source": table.path.name, "site": SITE, "tray": tray, "speed_unit": table.speed_unit}
+    write_raw(output, raws, int(table.t_ns[0]), "import", **about, tachos=tachos)
 
 
 def import_summary(table: Table, output: Path) -> dict[str, object]:

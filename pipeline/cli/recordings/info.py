@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -15,7 +15,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from fantwin.pipeline.cli.options import JsonOption
-from fantwin.pipeline.cli.printing import show, table_of
+from fantwin.pipeline.cli.printing import table_of
 from fantwin.pipeline.cli.progress import working
 from fantwin.pipeline.errors import UsageError
 from fantwin.pipeline.recordings.clips.clip import clip_lines
@@ -25,19 +25,15 @@ from fantwin.pipeline.recordings.contents import (
     Contents,
     contents_of,
     continuity,
+    losses_of,
     messages_as_text,
-)
-from fantwin.pipeline.recordings.contents import (
-    losses as found_losses,
 )
 from fantwin.pipeline.recordings.dates import format_clock, format_local
 from fantwin.pipeline.recordings.metadata import CONFIGURATION
 from fantwin.pipeline.recordings.reading import left_out_of
 from fantwin.pipeline.recordings.records import active_path
-from fantwin.pipeline.recordings.repair import Recovery
 from fantwin.pipeline.recordings.repair import recover as recover_file
 from fantwin.pipeline.recordings.run_recordings import RECORDING_KEY, recorded_files
-from fantwin.pipeline.recordings.scan import Scan
 from fantwin.pipeline.recordings.sequence_ledger import StreamCounts, sum_by_key
 from fantwin.pipeline.site.loss_accounting import label, losses, refused, refused_lines
 from fantwin.pipeline.site.stage_states import note_lines, notes_as_json
@@ -149,7 +145,7 @@ def _part_as_json(part: Contents) -> dict[str, Any]:
         "metadata": dict(part.metadata),
         "left_out": list(left_out_of(part.metadata)),
         "attachments": list(part.attachments),
-        "has_configuration": _has_configuration(part),
+        "has_configuration": CONFIGURATION in part.attachments,
         "twins": {_tray(key): {"twin": c.twin, "kind": c.kind, "sha256": c.sha256} for key, c in part.cards.items()},
         "topics": {key: _counts_as_json(counts) for key, counts in sum_by_key(part.streams.items()).items()},
         "producers": [{"key": key, "producer": producer, **asdict(a)} for (key, producer), a in part.streams.items()],
@@ -176,41 +172,40 @@ def _counts_as_json(counts: StreamCounts) -> dict[str, Any]:
 
 def _show(parts: Sequence[Contents], breaks: Iterable[str]) -> None:
     console = Console(soft_wrap=True, highlight=False, width=_WIDEST)
+
+    def show(lines: Iterable[str], style: str = "") -> None:
+        for line in lines:
+            console.print(line, style=style, markup=False)
+
     for part in parts:
-        for line in _about(part):
-            console.print(line)
+        first, *others = _about(part)
+        show([first], "bold")
+        show(others)
         if part.streams or part.others:
             console.print(_table(part))
         healths = sorted(part.healths, key=label)
-        for line in note_lines(healths):
-            console.print(escape(line))
-        for health in healths:
-            if health.problem:
-                console.print(f"[red]{escape(label(health))}: {escape(health.problem)}[/red]")
-        for line in part.recovered:
-            console.print(f"[red]repaired earlier: {escape(line)}[/red]")
-        for line in part.damage:
-            advice = "" if line == STILL_WRITTEN else "; repair it with `fantwin info --repair`"
-            console.print(f"[red]{escape(line)}{advice}[/red]")
-    for line in breaks:
-        console.print(f"[red]{escape(line)}[/red]")
-    for line in refused_lines(refused(_sessions(parts))):
-        console.print(f"[yellow]{escape(line)}[/yellow]")
+        show(note_lines(healths))
+        show((f"{label(health)}: {health.problem}" for health in healths if health.problem), "red")
+        show((f"repaired earlier: {line}" for line in part.recovered), "red")
+        advice = "; repair it with `fantwin info --repair`"
+        show((line if line == STILL_WRITTEN else f"{line}{advice}" for line in part.damage), "red")
+    show(breaks, "red")
+    show(refused_lines(refused(_sessions(parts))), "yellow")
     lost = losses(_sessions(parts))
     if any(lost.values()):
         by_stage = ", ".join(f"{name} {count}" for name, count in lost.items() if count)
-        console.print(f"[red]lost, over all sessions of each stage: {escape(by_stage)}[/red]")
+        show([f"lost, over all sessions of each stage: {by_stage}"], "red")
 
 
 def _about(part: Contents) -> list[str]:
     """The lines about a file above the table of its topics."""
     metadata = part.metadata
-    lines = [f"[bold]{escape(str(part.path))}[/bold]: {part.size_bytes / 1e6:,.2f} MB, {part.messages} messages"]
+    lines = [f"{part.path}: {part.size_bytes / 1e6:,.2f} MB, {part.messages} messages"]
     if part.first_ns is not None and part.last_ns is not None:
         lines.append(f"from {format_local(part.first_ns)} to {format_local(part.last_ns)}: {_duration_s(part):,.1f} s")
     if not metadata and not part.streams:
         lines.append("not a fantwin recording: it has no fantwin channels")
-    lines += [escape(line) for line in clip_lines(metadata)]
+    lines += clip_lines(metadata)
     if "part" in metadata:
         after = f", continues {metadata['continues']}" if "continues" in metadata else ""
         session, site = metadata.get("session", "?"), metadata.get("site", "?")
@@ -233,7 +228,7 @@ def _about(part: Contents) -> list[str]:
         lines.append(f"made from: {metadata['source']}")
     if part.attachments:
         lines.append(f"attached: {', '.join(part.attachments)}")
-    return [lines[0], *(escape(line) for line in lines[1:])]
+    return lines
 
 
 def _table(part: Contents) -> Table:
@@ -247,8 +242,7 @@ def _table(part: Contents) -> Table:
             str(counts.messages),
             missing,
             str(counts.duplicated),
-            _time(counts.first_ns),
-            _time(counts.last_ns),
+            *("" if t_ns is None else format_clock(t_ns) for t_ns in (counts.first_ns, counts.last_ns)),
             "" if rate_hz is None else f"{rate_hz:.1f}",
         )
     for topic, messages in sorted(part.others.items()):
@@ -271,20 +265,12 @@ def _rate_hz(counts: StreamCounts) -> float | None:
     return (counts.messages - 1) / ((counts.last_ns - counts.first_ns) / NS_PER_S)
 
 
-def _has_configuration(part: Contents) -> bool:
-    return CONFIGURATION in part.attachments
-
-
 def _tray(key: str) -> str:
     return key.split("/")[2]
 
 
-def _time(t_ns: int | None) -> str:
-    return "" if t_ns is None else format_clock(t_ns)
-
-
 def repair(file: Path, output: Path | None, *, json_output: bool) -> None:
-    """Repair a truncated or damaged recording, and print what it contains and what is missing.
+    """Repair a truncated or damaged recording, and print what the repaired one contains and what is missing.
 
     output: without it the repaired recording takes the name of `file`, which is kept as `file`.original.
 
@@ -294,44 +280,21 @@ def repair(file: Path, output: Path | None, *, json_output: bool) -> None:
     """
     with working(f"reading {file}"):
         recovery = recover_file(file, output)
-    show(_repair_as_json(file, recovery), *_repair_lines(file, recovery), json_output=json_output)
-    if found_losses(recovery.found):
-        raise typer.Exit(3)
-
-
-def _repair_lines(file: Path, recovery: Recovery) -> list[str]:
-    found = recovery.found
-    if found.is_intact:
-        copied = f"; copied to {recovery.path}" if recovery.path != file else ""
-        lines = [f"{file}: intact, with {messages_as_text(found.messages)}; nothing to recover{copied}"]
+        part = contents_of(recovery.path)
+    found, lost = recovery.found, losses_of(recovery.found)
+    if json_output:
+        original = str(recovery.original) if recovery.original else None
+        about = {"file": str(file), "output": str(recovery.path), "original": original, "was_intact": found.is_intact}
+        typer.echo(json.dumps(_part_as_json(part) | about | {"lost": lost}))
     else:
-        kept = f"; the original is kept as {recovery.original}" if recovery.original else ""
-        lines = [f"{file}: {messages_as_text(found.messages)} recovered in {recovery.path}{kept}"]
-    for topic, counts in _by_topic(found).items():
-        last = f", the last at {format_local(counts.last_ns)}" if counts.last_ns is not None else ""
-        missing = f", {counts.missing} missing" if counts.missing else ""
-        lines.append(f"  {topic}: {messages_as_text(counts.messages)}{missing}{last}")
-    lost = found_losses(found)
-    return lines + (["lost:", *(f"  {line}" for line in lost)] if lost else ["nothing was lost"])
-
-
-def _repair_as_json(file: Path, recovery: Recovery) -> dict[str, Any]:
-    """The output of --json."""
-    found = recovery.found
-    unrecorded = {} if found.is_ended else found.counts.ledger.unrecorded()
-    names = ("messages", "discarded_bytes", "damaged_chunks", "damaged_attachments", "damaged_records")
-    return {
-        "file": str(file),
-        "output": str(recovery.path),
-        "original": str(recovery.original) if recovery.original else None,
-        "was_intact": found.is_intact,
-        "had_ended": found.is_ended,
-        **{name: getattr(found, name) for name in names},
-        "topics": {topic: _counts_as_json(counts) for topic, counts in _by_topic(found).items()},
-        "published_after_the_last": {f"{key} {producer}": count for (key, producer), count in unrecorded.items()},
-        "lost": found_losses(found),
-    }
-
-
-def _by_topic(found: Scan) -> dict[str, StreamCounts]:
-    return sum_by_key(found.streams.items()) | found.counts.others
+        if found.is_intact:
+            copied = f"; copied to {recovery.path}" if recovery.path != file else ""
+            typer.echo(f"{file}: intact, with {messages_as_text(found.messages)}; nothing to recover{copied}")
+        else:
+            kept = f"; the original is kept as {recovery.original}" if recovery.original else ""
+            typer.echo(f"{file}: {messages_as_text(found.messages)} recovered in {recovery.path}{kept}")
+        _show([replace(part, recovered=())], ())
+        for line in ["lost:", *(f"  {line}" for line in lost)] if lost else ["nothing was lost"]:
+            typer.echo(line)
+    if lost:
+        raise typer.Exit(3)

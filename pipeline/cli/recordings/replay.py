@@ -113,7 +113,8 @@ def replay(
     if not 0.0 <= start < min(end, LONGEST_S) or (end > LONGEST_S and not math.isinf(end)):
         raise UsageError("--start and --end: give 0 <= --start < --end, in seconds")
     if offline:
-        from fantwin.pipeline.cli.recordings.replay_offline import Again, run_offline  # noqa: PLC0415  loads the stages
+        from fantwin.pipeline.cli.recordings.replay_offline import run_offline  # noqa: PLC0415  loads the stages
+        from fantwin.pipeline.replay.offline.outcome import Again  # noqa: PLC0415
 
         again = Again(config, tuple(overrides or ()), twin, verify, start, end)
         run_offline(files, again, output, RecordingsInParallel(jobs, skip_bad), json_output=json_output)
@@ -142,8 +143,8 @@ def replay(
                 return
             shown_s = time.monotonic()
             at_s = playback.seconds_at(progress.t_ns)
-            ends_s = end_s if end_s is not None and not progress.round else 0.0
-            reporter.show("", int(at_s), math.ceil(ends_s), status_line(progress))
+            ends_s = 0 if progress.round else math.ceil(end_s)
+            reporter.show("", int(at_s), ends_s, status_line(progress))
 
         with keys, reporter:
             outcome = publish(

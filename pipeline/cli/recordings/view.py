@@ -6,7 +6,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Annotated, Any
 
 import typer
@@ -14,12 +13,12 @@ import typer
 from fantwin.pipeline.cli.options import JsonOption, ViewLayout, fan_numbers
 from fantwin.pipeline.cli.printing import show
 from fantwin.pipeline.cli.progress import working
-from fantwin.pipeline.cli.recordings.replay_offline import Again, score_again
 from fantwin.pipeline.errors import UsageError, UserError
 from fantwin.pipeline.extras import require
-from fantwin.pipeline.files import make_folder, write_whole
+from fantwin.pipeline.files import temporary_folder, write_whole
 from fantwin.pipeline.recordings.left_out import RAW, left_out
 from fantwin.pipeline.recordings.run_recordings import recorded_files
+from fantwin.pipeline.replay.offline.outcome import Again, score_again
 
 PLOTS = (".png", ".svg", ".pdf")
 WINDOW_S = 30.0
@@ -136,21 +135,9 @@ def with_scores(recordings: Sequence[Path], output: Path) -> Iterator[WithScores
     if not left_out(files, ("score",)) or left_out(files, (RAW,)):
         yield WithScores(files)
         return
-    folder = make_folder(output.parent)
-    try:
-        temporary = TemporaryDirectory(dir=folder, prefix=".fantwin-")
-    except OSError as error:
-        raise UserError(f"{folder}: cannot be written: {error.strerror}; name another folder with -o") from error
-    with temporary as name:
-        found = score_again(tuple(files), Again(), Path(name))
-        yield WithScores([Path(name) / files[0].name], _damage(files[0], found), _remarks(found))
-
-
-def _damage(file: Path, found: dict[str, Any]) -> list[str]:
-    lost = [f"{file}: {found['lost']} samples and messages lost"] if found["lost"] else []
-    return [*found["damage"], *lost]
-
-
-def _remarks(found: dict[str, Any]) -> list[str]:
-    versions = (f"{line}: only the same version makes the same decisions" for line in found["other_version"])
-    return [*(f"not scored: {problem}" for problem in found["not_scored"]), *versions]
+    with temporary_folder(output.parent) as folder:
+        found = score_again(tuple(files), Again(), folder)
+        lost = [f"{files[0]}: {found['lost']} samples and messages lost"] if found["lost"] else []
+        versions = (f"{line}: only the same version makes the same decisions" for line in found["other_version"])
+        remarks = [*(f"not scored: {problem}" for problem in found["not_scored"]), *versions]
+        yield WithScores([folder / files[0].name], [*found["damage"], *lost], remarks)

@@ -19,7 +19,7 @@ from fantwin.pipeline.cli.progress import Reporter
 from fantwin.pipeline.cli.simulation.scenario import Scenario, read_scenario
 from fantwin.pipeline.errors import UsageError, UserError
 from fantwin.pipeline.files import write_whole
-from fantwin.pipeline.recordings.simulated import record
+from fantwin.pipeline.recordings.raw_recordings import record
 from fantwin.pipeline.runtime.signals import stop_on_signals
 from fantwin.pipeline.sources.hwmon.chips import chip_of
 from fantwin.pipeline.sources.simulated.device import PlaybackCounts, PseudoTerminal, play, wait_for_reader

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,11 +11,10 @@ from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.outputs.rerun.rerun_sink import ViewOptions
 from fantwin.pipeline.outputs.rerun.view_of_site import view_of_site
 from fantwin.pipeline.recordings.left_out import left_out_hint
-from fantwin.pipeline.recordings.parts import Seen, in_order
-from fantwin.pipeline.recordings.reading import RecordingMetadata, read_recording
+from fantwin.pipeline.recordings.parts import in_order, read_parts
+from fantwin.pipeline.recordings.reading import RecordingMetadata
 from fantwin.pipeline.recordings.run_recordings import run_metadata
 from fantwin.schemas.codec import CodecError
-from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.units import SpeedUnit
 
 TOPICS = ("score", "alarm", "snapshot")
@@ -55,7 +54,7 @@ def write_view(site: RecordedSite, output: Path, options: ViewOptions) -> list[s
         UserError: the file cannot be written, or a recording cannot be read.
     """
     damage: list[str] = []
-    messages = _messages(site.parts, damage)
+    messages = read_parts(site.parts, TOPICS, damage)
     first = next(messages, None)
     core = view_of_site(site.name, site.trays, first.received_t_ns if first else 0, output, options)
     try:
@@ -71,18 +70,6 @@ def write_view(site: RecordedSite, output: Path, options: ViewOptions) -> list[s
         raise
     core.close()
     return [*damage, *filter(None, [core.problem()])]
-
-
-def _messages(parts: Sequence[Path], damage: list[str]) -> Iterator[Envelope]:
-    """The messages of all parts, each once: a message may be in two parts after a restart."""
-    seen: dict[tuple[str, str], Seen] = {}
-    for part in parts:
-        reading = read_recording(part, TOPICS)
-        for envelope in reading:
-            header = envelope.header
-            if seen.setdefault((envelope.key, header.producer), Seen()).is_new(header.sequence):
-                yield envelope
-        damage += [reading.damage] if reading.damage else []
 
 
 def _unit(metadata: RecordingMetadata, tray: str) -> SpeedUnit:

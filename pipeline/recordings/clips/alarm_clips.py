@@ -10,9 +10,10 @@ from queue import SimpleQueue
 
 from fantwin.pipeline.files import replace_file
 from fantwin.pipeline.recordings.clips.clip import Clip, clip_folder, clips_as_text, list_path
-from fantwin.pipeline.recordings.clips.cutting import LEAD_NS, remove_unfinished
+from fantwin.pipeline.recordings.clips.cutting import remove_unfinished
 from fantwin.pipeline.recordings.clips.tracker import ClipTracker, CutResult
 from fantwin.pipeline.recordings.disk import refused
+from fantwin.pipeline.recordings.disk_room import in_bytes
 from fantwin.pipeline.recordings.reading import RecordingError
 from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.messages import Alarm
@@ -43,34 +44,19 @@ class AlarmClips:
     def tick(self, now_ns: int, flush: Callable[[], bool]) -> None:
         """Take what was cut, delete what is too much, and have cut what is due. flush: brings all that was received to
         the disk; returns False where the disk refuses."""
+        self.tracker.follow(now_ns)  # also while clips are cut
         is_cutting = self._thread is not None and self._thread.is_alive()
         self._take_results()
         self._undeletable = ""
         try:
-            while self.tracker.is_full and (clip := self.tracker.oldest_acknowledged):
-                self.delete(clip)
+            while clip := self.tracker.to_delete:
+                self._delete(clip)
         except RecordingError as error:
             self._undeletable = str(error)
-        self.tracker.follow(now_ns)  # also while clips are cut
         if not is_cutting and (due := self.tracker.due(now_ns)) and flush():
             # the thread ends with the process: what it has not cut is cut after a restart
             self._thread = threading.Thread(target=self._work, args=(due,), name="clips", daemon=True)
             self._thread.start()
-
-    def delete(self, clip: Clip) -> None:
-        """Delete a clip, which then is no longer known. Raises RecordingError if that is not possible."""
-        path = self._folder / clip.name
-        try:
-            path.unlink(missing_ok=True)
-        except OSError as error:
-            advice = "other clips and recordings are kept until this file is gone: delete it or move it"
-            raise refused(f"{path}: cannot be deleted", error, advice) from error
-        self.tracker.deleted(clip)  # only now: what is still there takes room, and must not be forgotten
-
-    def needs(self, last_ns: int) -> bool:
-        """Whether a clip that is still to be cut needs what was received up to this time."""
-        since_ns = self.tracker.needed_since_ns
-        return since_ns is not None and since_ns - LEAD_NS <= last_ns
 
     def save(self) -> None:
         """Write the list of clips if it has changed: before the alarms that they are of are on the disk."""
@@ -90,9 +76,26 @@ class AlarmClips:
         self._take_results()
         self.save()
 
+    def notes(self) -> list[str]:
+        """What is kept longer than recordings are, for people."""
+        beyond = self.tracker.beyond
+        size = in_bytes(sum(clip.size_bytes for clip in beyond))
+        said = f"clips kept beyond recorder.keep_days until their alarms are acknowledged: {len(beyond)}, {size}"
+        return [said] if beyond else []
+
     def problem(self) -> str:
         """Why clips cannot be cut, kept or deleted; empty if all is well."""
         return self._undeletable or self.tracker.problem() or self._unwritten
+
+    def _delete(self, clip: Clip) -> None:
+        """Delete a clip, which then is no longer known. Raises RecordingError if that is not possible."""
+        path = self._folder / clip.name
+        try:
+            path.unlink(missing_ok=True)
+        except OSError as error:
+            advice = "other clips are kept until this file is gone: delete it or move it"
+            raise refused(f"{path}: cannot be deleted", error, advice) from error
+        self.tracker.deleted(clip)  # only now: what is still there takes room, and must not be forgotten
 
     def _work(self, clips: Sequence[Clip]) -> None:
         for clip in clips:

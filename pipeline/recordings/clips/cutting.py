@@ -41,8 +41,6 @@ from fantwin.schemas.units import NS_PER_S
 
 LEAD_S = 200.0
 """snapshots of large trays are three minutes apart at 100 Hz"""
-LEAD_NS = round((CLOCK_MARGIN_S + LEAD_S) * NS_PER_S)
-"""a clip needs the recording from so long before its beginning, at most"""
 PARTS_SEARCHED = 3
 """before the part where a clip begins, for the snapshot and the twin"""
 ROOM_BYTES = 4 << 20
@@ -105,12 +103,14 @@ class ClipCutter:
         within = [part for part in parts if part.first_ns <= clip.until_ns and part.last_ns >= start_ns]
         if not within:
             raise RecordingError("nothing of that time is recorded any more")
-        metadata, attachments = _about(read_metadata(within[0].file), clip, start_ns)
+        of_part = read_metadata(within[0].file)
+        metadata, attachments = _about(of_part, clip, start_ns)
         judged_after_ns = snapshot.newest_t_ns if snapshot else None
         if judged_after_ns is not None:
             metadata[CLIP_SNAPSHOT_KEY] = str(judged_after_ns)
         twin = _last_before(parts, "twin", start_ns)
-        lacks, topics = "", set[str]()
+        has_beginning = "continues" not in of_part.metadata or within[0].first_ns <= start_ns
+        lacks, topics = "" if has_beginning else "parts that it needs were deleted to make room", set[str]()
         with RecordingWriter(path, metadata, attachments, t_ns=start_ns, overwrite=True) as writer:
             for each in filter(None, (twin, snapshot)):
                 writer.add(each.received_at(start_ns))

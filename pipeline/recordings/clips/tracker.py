@@ -16,9 +16,9 @@ from fantwin.schemas.messages import Alarm
 from fantwin.schemas.units import NS_PER_S
 from fantwin.scoring.alarms.alarm_state import is_silenced
 
-BEFORE_S, AFTER_S = 60.0, 60.0
+BEFORE_NS, AFTER_NS = 60 * NS_PER_S, 60 * NS_PER_S
 """a clip begins so long before its alarm, and ends so long after"""
-SETTLED_S = 2.0
+SETTLED_NS = 2 * NS_PER_S
 """time after the end of a clip for what comes late; it then waits until all of that is on the disk"""
 LONGEST_NS = 600 * NS_PER_S
 """of a clip that more and more alarms extend; the next alarm then begins another one"""
@@ -48,20 +48,11 @@ class CutResult:
 class ClipTracker:
     """The clips of one recorder."""
 
-    def __init__(
-        self,
-        clips: Iterable[Clip],
-        most_bytes: int,
-        *,
-        before_s: float = BEFORE_S,
-        after_s: float = AFTER_S,
-        settled_s: float = SETTLED_S,
-    ) -> None:
-        """clips: those known from before a restart. most_bytes: of all clips together; 0: no limit."""
+    def __init__(self, clips: Iterable[Clip], most_bytes: int, kept_s: float = 0.0) -> None:
+        """clips: those known from before a restart. most_bytes: of all clips together; kept_s: how long acknowledged
+        ones are kept; 0: no limit."""
         self._clips = {clip.name: clip for clip in clips}
-        self._before_ns, self._after_ns = round(before_s * NS_PER_S), round(after_s * NS_PER_S)
-        self._settled_ns = round(settled_s * NS_PER_S)
-        self._most_bytes = most_bytes
+        self._most_bytes, self._kept_ns = most_bytes, round(kept_s * NS_PER_S)
         self._ended: set[str] = set()
         """clips that ended when the host's clock was set back"""
         self._retry_ns = self._now_ns = 0
@@ -77,15 +68,16 @@ class ClipTracker:
         return list(self._clips.values())
 
     @property
-    def needed_since_ns(self) -> int | None:
-        """What was received from here on is needed by clips that are still to be cut; None: nothing is."""
-        return min((clip.judged_since_ns for clip in self._clips.values() if clip.is_due), default=None)
+    def to_delete(self) -> Clip | None:
+        """The oldest acknowledged clip, if it is too old or clips exceed the limit of bytes."""
+        may_go = (clip for clip in self._clips.values() if clip.is_acknowledged and not clip.is_due)
+        oldest = min(may_go, key=lambda clip: clip.until_ns, default=None)
+        return oldest if oldest and (self.is_full or self._is_old(oldest)) else None
 
     @property
-    def oldest_acknowledged(self) -> Clip | None:
-        """The first clip that may be deleted."""
-        may_go = (clip for clip in self._clips.values() if clip.is_acknowledged and not clip.is_due)
-        return min(may_go, key=lambda clip: clip.until_ns, default=None)
+    def beyond(self) -> list[Clip]:
+        """The clips that are kept longer only until their alarms are acknowledged."""
+        return [clip for clip in self._clips.values() if self._is_old(clip) and not clip.is_acknowledged]
 
     @property
     def is_full(self) -> bool:
@@ -112,7 +104,7 @@ class ClipTracker:
         found = [
             clip
             for clip in self._clips.values()
-            if clip.is_due and (clip.name in self._ended or clip.until_ns + self._settled_ns <= now_ns)
+            if clip.is_due and (clip.name in self._ended or clip.until_ns + SETTLED_NS <= now_ns)
         ]
         if now_ns < self._retry_ns or not found:
             return []
@@ -126,8 +118,8 @@ class ClipTracker:
         """What came of cutting a clip."""
         clip = self._clips[result.name]
         if result.size_bytes:
-            problem = "; ".join(dict.fromkeys(filter(None, (clip.problem, result.problem))))
-            self._clips[clip.name] = replace(clip, is_due=False, size_bytes=result.size_bytes, problem=problem)
+            size_bytes, problem = result.size_bytes, result.problem
+            self._clips[clip.name] = replace(clip, is_due=False, size_bytes=size_bytes, problem=problem)
             self.counts["clips"] += 1
             self._failed = ""
         elif result.may_pass:
@@ -142,11 +134,6 @@ class ClipTracker:
         del self._clips[clip.name]
         self.counts["clips_deleted"] += 1
 
-    def part_deleted(self) -> None:
-        """A part that due clips may need was deleted, because the disk was full."""
-        for clip in [clip for clip in self._clips.values() if clip.is_due]:
-            self._clips[clip.name] = replace(clip, problem="a part that it needs was deleted to make room")
-
     def problem(self) -> str:
         """Why clips cannot be cut or kept; empty if all is well."""
         if self._not_kept and self.is_full:
@@ -156,13 +143,16 @@ class ClipTracker:
             )
         return self._failed
 
+    def _is_old(self, clip: Clip) -> bool:
+        return 0 < self._kept_ns < self._now_ns - clip.until_ns
+
     def _raise(self, alarm: Alarm, received_t_ns: int, of_tray: Sequence[Clip]) -> None:
         name = alarm.fan, alarm.onset_t_ns
         if any((each.fan, each.onset_t_ns) == name for clip in of_tray for each in clip.alarms):
             return
         delay_ns = min(max(0, alarm.t_ns - alarm.onset_t_ns), LONGEST_DELAY_NS)
-        onset_ns, until_ns = received_t_ns - delay_ns, received_t_ns + self._after_ns
-        since_ns, judged_since_ns = onset_ns - self._before_ns, onset_ns - max(self._before_ns, JUDGED_NS)
+        onset_ns, until_ns = received_t_ns - delay_ns, received_t_ns + AFTER_NS
+        since_ns, judged_since_ns = onset_ns - BEFORE_NS, onset_ns - max(BEFORE_NS, JUDGED_NS)
         clip = next((clip for clip in of_tray if self._is_joined(clip, received_t_ns, until_ns)), None)
         if clip is None:
             clip = Clip(clip_name(alarm, self._clips), alarm.header.tray, since_ns, until_ns, judged_since_ns, ())
@@ -177,7 +167,7 @@ class ClipTracker:
     def _is_joined(self, clip: Clip, received_t_ns: int, until_ns: int) -> bool:
         """Whether an alarm that is received now belongs to a clip, which then goes on until `until_ns`."""
         is_running = clip.is_due and clip.name not in self._ended
-        is_short = until_ns - clip.since_ns <= LONGEST_NS + self._before_ns + self._after_ns
+        is_short = until_ns - clip.since_ns <= LONGEST_NS + BEFORE_NS + AFTER_NS
         return is_running and is_short and clip.since_ns <= received_t_ns <= clip.until_ns
 
     def _end_running(self, now_ns: int) -> None:

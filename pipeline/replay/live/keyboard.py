@@ -28,7 +28,6 @@ _ARROWS = {b"C": Key.STEP, b"A": Key.FASTER, b"B": Key.SLOWER}
 _LETTERS = {b" ": Key.PAUSE, b"s": Key.STEP, b"q": Key.QUIT}
 _KEYS = re.compile(rb"\x1b[\[O]([ABC])|([ sq])")
 """terminals send arrows in one of two forms"""
-_INCOMPLETE = re.compile(rb"\x1b[\[O]?\Z")
 
 
 class Keys:
@@ -37,8 +36,6 @@ class Keys:
     def __init__(self) -> None:
         self._descriptor: int | None = None
         self._before: list[Any] = []
-        self._rest = b""
-        """an arrow of which only the first bytes have come"""
         with suppress(OSError, ValueError):  # standard input is closed or has no descriptor
             descriptor = sys.stdin.fileno()
             if os.isatty(descriptor) and os.tcgetpgrp(descriptor) == os.getpgrp():
@@ -72,12 +69,10 @@ class Keys:
                 data = b""
             if not data:  # the terminal was closed
                 self._descriptor = None
-            found += self.parsed(data)
+            found += keys_in(data)
         return found
 
-    def parsed(self, data: bytes) -> list[Key]:
-        """The keys that these bytes complete; other bytes are ignored."""
-        data = self._rest + data
-        rest = _INCOMPLETE.search(data)
-        self._rest = rest[0] if rest else b""
-        return [_ARROWS.get(arrow) or _LETTERS[letter] for arrow, letter in _KEYS.findall(data)]
+
+def keys_in(data: bytes) -> list[Key]:
+    """The keys that a terminal has sent; other bytes are ignored."""
+    return [_ARROWS.get(arrow) or _LETTERS[letter] for arrow, letter in _KEYS.findall(data)]

@@ -46,14 +46,14 @@ def read_versions(files: Iterable[Path]) -> dict[str, list[Version]]:
     Raises:
         RecordingError: a file cannot be read.
     """
-    seen: dict[tuple[str, str], Seen] = {}
+    seen = Seen()
     producers: dict[str, str] = {}
     versions: dict[str, list[Version]] = {}
     for entry in (entry for file in files for entry in rare_messages(file, TWIN)):
         card = entry.message
         assert isinstance(card, ModelCard)
         tray, header = tray_of(entry.key), card.header
-        if not card.content or not seen.setdefault((entry.key, header.producer), Seen()).is_new(header.sequence):
+        if not card.content or not seen.is_new(entry):
             continue
         known = versions.setdefault(tray, [])
         before, producers[tray] = producers.get(tray, header.producer), header.producer
@@ -152,11 +152,9 @@ class RecordingPlayback:
         """Seconds since the first message of the recording."""
         return (t_ns - self.first.received_t_ns) / NS_PER_S
 
-    def end_s(self) -> float | None:
-        """The end of the stretch in seconds since the first message; None where no file has an index."""
+    def end_s(self) -> float:
+        """The end of the stretch in seconds since the first message."""
         recorded = max(map(last_message_ns, self.files))
-        if not recorded:
-            return None
         return self.seconds_at(min(recorded, self._end_ns) if self._end_ns is not None else recorded)
 
     def __iter__(self) -> Iterator[Envelope]:
@@ -177,14 +175,13 @@ class RecordingPlayback:
 
     def _round(self, *, is_first: bool) -> Iterator[Envelope]:
         versions = ComingVersions(self._versions, self._end_ns, is_first_round=is_first)
-        seen: dict[tuple[str, str], Seen] = {}
+        seen = Seen()
         latched: dict[str, Envelope] = {}
         damage: dict[Path, str] = {}
         recordings = [self._messages(parts, damage) for parts in self._recordings]
         try:
             for entry in heapq.merge(*recordings, key=lambda each: each.received_t_ns):
-                header = entry.message.header
-                if not seen.setdefault((entry.key, header.producer), Seen()).is_new(header.sequence):
+                if not seen.is_new(entry):
                     continue  # also in the part before, or in the recording of another shard
                 if self._end_ns is not None and entry.received_t_ns > self._end_ns:
                     if entry.received_t_ns > self._end_ns + OUT_OF_ORDER_NS:
@@ -214,33 +211,28 @@ class RecordingPlayback:
 
 
 class TimeExtent:
-    """The first and the last time of messages, by receipt and by sample."""
+    """The first and the last time of messages, by receipt or by sample."""
 
     def __init__(self) -> None:
-        self._spans: dict[str, tuple[int, int]] = {}
+        self._times_ns: list[int] = []
+        """first and last, once there was a message"""
         self._periods_ns: set[int] = set()
 
     def add(self, entry: Envelope) -> None:
         """Include a message."""
-        self._widen("received", entry.received_t_ns)
         times = sample_times(entry.message)
-        if len(times):
-            self._widen("sampled", int(times[0]))
-            self._widen("sampled", int(times[-1]))
+        times_ns = [*self._times_ns, entry.received_t_ns, *times[:1].tolist(), *times[-1:].tolist()]
+        self._times_ns = [min(times_ns), max(times_ns)]
         if (period_ns := getattr(entry.message, "period_ns", 0)) > 0:
             self._periods_ns.add(period_ns)
 
     def length_ns(self) -> int:
         """The shift in ns of the next round: a whole number of grid periods. 0: there was no message."""
-        if not self._spans:
+        if not self._times_ns:
             return 0
         period_ns = math.lcm(*self._periods_ns) if self._periods_ns else LOOP_GAP_NS
-        longest_ns = max(last - first for first, last in self._spans.values())
-        return (longest_ns // period_ns + 1) * period_ns
-
-    def _widen(self, span: str, t_ns: int) -> None:
-        first, last = self._spans.get(span, (t_ns, t_ns))
-        self._spans[span] = (min(first, t_ns), max(last, t_ns))
+        first_ns, last_ns = self._times_ns
+        return ((last_ns - first_ns) // period_ns + 1) * period_ns
 
 
 def shifted(entry: Envelope, by_ns: int) -> Envelope:

@@ -51,22 +51,20 @@ class Episode:
     feedback_by: str = ""
     feedback_reason: str = ""
 
+    @property
+    def end_ns(self) -> int:
+        """When it was cleared; later than all times if it was not."""
+        return _NEVER_NS if self.cleared_ns is None else self.cleared_ns
+
     def as_json(self) -> dict[str, Any]:
         """The JSON form; times on the recording's clock in ns."""
-        return {
-            "tray": self.tray,
-            "fan": self.fan,
-            "raised_ns": self.raised_ns,
-            "cleared_ns": self.cleared_ns,
-            "onset_ns": self.onset_ns,
-            "severity": self.severity,
-            "residual": self.residual_rad_s,
-            "torque_balance": self.torque_balance_command,
-            "message": self.message,
-            "causes": [asdict(cause) for cause in self.causes],
+        found = asdict(self)
+        residual, balance = found.pop("residual_rad_s"), found.pop("torque_balance_command")
+        return found | {
+            "residual": residual,
+            "torque_balance": balance,
+            "causes": list(found["causes"]),
             "feedback": self.feedback.name.lower(),
-            "feedback_by": self.feedback_by,
-            "feedback_reason": self.feedback_reason,
         }
 
 
@@ -90,38 +88,20 @@ def episodes(alarms: Iterable[Alarm]) -> list[Episode]:
     return sorted(found, key=lambda episode: (episode.raised_ns, episode.tray, episode.fan))
 
 
-@dataclass(frozen=True)
-class AlarmDiff:
-    """How two lists of episodes differ. An episode is in both if one of the same fan overlaps it in time."""
-
-    gained: list[Episode]
-    lost: list[Episode]
-    kept: list[Episode]
-    """in the new list, as they are there"""
-
-
-def compare_episodes(now: list[Episode], before: list[Episode]) -> AlarmDiff:
-    """The episodes that are gained, lost and kept compared with `before`."""
+def compare_episodes(now: list[Episode], before: list[Episode]) -> dict[str, list[Episode]]:
+    """The episodes that are `gained`, `lost` and `kept` compared with `before`: kept are those of which one of the same
+    fan overlaps in time."""
     kept = [episode for episode in now if any(_overlap(episode, other) for other in before)]
-    return AlarmDiff(
-        gained=[episode for episode in now if episode not in kept],
-        lost=[other for other in before if not any(_overlap(other, episode) for episode in now)],
-        kept=kept,
-    )
+    return {
+        "gained": [episode for episode in now if episode not in kept],
+        "lost": [other for other in before if not any(_overlap(other, episode) for episode in now)],
+        "kept": kept,
+    }
 
 
 def _overlap(one: Episode, other: Episode) -> bool:
-    if (one.tray, one.fan) != (other.tray, other.fan):
-        return False
-    return _from(one) <= _to(other) and _from(other) <= _to(one)
-
-
-def _from(episode: Episode) -> int:
-    return episode.onset_ns
-
-
-def _to(episode: Episode) -> int:
-    return 2**63 if episode.cleared_ns is None else episode.cleared_ns
+    is_same_fan = (one.tray, one.fan) == (other.tray, other.fan)
+    return is_same_fan and one.onset_ns <= other.end_ns and other.onset_ns <= one.end_ns
 
 
 def _marks(in_order: list[Alarm]) -> dict[_Name, _Mark]:
@@ -193,8 +173,7 @@ class LeftOut:
 
     def has(self, alarm: Episode) -> bool:
         """Whether an alarm of these trays overlaps it."""
-        end_ns = _NEVER_NS if alarm.cleared_ns is None else alarm.cleared_ns
-        return alarm.fan == self.fan and alarm.onset_ns <= self.to_t_ns and self.from_t_ns <= end_ns
+        return alarm.fan == self.fan and alarm.onset_ns <= self.to_t_ns and self.from_t_ns <= alarm.end_ns
 
     def length_ns(self, first_t_ns: int, last_t_ns: int) -> int:
         """How much of it lies between two times."""
@@ -215,9 +194,8 @@ class MarkedAlarm:
         """What is left out because of it; None: nothing."""
         if self.alarm.feedback != Feedback.TRUE_ALARM:
             return None
-        end_t_ns = _NEVER_NS if self.alarm.cleared_ns is None else self.alarm.cleared_ns
         from_t_ns = self.alarm.onset_ns - BEFORE_ALARM_NS
-        return LeftOut(self.site, self.path, self.alarm.tray, self.alarm.fan, from_t_ns, end_t_ns)
+        return LeftOut(self.site, self.path, self.alarm.tray, self.alarm.fan, from_t_ns, self.alarm.end_ns)
 
     @property
     def line(self) -> str:

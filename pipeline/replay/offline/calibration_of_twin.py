@@ -10,7 +10,7 @@ from pydantic import ValidationError
 
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.prediction.tray_twin import TrayTwin
-from fantwin.pipeline.replay.offline.healthy_runs import DecidedRun, FreeLimit, HealthyRuns, LearnedRun, Limit
+from fantwin.pipeline.replay.offline.healthy_runs import DecidedRun, HealthyRuns, LearnedRun, Limit
 from fantwin.scoring.calibration.calibration import (
     HOURS_PER_DAY,
     Calibration,
@@ -95,7 +95,7 @@ def _raised(runs: HealthyRuns, limit: Limit, most: int) -> tuple[Limit, list[Dec
     An excursion may raise more than one. So the alarms themselves are counted, and the limit is raised again until it
     is so.
     """
-    peaks = [peak for run in runs.decided(FreeLimit(limit.priors, limit.declared_s)) for peak in run.peaks]
+    peaks = [peak for run in runs.decided(limit.free()) for peak in run.peaks]
     usual = [peak for peak in peaks if peak <= LARGEST_FACTOR]
     allowed = max(most - (len(peaks) - len(usual)), 0)
     factor = raised_limit(usual, allowed)

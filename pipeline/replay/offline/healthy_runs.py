@@ -106,32 +106,32 @@ class DecidedRun:
 
 @dataclass(frozen=True)
 class Limit:
-    """What a run is decided with. declared_s: mean time between two false alarms of a fan."""
+    """What a run is decided with. declared_s: mean time between two false alarms of a fan.
+
+    factor: of the limit by theory. is_free: no alarm is raised, so that statistics go on beyond the limit; their score
+    times `factor` is then relative to the limit by theory, by which also wrong readings of a tacho are found.
+    """
 
     priors: Priors
     declared_s: float
     factor: float = 1.0
+    is_free: bool = False
 
     def decision(self, fans: Fans, bin_ns: int, period_ns: int) -> Decision:
         """A new decision on fans."""
-        return Decision(fans, bin_ns, period_ns / NS_PER_S, self.declared_s, self.priors, self.factor)
 
+        def by(factor: float) -> Decision:
+            return Decision(fans, bin_ns, period_ns / NS_PER_S, self.declared_s, self.priors, factor)
 
-@dataclass(frozen=True)
-class FreeLimit:
-    """The limit by theory, for statistics that go on beyond it: no alarm is raised."""
-
-    priors: Priors
-    declared_s: float
-    factor: float = NEVER
-    """the score of a decision times this is relative to the limit by theory"""
-
-    def decision(self, fans: Fans, bin_ns: int, period_ns: int) -> Decision:
-        """A new decision on fans. Which readings of a tacho are wrong is decided as by theory."""
-        by_theory = Limit(self.priors, self.declared_s).decision(fans, bin_ns, period_ns)
-        never = Limit(self.priors, self.declared_s, self.factor).decision(fans, bin_ns, period_ns)
+        if not self.is_free:
+            return by(self.factor)
+        by_theory, never = by(1.0), by(self.factor)
         by_theory.log_limit, by_theory.missing = never.log_limit, never.missing
         return by_theory
+
+    def free(self) -> Limit:
+        """The limit by theory, at which no alarm is raised."""
+        return replace(self, factor=NEVER, is_free=True)
 
 
 class HealthyRuns:
@@ -159,7 +159,7 @@ class HealthyRuns:
         learn = partial(_learn, source=self._source)
         return [*chain.from_iterable(self._each(learn, self._paths, "learning from healthy recordings"))]
 
-    def decided(self, limit: Limit | FreeLimit) -> list[DecidedRun]:
+    def decided(self, limit: Limit) -> list[DecidedRun]:
         """The alarms of each run, all of which are false. Raises as `learned`."""
         decide = partial(_decide, source=self._source, limit=limit)
         return [*chain.from_iterable(self._each(decide, self._paths, "counting false alarms"))]
@@ -202,7 +202,7 @@ def _learn(path: Path, source: _Source) -> list[LearnedRun]:
     return found
 
 
-def _decide(path: Path, source: _Source, limit: Limit | FreeLimit) -> list[DecidedRun]:
+def _decide(path: Path, source: _Source, limit: Limit) -> list[DecidedRun]:
     return [decide(run, source.fans(run.tray), limit) for run in source.runs(path)]
 
 
@@ -214,7 +214,7 @@ def learn(run: TrayRun, fans: Fans) -> LearnedRun:
     return LearnedRun(run.tray, healthy.sums)
 
 
-def decide(run: TrayRun, fans: Fans, limit: Limit | FreeLimit) -> DecidedRun:
+def decide(run: TrayRun, fans: Fans, limit: Limit) -> DecidedRun:
     """The alarms of a run of these fans."""
     decision = limit.decision(fans, run.bin_ns, run.period_ns)
     alarms, excursions = [0] * run.tray.fans, Excursions(run.tray.fans)

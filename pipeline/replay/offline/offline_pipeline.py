@@ -9,7 +9,7 @@ from __future__ import annotations
 import heapq
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import chain
 from operator import itemgetter
 from typing import Any, Literal
@@ -25,14 +25,6 @@ from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Message, ModelCard, NewTwin, Prediction, Request, ScorerSnapshot
 from fantwin.schemas.messages import newest_t_ns as message_t_ns
 from fantwin.schemas.topics import BY_NAME
-
-
-@dataclass(frozen=True)
-class ReplayedMessage:
-    """A message that the last stage made, and the recorded session that it belongs to."""
-
-    producer: str
-    message: Message
 
 
 class OfflinePipeline:
@@ -82,8 +74,8 @@ class OfflinePipeline:
             limits |= {session.producer: limit_through(session, limits) for session in sessions}
         return limits.get(producer)
 
-    def run(self) -> Iterator[ReplayedMessage]:
-        """What the last stage makes, in order.
+    def run(self) -> Iterator[tuple[str, Message]]:
+        """What the last stage makes, in order, with the recorded session (its producer) that it belongs to.
 
         Raises:
             StageError: a stage cannot be built as configured.
@@ -98,7 +90,7 @@ class OfflinePipeline:
             restored = core.restore(snapshot) if snapshot else ()
             for message in chain(restored, self._run_last(core, session)):
                 self._observe(message)
-                yield ReplayedMessage(session.producer, message)
+                yield session.producer, message
             closing = self._close(core)
             replayed_snapshot = next((message for message in closing if isinstance(message, ScorerSnapshot)), None)
 

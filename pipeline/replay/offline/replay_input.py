@@ -13,6 +13,7 @@ from typing import NamedTuple
 from fantwin.pipeline.config.loading import load_config
 from fantwin.pipeline.config.settings import Config, TrayConfig
 from fantwin.pipeline.recordings.clips.clip import CLIP_SNAPSHOT_KEY
+from fantwin.pipeline.recordings.indexed import rare_messages
 from fantwin.pipeline.recordings.metadata import CONFIGURATION
 from fantwin.pipeline.recordings.parts import in_order
 from fantwin.pipeline.recordings.reading import RecordingError, RecordingMetadata, read_metadata, read_recording
@@ -28,6 +29,7 @@ from fantwin.pipeline.runtime.stage import Context
 from fantwin.pipeline.timebase.stage_clock import is_of_replay
 from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.messages import Alarm, Message, ModelCard
+from fantwin.schemas.topics import tray_of
 
 
 class ReadPlan(NamedTuple):
@@ -250,15 +252,10 @@ def _twin_of(
         return tray.twin if tray.twin.is_absolute() else base.folder / tray.twin
     if tray.name in recorded:
         return recorded[tray.name]
-    if any(has_learned_twins(path, tray.name) for path in paths):
+    cards = (each.message for path in paths for each in rare_messages(path, "twin") if tray_of(each.key) == tray.name)
+    if any(isinstance(card, ModelCard) and card.content for card in cards):  # learned while it was recorded
         return None
     raise RecordingError(f"{paths[0]}: no twin of {tray.name} in this recording: name one with --twin FILE.onnx")
-
-
-def has_learned_twins(path: Path, tray: str) -> bool:
-    """Whether a recording has twins that were learned while it was recorded."""
-    cards = (envelope.message for envelope in read_recording(path, ("twin",), tray))
-    return any(isinstance(card, ModelCard) and card.content for card in cards)
 
 
 def _started_t_ns(path: Path, metadata: RecordingMetadata, first_sample_t_ns: int) -> int:

@@ -16,7 +16,6 @@ import numpy as np
 
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.recordings.metadata import recording_metadata
-from fantwin.pipeline.recordings.records import active_path
 from fantwin.pipeline.recordings.writing import RecordingWriter
 from fantwin.pipeline.replay.offline.comparison import CannotCompareError, Comparison
 from fantwin.pipeline.replay.offline.plan import RAW_MISSING, TrayPlan
@@ -26,7 +25,7 @@ from fantwin.schemas.blocks import cut
 from fantwin.schemas.codec import CodecError
 from fantwin.schemas.enums import InvalidReason
 from fantwin.schemas.header import Header
-from fantwin.schemas.messages import Alarm, Grid, Message, Prediction, Raw, Request, Score, ScorerSnapshot, newest_t_ns
+from fantwin.schemas.messages import Alarm, Grid, Message, Prediction, Raw, Request, Score, newest_t_ns
 from fantwin.schemas.streams import LOSS_PREFIX
 from fantwin.schemas.topics import TOPICS, tray_key
 from fantwin.schemas.units import NS_PER_S
@@ -40,12 +39,8 @@ def output_writer(replay_input: ReplayInput, output: Path) -> RecordingWriter:
     """The writer of a new recording, with the configuration and the twins that are used.
 
     Raises:
-        UserError: the file exists.
         RecordingError: it cannot be written.
     """
-    for path in (output, active_path(output)):
-        if path.exists():
-            raise UserError(f"{path}: exists already; name another file with -o, or remove it")
     contexts = [replay_input.contexts(tray)[-1] for tray in replay_input.trays]
     metadata, attachments = recording_metadata(replace(contexts[0], trays=tuple(context.tray for context in contexts)))
     metadata["source"] = ",".join(path.name for path in replay_input.paths)
@@ -172,7 +167,6 @@ def rescore(
         CannotCompareError: the recording has no scores, or lacks the input from which they were computed.
         StageError: a stage cannot be built as configured.
         RecordingError: the output cannot be written.
-        UserError: the output exists.
     """
     if verify and replay_input.is_part:
         raise CannotCompareError(
@@ -209,7 +203,7 @@ def _rescore_tray(
         if output:
             output.add(message)
         if verifier and isinstance(message, Grid | Prediction):
-            verifier.add_input(message)
+            verifier.add(message.header.producer, message)
 
     pipeline = replay_input.pipeline(tray, found.plan, observe)
     verifier = (
@@ -223,15 +217,14 @@ def _rescore_tray(
         else None
     )
     try:
-        for replayed in pipeline.run():
-            message = replayed.message
+        for producer, message in pipeline.run():
             if isinstance(message, Alarm):
-                rescored.alarms.append(replace(message, header=Header(replayed.producer, 0, tray)))
+                rescored.alarms.append(replace(message, header=Header(producer, 0, tray)))
             elif isinstance(message, Score):
                 rescored.add(message, pipeline.longest_repeat)
                 progress(tray, rescored.end_ns)
-            if verifier and isinstance(message, Score | ScorerSnapshot):
-                verifier.add(replayed.producer, message)
+            if verifier:
+                verifier.add(producer, message)
     except CodecError as error:
         raise UserError(f"{replay_input.paths[0]}: a message cannot be decoded: {error}; see `fantwin info`") from error
     rescored.counts, rescored.raw_missing = pipeline.counts, pipeline.raw_missing

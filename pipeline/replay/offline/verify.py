@@ -6,39 +6,41 @@ Numbers may differ within a tolerance (pipeline.replay.offline.comparison).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+import json
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict
 from functools import cache
-from typing import Any, Generic, TypeVar
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from fantwin.pipeline.recordings.dates import format_utc
-from fantwin.pipeline.replay.offline.comparison import Apart, Comparison, SnapshotVerifier, differences, unequal
+from fantwin.pipeline.replay.offline.comparison import Apart, Comparison, differences, unequal
 from fantwin.pipeline.replay.offline.plan import UNLIMITED, Limit, Session
 from fantwin.schemas.blocks import cut
-from fantwin.schemas.codec import decode_together
+from fantwin.schemas.codec import CodecError, decode_together
 from fantwin.schemas.enums import Transition
 from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.fields import columns
 from fantwin.schemas.messages import Alarm, Array, Grid, Message, Prediction, Score, ScorerSnapshot
+from fantwin.scoring.model.saved import from_json
 
-Samples = TypeVar("Samples", bound=Grid | Prediction | Score)
+Samples: TypeAlias = Grid | Prediction | Score
 
-SCORE, SNAPSHOT = "score", "snapshot"
 AT_A_LIMIT = (
     "although all numbers agree within the tolerance: one lies so close to its limit that processors decide "
     "differently, or the way of deciding has changed"
 )
 _BLOCK_MESSAGES = 512
-_INPUTS = {Grid: "grid", Prediction: "prediction"}
+_TOPICS: dict[type[Message], str] = {Grid: "grid", Prediction: "prediction", Score: "score"}
 
 
 class TrayVerifier:
     """Compares what a replay of one tray makes with the recording, session by session.
 
     What differs beyond the limit of its session is not a difference of the code: the recording lacks what it was
-    computed from.
+    computed from. Where scores are not recorded, snapshots show that every statistic and alarm was the same, and all
+    that was learned of the fans.
     """
 
     def __init__(
@@ -46,80 +48,56 @@ class TrayVerifier:
         tray: str,
         read: Callable[[str], Iterable[Envelope]],
         limit_of: Callable[[str], Limit | None],
-        left_out: Collection[str] = (),
+        left_out: tuple[str, ...] = (),
     ) -> None:
         """read: the recorded messages of a topic of the tray, from the beginning at each call. limit_of: the limit of a
-        session of the scorer, as known when its last scores were made. left_out: topics that are not recorded."""
+        session, as known by now. left_out: topics that are not recorded."""
         self._read = read
         self._limit_of: Callable[[str], Limit] = lambda producer: limit_of(producer) or UNLIMITED
-        self._producer: str | None = None
-        self._recorded: RecordedSession[Score] | None = None
-        self._visited: set[str] = set()
-        self._inputs: dict[str, RecordedSession[Grid | Prediction]] = {}
-        """by producer"""
-        self._found = Comparison(tray, has_scores=SCORE not in left_out)
-        self._snapshots = SnapshotVerifier(lambda: read(SNAPSHOT), self._limit_of, self._found)
+        self._samples: dict[tuple[type[Samples], str], RecordedSamples] = {}
+        self._snapshots: dict[str, _RecordedSnapshots] = {}
+        self._found = Comparison(tray, left_out)
 
-    def add(self, producer: str, message: Score | ScorerSnapshot) -> None:
-        """Compare the next scores or snapshot that were replayed, of the recorded session `producer`."""
-        if isinstance(message, Score) and self._found.has_scores:
-            self._add_score(producer, message)
+    def add(self, producer: str, message: Message) -> None:
+        """Compare the next message that was replayed, of the recorded session `producer`."""
+        if isinstance(message, Grid | Prediction) or (isinstance(message, Score) and self._found.has_scores):
+            compare_samples(message, self._samples_of(type(message), producer), self._found, self._limit_of(producer))
         elif isinstance(message, ScorerSnapshot) and not (message.restored or self._found.has_scores):
-            self._snapshots.add(producer, message)
-
-    def add_input(self, block: Grid | Prediction) -> None:
-        """Compare the next samples that a stage made for the next one, of the recorded session that they name."""
-        producer = block.header.producer
-        if producer not in self._inputs:
-            self._inputs[producer] = RecordedSession(self._read(_INPUTS[type(block)]), producer, type(block))
-        compare_inputs(block, self._inputs[producer], self._found, self._limit_of(producer))
-
-    def _add_score(self, producer: str, score: Score) -> None:
-        if self._recorded is None or producer != self._producer:
-            self._end_session()
-            self._recorded = self._begin_session(producer)
-        compare_scores(score, self._recorded, self._found, self._limit_of(producer))
+            self._snapshots_of(producer).add(message)
 
     def finish(self, sessions: Sequence[Session], alarms: Sequence[Alarm], recorded: Sequence[Alarm]) -> Comparison:
         """Compare what is left, and the alarms; the result."""
-        if self._found.has_scores:
-            self._finish_scores(sessions)
-        else:
-            self._snapshots.finish(sessions)
+        found = self._found
         for session in sessions:
+            producer, limit = session.producer, self._limit_of(session.producer)
+            if found.has_scores:
+                for block in self._samples_of(Score, producer).until(None):
+                    _count_not_made(block.t_ns, found, limit)
+            else:
+                self._snapshots_of(producer).settle(None)
             replayed, known = (
-                [alarm for alarm in listed if alarm.header.producer == session.producer]
-                for listed in (alarms, recorded)
+                [alarm for alarm in listed if alarm.header.producer == producer] for listed in (alarms, recorded)
             )
-            limit = self._limit_of(session.producer)
-            compare_alarms(replayed, known, session.last_t_ns, self._found, limit)
-            if limit.t_ns < session.last_t_ns and not self._found.has_scores:
-                self._found.add_limit(limit)
-        if holes := self._found.holes:
-            self._found.add_reason(f"{self._found.tray}: the recording lacks {holes} scored samples between others")
-        return self._found
+            compare_alarms(replayed, known, session.last_t_ns, found, limit)
+            if limit.t_ns < session.last_t_ns and not found.has_scores:
+                found.add_limit(limit)
+        if found.holes:
+            found.add_reason(f"{found.tray}: the recording lacks {found.holes} scored samples between others")
+        return found
 
-    def _finish_scores(self, sessions: Sequence[Session]) -> None:
-        self._end_session()
-        for session in sessions:
-            if session.producer not in self._visited:
-                self._recorded = self._begin_session(session.producer)
-                self._end_session()
+    def _samples_of(self, kind: type[Samples], producer: str) -> RecordedSamples:
+        if (kind, producer) not in self._samples:
+            self._samples[kind, producer] = RecordedSamples(self._read(_TOPICS[kind]), producer, kind)
+        return self._samples[kind, producer]
 
-    def _begin_session(self, producer: str) -> RecordedSession[Score]:
-        self._producer = producer
-        self._visited.add(producer)
-        return RecordedSession(self._read(SCORE), producer, Score)
-
-    def _end_session(self) -> None:
-        if self._recorded and self._producer is not None:
-            limit = self._limit_of(self._producer)
-            for block in self._recorded.until(None):
-                count_not_made(block.t_ns, self._found, limit)
-        self._recorded = None
+    def _snapshots_of(self, producer: str) -> _RecordedSnapshots:
+        if producer not in self._snapshots:
+            recorded = _saved(self._read("snapshot"), producer)
+            self._snapshots[producer] = _RecordedSnapshots(recorded, self._found, lambda: self._limit_of(producer))
+        return self._snapshots[producer]
 
 
-class RecordedSession(Generic[Samples]):
+class RecordedSamples:
     """The recorded samples of one session of a stage, in order, each once."""
 
     def __init__(self, envelopes: Iterable[Envelope], producer: str, kind: type[Samples]) -> None:
@@ -135,8 +113,7 @@ class RecordedSession(Generic[Samples]):
 
     def until(self, t_ns: int | None) -> Iterator[Samples]:
         """The next samples up to and including a time; None: all that are left."""
-        while self._rest is not None:
-            block = self._rest
+        while (block := self._rest) is not None:
             last = len(block.t_ns) if t_ns is None else int(np.searchsorted(block.t_ns, t_ns, side="right"))
             if last:
                 self.has_begun = True
@@ -147,48 +124,34 @@ class RecordedSession(Generic[Samples]):
             self._rest = next(self._blocks, None)
 
 
-def compare_inputs(
-    made: Samples, recorded: RecordedSession[Samples], found: Comparison, limit: Limit = UNLIMITED
-) -> None:
-    """Compare a block of another stage than the scorer with what is recorded of it, up to its last sample."""
-    for block, rows, is_made in _beside(made, recorded):
-        if block.fans == made.fans and len(rows):
-            different = _compare_samples(made, rows, block, is_made, limit, found, f"{_INPUTS[type(made)]}.")
-            found.inputs_different += int((different & (block.t_ns[is_made] <= limit.t_ns)).sum())
-
-
-def compare_scores(made: Score, recorded: RecordedSession[Score], found: Comparison, limit: Limit = UNLIMITED) -> None:
-    """Compare a block of scores with the recorded ones up to its last sample."""
+def compare_samples(made: Samples, recorded: RecordedSamples, found: Comparison, limit: Limit = UNLIMITED) -> None:
+    """Compare a block of samples with the recorded ones up to its last sample. Of other stages than the scorer only
+    those count that are recorded and replayed: a session may have made more than the next one consumed."""
+    counts, is_score = found.counts, isinstance(made, Score)
     is_taken = np.zeros(len(made.t_ns), np.bool_)
     had_begun = recorded.has_begun
-    for block, rows, is_made in _beside(made, recorded):
-        count_not_made(block.t_ns[~is_made], found, limit)
-        is_taken[rows] = True
-        within = block.t_ns[is_made] <= limit.t_ns
-        if block.fans != made.fans:
-            different = np.ones(len(rows), np.bool_)
-            found.name(f"{found.tray}: {made.fans} fans replayed, {block.fans} recorded")
-        else:
-            different = _compare_samples(made, rows, block, is_made, limit, found)
-        found.add_not_comparable(int((different & ~within).sum()), limit)
-        found.different += int((different & within).sum())
-        found.equal += int((~different).sum())
-    found.not_recorded += int((~is_taken).sum())
-    taken = np.flatnonzero(is_taken)
-    between = slice(
-        0 if had_begun else int(taken[0]) if len(taken) else len(is_taken),
-        len(is_taken) if recorded.has_more else int(taken[-1]) if len(taken) else 0,
-    )
-    found.holes += int((~is_taken & (made.t_ns <= limit.t_ns))[between].sum())
-
-
-def _beside(made: Samples, recorded: RecordedSession[Samples]) -> Iterator[tuple[Samples, Array, Array]]:
-    """The recorded blocks up to the last sample of a replayed one; the rows of it that are recorded, and which of the
-    recorded ones they are, (n,) of bool."""
     for block in recorded.until(int(made.t_ns[-1])):
         at = np.searchsorted(made.t_ns, block.t_ns)
         is_made = (at < len(made.t_ns)) & (made.t_ns[np.minimum(at, len(made.t_ns) - 1)] == block.t_ns)
-        yield block, at[is_made], is_made
+        rows, within = at[is_made], block.t_ns[is_made] <= limit.t_ns
+        is_taken[rows] = True
+        if is_score:
+            _count_not_made(block.t_ns[~is_made], found, limit)
+        if block.fans != made.fans:
+            different = np.ones(len(rows), np.bool_)
+            found.name(f"{made.fans} fans replayed, {block.fans} recorded")
+        else:
+            different = _different_rows(made, rows, block, is_made, limit, found)
+        counts["samples_different" if is_score else "inputs_different"] += int((different & within).sum())
+        if is_score:
+            found.add_not_comparable(int((different & ~within).sum()), limit)
+            counts["samples_equal"] += int((~different).sum())
+    if is_score:
+        counts["samples_not_recorded"] += int((~is_taken).sum())
+        taken = np.flatnonzero(is_taken)
+        first, last = (int(taken[0]), int(taken[-1])) if len(taken) else (len(is_taken), 0)
+        between = slice(0 if had_begun else first, len(is_taken) if recorded.has_more else last)
+        found.holes += int((~is_taken & (made.t_ns <= limit.t_ns))[between].sum())
 
 
 @cache
@@ -201,50 +164,40 @@ def _dtypes(kind: type[Message]) -> dict[str, np.dtype[Any]]:
     }
 
 
-def _compare_samples(
-    made: Samples, rows: Array, recorded: Samples, is_made: Array, limit: Limit, found: Comparison, prefix: str = ""
+def _different_rows(
+    made: Samples, rows: Array, recorded: Samples, is_recorded: Array, limit: Limit, found: Comparison
 ) -> Array:
     """(n,) whether a sample differs; only those within the limit of their session are named."""
-    t_ns = recorded.t_ns[is_made]
+    t_ns = recorded.t_ns[is_recorded]
     within = t_ns <= limit.t_ns
-    one, other = (
-        {f"{prefix}{name}": getattr(message, name)[of].astype(dtype) for name, dtype in _dtypes(type(message)).items()}
-        for message, of in ((made, rows), (recorded, is_made))
-    )
-    differ = {name: _differ(name, values, other[name], found) for name, values in one.items()}
-    number_differs = np.any([differs for name, differs in differ.items() if one[name].dtype.kind == "f"], axis=0)
+    values = {
+        name: (getattr(made, name)[rows].astype(dtype), getattr(recorded, name)[is_recorded].astype(dtype))
+        for name, dtype in _dtypes(type(made)).items()
+    }
+    differ = {name: unequal(name, *both, found.note) for name, both in values.items()}
+    number_differs = np.any([differs for name, differs in differ.items() if values[name][0].dtype.kind == "f"], axis=0)
     found.numbers_different += int((number_differs.any(axis=1) & within).sum())
+    of_input = "" if isinstance(made, Score) else f"{_TOPICS[type(made)]}."
     for name, differs in differ.items():
         named = differs & within[:, np.newaxis]
         if named.any():
             row, fan = np.argwhere(named)[0].tolist()
+            one, other = (each[row, fan] for each in values[name])
             found.name(
-                f"{found.tray}: {format_utc(int(t_ns[row]))}, fan {fan}: {name} {one[name][row, fan]!s} replayed, "
-                f"{other[name][row, fan]!s} recorded (in {int(named.any(axis=1).sum())} of {len(t_ns)} samples "
-                f"from here on){'' if number_differs[row, fan] else ', ' + AT_A_LIMIT}"
+                f"{format_utc(int(t_ns[row]))}, fan {fan}: {of_input}{name} {one!s} replayed, {other!s} recorded "
+                f"(in {int(named.any(axis=1).sum())} of {len(t_ns)} samples from here on)"
+                f"{'' if number_differs[row, fan] else ', ' + AT_A_LIMIT}"
             )
     return np.any([differs.any(axis=1) for differs in differ.values()], axis=0)
 
 
-def _differ(name: str, one: Array, other: Array, found: Comparison) -> Array:
-    """(n, fans) which values differ: decisions at all, numbers by more than the tolerance. All NaN are equal."""
-    differs, share = unequal(name, one, other)
-    if (allowed := share <= 1.0).any():
-        largest = int(np.argmax(np.where(allowed, share, 0.0)))
-        difference = abs(float(one[differs][largest]) - float(other[differs][largest]))
-        found.note(Apart(float(share[largest]), name, difference))
-    differs[differs] = share > 1.0
-    return differs
-
-
-def count_not_made(t_ns: Array, found: Comparison, limit: Limit = UNLIMITED) -> None:
+def _count_not_made(t_ns: Array, found: Comparison, limit: Limit) -> None:
     """Count samples that were recorded and not replayed."""
-    within = t_ns <= limit.t_ns
-    found.add_not_comparable(int((~within).sum()), limit)
-    if within.any():
-        found.not_made += int(within.sum())
-        first_t_ns = int(t_ns[within][0])
-        found.name(f"{found.tray}: {format_utc(first_t_ns)}: recorded and not replayed, {int(within.sum())} samples")
+    within = t_ns[t_ns <= limit.t_ns]
+    found.add_not_comparable(len(t_ns) - len(within), limit)
+    if len(within):
+        found.counts["samples_not_made"] += len(within)
+        found.name(f"{format_utc(int(within[0]))}: recorded and not replayed, {len(within)} samples")
 
 
 def compare_alarms(
@@ -258,33 +211,39 @@ def compare_alarms(
 
     An alarm is published right after its score, so those of the last recorded score may be missing in the recording.
     """
-    at_a_limit = f" ({AT_A_LIMIT})" if found.equal and not found.numbers_different else ""
+    at_a_limit = f" ({AT_A_LIMIT})" if found.counts["samples_equal"] and not found.numbers_different else ""
     left = {_key(alarm): alarm for alarm in recorded}
-    for alarm in made:
-        other = left.pop(_key(alarm), None)
-        where = first_difference(alarm, other, found.note) if other is not None else ""
-        if other is not None and not where:
-            found.alarms_equal += 1
-        elif alarm.t_ns > limit.t_ns:
-            found.alarms_not_comparable += 1
-        elif other is not None:
-            found.alarms_different += 1
-            found.name(f"{found.tray}: alarm {_describe(alarm)} replayed, {other.message!r} recorded: {where} differs")
-        elif alarm.t_ns >= last_scored_t_ns:
-            found.alarms_not_recorded += 1
+    pairs: list[tuple[Alarm | None, Alarm | None]] = [(alarm, left.pop(_key(alarm), None)) for alarm in made]
+    pairs += [(None, alarm) for alarm in left.values()]
+    for one, other in pairs:
+        alarm, difference = one or other, ""
+        assert alarm
+        described = f"alarm {alarm.transition.name.lower()} at {format_utc(alarm.t_ns)}, {alarm.message!r},"
+        if one and other:
+            if where := _alarm_difference(one, other, found.note):
+                difference = f"replayed, {other.message!r} recorded: {where} differs"
         else:
-            found.alarms_different += 1
-            found.name(f"{found.tray}: alarm {_describe(alarm)} replayed, none recorded{at_a_limit}")
-    for alarm in left.values():
-        if alarm.t_ns > limit.t_ns:
-            found.alarms_not_comparable += 1
-            continue
-        found.alarms_different += 1
-        found.name(f"{found.tray}: alarm {_describe(alarm)} recorded, none replayed{at_a_limit}")
+            difference = f"{'replayed, none recorded' if one else 'recorded, none replayed'}{at_a_limit}"
+        if not difference:
+            result = "equal"
+        elif alarm.t_ns > limit.t_ns:
+            result = "not_comparable"
+        elif other is None and alarm.t_ns >= last_scored_t_ns:
+            result = "not_recorded"
+        else:
+            result = "different"
+            found.name(f"{described} {difference}")
+        found.counts[f"alarms_{result}"] += 1
 
 
 def _key(alarm: Alarm) -> tuple[int, int, Transition, str]:
     return alarm.fan, alarm.t_ns, alarm.transition, alarm.request
+
+
+def _alarm_difference(one: Alarm, other: Alarm, note: Callable[[Apart], None]) -> str:
+    """The first field in which two alarms differ by more than the tolerance; empty if none."""
+    mine, others = ({name: value for name, value in asdict(each).items() if name != "header"} for each in (one, other))
+    return next(differences(mine, others, note), "")
 
 
 def _blocks(envelopes: Iterable[Envelope], producer: str, kind: type[Samples]) -> Iterator[Samples]:
@@ -301,11 +260,81 @@ def _blocks(envelopes: Iterable[Envelope], producer: str, kind: type[Samples]) -
     yield from decode_together(kind, waiting)
 
 
-def first_difference(alarm: Alarm, other: Alarm, note: Callable[[Apart], None]) -> str:
-    """The first field in which two alarms differ by more than the tolerance; empty if none."""
-    one, beside = ({name: value for name, value in asdict(each).items() if name != "header"} for each in (alarm, other))
-    return next(differences(one, beside, note), "")
+class _RecordedSnapshots:
+    """The recorded snapshots of one session of the scorer, compared in order with those of the replay.
+
+    A scorer takes snapshots at the end of a block of samples. A replay has other blocks, so it takes its own at the
+    samples of the recorded ones, and perhaps another at the same time for a request.
+    """
+
+    def __init__(self, recorded: Iterator[ScorerSnapshot], found: Comparison, limit: Callable[[], Limit]) -> None:
+        self._recorded, self._found, self._limit = recorded, found, limit
+        self._next = next(recorded, None)
+        self._made: list[ScorerSnapshot] = []
+        """those of one time"""
+
+    def add(self, made: ScorerSnapshot) -> None:
+        """Compare the next replayed snapshot."""
+        if self._made and made.t_ns != self._made[0].t_ns:
+            self.settle(made.t_ns)
+        self._made.append(made)
+
+    def settle(self, until_t_ns: int | None) -> None:
+        """Compare the recorded snapshots before a time; None: all."""
+        while self._next is not None and (until_t_ns is None or self._next.t_ns < until_t_ns):
+            self._compare(self._next, [each for each in self._made if each.t_ns == self._next.t_ns])
+            self._next = next(self._recorded, None)
+        self._made = []
+
+    def _compare(self, recorded: ScorerSnapshot, made: Sequence[ScorerSnapshot]) -> None:
+        found = self._found
+        places = [first_difference(each, recorded, found.note) for each in made]
+        if "" in places:
+            result = "equal"
+        elif recorded.t_ns > self._limit().t_ns:
+            result = "not_comparable"
+        else:
+            result = "different"
+            what = f"{places[-1]} differs" if places else "recorded and not replayed"
+            found.name(f"snapshot of {format_utc(recorded.t_ns)}: {what}")
+        found.counts[f"snapshots_{result}"] += 1
 
 
-def _describe(alarm: Alarm) -> str:
-    return f"{alarm.transition.name.lower()} at {format_utc(alarm.t_ns)}, {alarm.message!r},"
+def first_difference(
+    made: ScorerSnapshot, recorded: ScorerSnapshot, note: Callable[[Apart], None] = lambda _apart: None
+) -> str:
+    """The first place in which two snapshots differ by more than the tolerance; empty if none.
+
+    note: see `unequal`.
+    """
+    if made.twin_sha256 != recorded.twin_sha256:
+        return "twin_sha256"
+    if made.state_json == recorded.state_json:
+        return ""
+    try:
+        one, other = (_state(snapshot) for snapshot in (made, recorded))
+    except (ValueError, LookupError, TypeError, AttributeError):
+        return "state_json"
+    return next(differences(one, other, note), "")
+
+
+def _state(snapshot: ScorerSnapshot) -> dict[str, Any]:
+    """What a snapshot holds, with its arrays as such."""
+    state = json.loads(snapshot.state_json)
+    model = state["model"]
+    return state | {"model": model | {"arrays": from_json(model["arrays"])}}
+
+
+def _saved(envelopes: Iterable[Envelope], producer: str) -> Iterator[ScorerSnapshot]:
+    """The snapshots that a session saved, in order, each once. What cannot be decoded is reported with the plan."""
+    next_sequence = 0
+    for envelope in envelopes:
+        try:
+            message = envelope.message
+        except CodecError:
+            continue
+        header = message.header
+        if isinstance(message, ScorerSnapshot) and header.producer == producer and header.sequence >= next_sequence:
+            next_sequence = header.sequence + 1
+            if not message.restored:
+                yield message

@@ -50,7 +50,7 @@ def test_no_limit_of_a_later_recorder_deletes_what_twins_are_made_of(tmp_path: P
     for_twins = [recorded(next_recording_file(config)) for _ in range(2)]
     limits = RecorderConfig(keep_days=1)
     for file in (Path("disk/recording.mcap"), next_recording_file(config)):
-        DiskRoom(RecordingParts(config.run_folder / file, {}, {}, session="two"), limits, None).keep_limits(10 * DAY_NS)
+        DiskRoom(RecordingParts(config.run_folder / file, {}, {}, session="two"), limits).keep_limits(10 * DAY_NS)
     assert last.exists() and not ordinary.exists(), "the last part of a folder stays"
     assert for_twins == [config.run_folder / f"disk/commissioned-{n}/commissioned-{n}.mcap" for n in (1, 2)]
     assert all(path.exists() for path in for_twins)

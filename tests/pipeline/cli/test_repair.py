@@ -34,7 +34,8 @@ def test_a_truncated_file_is_repaired_under_its_name_and_the_loss_reported(tmp_p
     done = fantwin("info", "--repair", truncated)
     assert done.exit_code == 3
     assert f"{truncated}: 20 messages recovered in {tmp_path / 'r.mcap'}; the original is kept as" in done.stdout
-    assert f"{RAW_KEY}: 20 messages, the last at 0.000 s" in done.stdout
+    (line,) = [line for line in done.stdout.splitlines() if line.startswith("tray1/raw")]
+    assert line.split()[1:4] == ["20", "0", "0"]
     assert "it is truncated, as after a crash: messages of the unfinished chunk may be missing" in done.stdout
     assert len(read_by_others(tmp_path / "r.mcap")) == 20
     assert (tmp_path / "r.mcap.original").exists()

@@ -29,8 +29,8 @@ def alarm(fan: int = 0, at_s: float = 0.0, tray: str = "tray1", *, onset_s: floa
     return Alarm(header=Header("s-1", 0, tray), fan=fan, t_ns=t_ns, onset_t_ns=onset_t_ns, **{**fields, **more})
 
 
-def tracker(*clips: Clip, most_bytes: int = 0) -> ClipTracker:
-    return ClipTracker(clips, most_bytes)
+def tracker(*clips: Clip, most_bytes: int = 0, **more: Any) -> ClipTracker:
+    return ClipTracker(clips, most_bytes, **more)
 
 
 def follow(tracker: ClipTracker, *alarms: Alarm) -> None:
@@ -53,11 +53,9 @@ def test_an_alarm_gives_a_clip_from_before_its_onset_to_after_it_once_that_is_on
     assert (clip.since_ns - T0, clip.until_ns - T0) == (-52 * S, 70 * S)
     assert clip.judged_since_ns == T0 + 8 * S - JUDGED_NS
     assert clip.name == "tray1-3-20270115T080010Z.mcap"
-    assert of.needed_since_ns == clip.judged_since_ns
     assert of.due(T0 + 71 * S) == []
     assert cut(of, 72) == [clip.name]
     assert cut(of, 73) == []
-    assert of.needed_since_ns is None
     (kept,) = of.clips
     assert (kept.is_due, kept.size_bytes, kept.is_acknowledged) == (False, 100, False)
 
@@ -90,15 +88,16 @@ def test_what_is_known_silenced_or_no_raise_gives_no_clip():
 
 
 def test_a_clip_may_go_once_all_of_its_alarms_are_acknowledged_and_not_by_an_older_message():
-    of = tracker()
+    of = tracker(kept_s=60.0)
     follow(of, alarm(0), alarm(1, 10.0))
     cut(of, 80)
+    of.follow(T0 + 131 * S)
     follow(of, alarm(0, 90.0, transition=Transition.ACKNOWLEDGED, acknowledged=True))
     follow(of, alarm(1, 5.0, transition=Transition.SHELVED, acknowledged=True))
     follow(of, alarm(1, 95.0, "tray2", transition=Transition.ACKNOWLEDGED, acknowledged=True))
-    assert of.oldest_acknowledged is None
+    assert of.to_delete is None and of.beyond == of.clips
     follow(of, alarm(1, 95.0, transition=Transition.REPUBLISHED, acknowledged=True))
-    assert of.oldest_acknowledged == of.clips[0]
+    assert of.to_delete == of.clips[0] and not of.beyond
 
 
 def test_beyond_the_limit_acknowledged_clips_go_and_without_any_new_ones_are_not_kept():
@@ -106,7 +105,7 @@ def test_beyond_the_limit_acknowledged_clips_go_and_without_any_new_ones_are_not
     for number in range(3):
         follow(of, alarm(number, number * 200.0))
         cut(of, number * 200.0 + 70)
-    assert of.oldest_acknowledged is None
+    assert of.to_delete is None
     follow(of, alarm(3, 600.0))
     assert cut(of, 670) == []
     assert of.counts["clips_not_kept"] == 1
@@ -114,7 +113,7 @@ def test_beyond_the_limit_acknowledged_clips_go_and_without_any_new_ones_are_not
     assert len(of.clips) == 3
     acknowledged = alarm(1, 700.0, transition=Transition.ACKNOWLEDGED, acknowledged=True)
     follow(of, acknowledged)
-    clip = of.oldest_acknowledged
+    clip = of.to_delete
     assert of.is_full and clip and clip.alarms[0].fan == 1
     of.deleted(clip)
     assert not of.is_full
@@ -134,7 +133,7 @@ def test_a_full_disk_is_reported_and_tried_again_and_what_is_gone_is_given_up():
     follow(of, alarm(1, 100.0))
     cut(of, 170, 0, problem="nothing is there any more")
     assert "is not kept: nothing is there any more" in of.problem()
-    assert of.needed_since_ns is None
+    assert not any(clip.is_due for clip in of.clips)
 
 
 def test_a_clock_that_is_set_back_does_not_make_a_clip_wait():

@@ -105,7 +105,7 @@ def test_a_new_recorder_takes_a_number_above_all_existing_ones(tmp_path):
 def test_the_file_of_a_killed_recorder_is_repaired_and_continued(tmp_path):
     kill_a_recorder(tmp_path / "r.mcap", flushed=40)
     place = parts_in(tmp_path, "s2")
-    assert [(recovery.path.name, recovery.found.messages) for recovery in place.repaired] == [("r.mcap", 40)]
+    assert f"was repaired and is {tmp_path / 'r.mcap'}: 40 messages" in place.remarks[0]
     assert sequences(tmp_path / "r.mcap") == list(range(40))
     assert read_recording(tmp_path / "r.mcap").damage == ""
     assert contents_of(tmp_path / "r.mcap").damage == (NO_INDEX,)
@@ -156,7 +156,7 @@ def test_an_active_file_that_is_not_a_recording_or_of_which_nothing_is_intact_is
         damage_a_chunk(active, 0)
         content = active.read_bytes()
     place = parts_in(tmp_path)
-    assert list(place.unreadable) == [tmp_path / "r.mcap.original"]
+    assert "cannot be repaired and was renamed to r.mcap.original: " in place.remarks[0]
     assert (tmp_path / "r.mcap.original").read_bytes() == content
     part(place).finish()
     assert names(tmp_path) == ["r-2.mcap", "r.mcap.original"]
@@ -169,11 +169,11 @@ def test_a_damaged_active_file_that_a_full_disk_keeps_from_being_repaired_is_con
     damage_a_chunk(tmp_path / "r.mcap.active", 1)
     with disk_of(100):
         place = parts_in(tmp_path, "s2")
-    assert (place.unrepaired, place.unreadable, place.repaired) == ([tmp_path / "r.mcap.active"], {}, [])
+    assert f"refuses the repair of its recording, which stays {tmp_path / 'r.mcap.active'}" in place.remarks[0]
     assert place.before == {STREAM: 3000}
     part(place, [3000]).finish()
     assert read_metadata(tmp_path / "r-2.mcap").metadata["continues"] == "r.mcap"
-    assert parts_in(tmp_path, "s3").repaired[0].path == tmp_path / "r.mcap"
+    assert f"was repaired and is {tmp_path / 'r.mcap'}: " in parts_in(tmp_path, "s3").remarks[0]
 
 
 def test_files_that_cannot_be_read_for_a_while_count_and_are_repaired_later(tmp_path, monkeypatch):
@@ -183,15 +183,16 @@ def test_files_that_cannot_be_read_for_a_while_count_and_are_repaired_later(tmp_
         busy.setattr(Path, "open", refuse)
         place = parts_in(tmp_path, "s2")
         assert place.stored().parts == ()
-    assert (place.unrepaired, place.unreadable) == ([tmp_path / "r-2.mcap.active"], {})
+    (line,) = place.remarks
+    assert f"which stays {tmp_path / 'r-2.mcap.active'}" in line
     assert [each.path.name for each in place.stored().parts] == ["r.mcap"] and place.stored().finished_bytes > 0
-    assert parts_in(tmp_path, "s3").repaired[0].path == tmp_path / "r-2.mcap"
+    assert f"was repaired and is {tmp_path / 'r-2.mcap'}: " in parts_in(tmp_path, "s3").remarks[0]
 
 
 def test_recorders_killed_before_they_recorded_anything_do_not_hide_the_last_message(tmp_path):
     kill_a_recorder(tmp_path / "r.mcap", flushed=0)
     place = parts_in(tmp_path)
-    assert (place.repaired, names(tmp_path)) == ([], [])
+    assert (place.remarks, names(tmp_path)) == ([], [])
     first = part(place, range(40))
     first.flush()
     killed(first)

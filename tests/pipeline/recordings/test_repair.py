@@ -69,22 +69,6 @@ def test_a_file_truncated_at_any_byte_is_recovered_up_to_its_last_intact_chunk_a
     assert (in_place.streams, in_place.recovered) == (copy.streams, copy.recovered)
 
 
-def test_a_kill_at_any_byte_of_a_repair_loses_nothing(tmp_path, whole):
-    """A second kill leaves a truncated file again, which is repaired again."""
-    truncated = whole.read_bytes()[: chunk_ends(whole)[5][0] + 7]
-    active = tmp_path / "r.mcap.active"
-    active.write_bytes(truncated)
-    first = repair_in_place(active)
-    assert first is not None
-    repaired = first.path.read_bytes()
-    for size in range(chunk_ends(whole)[5][0], len(repaired), 37):
-        active.write_bytes(repaired[:size])
-        again = repair_in_place(active)
-        assert again is not None
-        assert again.path.read_bytes() == repaired
-        again.path.unlink()
-
-
 def test_the_original_is_kept_beside_the_repaired_file_which_has_the_name_of_a_recording(tmp_path, whole):
     truncated = tmp_path / "r.mcap"
     before = whole.read_bytes()[:-300]

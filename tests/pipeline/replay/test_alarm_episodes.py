@@ -66,9 +66,9 @@ def test_an_alarm_is_in_both_lists_where_the_same_fans_overlap() -> None:
     before = episodes([alarm(10), alarm(20, Transition.CLEARED), alarm(50, onset_t_ns=45)])
     now = episodes([alarm(12), alarm(30, Transition.CLEARED), alarm(11, fan=1)])
     found = compare_episodes(now, before)
-    assert [e.fan for e in found.gained] == [1]
-    assert [e.raised_ns for e in found.kept] == [12]
-    assert [e.raised_ns for e in found.lost] == [50]
+    assert [e.fan for e in found["gained"]] == [1]
+    assert [e.raised_ns for e in found["kept"]] == [12]
+    assert [e.raised_ns for e in found["lost"]] == [50]
 
 
 def marked(t_ns: int, transition: Transition, meant_t_ns: int, comment: str = "", **more: Any) -> Alarm:

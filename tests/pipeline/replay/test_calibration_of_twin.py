@@ -14,7 +14,6 @@ from fantwin.pipeline.learning.healthy_evidence import outlier_warnings
 from fantwin.pipeline.replay.offline.calibration_of_twin import CalibratedTwin, calibrated
 from fantwin.pipeline.replay.offline.healthy_runs import (
     DecidedRun,
-    FreeLimit,
     HealthyRuns,
     LearnedRun,
     Limit,
@@ -53,7 +52,7 @@ class MadeRuns:
     def learned(self) -> list[LearnedRun]:
         return [learn(run, self.fans) for run in self._runs()]
 
-    def decided(self, limit: Limit | FreeLimit) -> list[DecidedRun]:
+    def decided(self, limit: Limit) -> list[DecidedRun]:
         return [decide(run, self.fans, limit) for run in self._runs()]
 
 
@@ -86,7 +85,7 @@ class ToldRuns:
         judged_s = np.full(len(self._peaks), 3600.0 * self._hours / len(self._peaks))
         return [LearnedRun(TRAY, RunSums(judged_s, np.array(self._means), np.zeros(3), np.zeros(3)))]
 
-    def decided(self, limit: Limit | FreeLimit) -> list[DecidedRun]:
+    def decided(self, limit: Limit) -> list[DecidedRun]:
         self.factors.append(limit.factor)
         alarms = tuple(2 * sum(peak > limit.factor for peak in fan) for fan in self._peaks)
         return [DecidedRun(TRAY, alarms, tuple(peak for fan in self._peaks for peak in fan if peak > 1.0))]

@@ -86,7 +86,7 @@ def test_the_same_alarm_comes_out_of_a_clip_again_from_its_snapshot_on(undisturb
     assert tray.lost == 0
     with open_replay_input([clip], None, (), None) as replay_input:
         plan, _, _ = replay_input.read_plan("tray1")
-        first, second, *_ = (each.message for each in replay_input.pipeline("tray1", plan).run())
+        first, second, *_ = (message for _, message in replay_input.pipeline("tray1", plan).run())
     assert isinstance(first, ScorerSnapshot) and first.restored
     assert first.state_json == recorded(clip, "snapshot")[0].state_json
     assert isinstance(second, Score) and second.t_ns[0] > first.t_ns

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fantwin.pipeline.replay.offline.comparison import Apart, first_difference
+from fantwin.pipeline.replay.offline.comparison import Apart
+from fantwin.pipeline.replay.offline.verify import first_difference
 from fantwin.schemas.messages import ScorerSnapshot
 from fantwin.scoring.model.saved import as_json
 

@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from fantwin.pipeline.replay.live.keyboard import Key, Keys
+from fantwin.pipeline.replay.live.keyboard import Key, Keys, keys_in
 
 
 @pytest.mark.parametrize(
@@ -22,12 +22,7 @@ from fantwin.pipeline.replay.live.keyboard import Key, Keys
     ],
 )
 def test_keys_and_both_manners_of_arrows_are_known_and_all_else_is_passed_over(typed, keys):
-    assert Keys().parsed(typed) == keys
-
-
-def test_an_arrow_that_comes_in_pieces_is_one_key():
-    pressed = Keys()
-    assert [pressed.parsed(bytes([byte])) for byte in b"\x1b[C"] == [[], [], [Key.STEP]]
+    assert keys_in(typed) == keys
 
 
 def test_without_a_terminal_there_are_no_keys(monkeypatch, tmp_path):

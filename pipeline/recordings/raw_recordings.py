@@ -1,8 +1,9 @@
-"""Samples of a simulated device written directly to a recording, faster than real time: data to train twins on."""
+"""Recordings of raw samples that have not been on a bus: of a measured table, or of a simulated device."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -40,21 +41,52 @@ def record(
         RecordingError: it cannot be written.
     """
     played = PlaybackCounts(start_ns=epoch_ns)
-    metadata = {
-        "source": "simulated tray",
-        "site": SITE,
-        "trays": TRAY,
-        "speed_unit": speed_unit,
-    }
-    if tuple(tachos) != INSTANTANEOUS:
-        metadata[f"{TACHO_KEY}.{TRAY}"] = tachos_to_json(tachos)
-    with RecordingWriter(path, metadata, t_ns=epoch_ns, overwrite=True) as writer:
-        for sequence, block in enumerate(_blocks(device, played)):
-            raw = _raw(device.fans, block, epoch_ns, sequence)
-            writer.add_message(tray_key(SITE, TRAY, "raw"), raw, int(raw.host_receive_t_ns[-1]))
+
+    def raws() -> Iterator[Raw]:
+        for block in _blocks(device, played):
+            yield _raw(device.fans, block, epoch_ns)
             played.samples_sent += len(block)
             progress(block[-1].t_s)
+
+    write_raw(
+        path,
+        raws(),
+        epoch_ns,
+        PRODUCER,
+        source="simulated tray",
+        site=SITE,
+        tray=TRAY,
+        speed_unit=speed_unit,
+        tachos=tachos,
+    )
     return played
+
+
+def write_raw(
+    path: Path,
+    raws: Iterable[Raw],
+    first_t_ns: int,
+    producer: str,
+    *,
+    source: str,
+    site: str,
+    tray: str,
+    speed_unit: str,
+    tachos: Sequence[Tacho],
+) -> None:
+    """Write the samples of a tray to a recording. They get their headers here; a message is received with its last
+    sample. An existing recording is replaced.
+
+    Raises:
+        RecordingError: it cannot be written.
+    """
+    metadata = {"source": source, "site": site, "trays": tray, "speed_unit": speed_unit}
+    if tuple(tachos) != INSTANTANEOUS:
+        metadata[f"{TACHO_KEY}.{tray}"] = tachos_to_json(tachos)
+    with RecordingWriter(path, metadata, t_ns=first_t_ns, overwrite=True) as writer:
+        for sequence, raw in enumerate(raws):
+            numbered = replace(raw, header=Header(producer, sequence, tray))
+            writer.add_message(tray_key(site, tray, "raw"), numbered, int(raw.host_receive_t_ns[-1]))
 
 
 def _blocks(device: Device, played: PlaybackCounts) -> Iterator[list[DeviceSample]]:
@@ -73,12 +105,11 @@ def _blocks(device: Device, played: PlaybackCounts) -> Iterator[list[DeviceSampl
         yield block
 
 
-def _raw(fans: int, block: list[DeviceSample], epoch_ns: int, sequence: int) -> Raw:
+def _raw(fans: int, block: list[DeviceSample], epoch_ns: int) -> Raw:
     auxiliary: dict[str, Any] = {
         name: np.stack([sample.auxiliary[name] for sample in block]).astype(np.float32) for name in block[0].auxiliary
     }
     return Raw(
-        header=Header(PRODUCER, sequence, TRAY),
         fans=fans,
         host_receive_t_ns=np.array([epoch_ns + round(sample.t_s * NS_PER_S) for sample in block], np.int64),
         device_clock_us=np.array([sample.clock_us for sample in block], np.uint32),
