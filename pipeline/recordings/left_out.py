@@ -5,14 +5,18 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable
 from pathlib import Path
 
-from fantwin.pipeline.recordings.reading import RecordingError, read_metadata
+from fantwin.pipeline.recordings.reading import read_metadata
 
 RAW = "raw"
 
 
 def left_out(paths: Iterable[Path], topics: Collection[str]) -> list[str]:
-    """Which of these topics the recorder left out of a recording, given its parts."""
-    found = {topic for path in paths for topic in _left_out_of(path)}
+    """Which of these topics the recorder left out of a recording, given its parts.
+
+    Raises:
+        RecordingError: a part cannot be read.
+    """
+    found = {topic for path in paths for topic in read_metadata(path).left_out}
     return [topic for topic in topics if topic in found]
 
 
@@ -26,10 +30,3 @@ def left_out_hint(paths: Collection[Path], topics: Collection[str]) -> str:
         return f"{line}, and without {RAW} nothing can be made again"
     files = " ".join(map(str, paths))
     return f"{line}: `fantwin replay {files} --offline -o WHOLE.mcap` makes a recording with all topics"
-
-
-def _left_out_of(path: Path) -> tuple[str, ...]:
-    try:
-        return read_metadata(path).left_out
-    except RecordingError:  # reported by whoever reads its messages
-        return ()

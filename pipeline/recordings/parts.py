@@ -15,7 +15,7 @@ from itertools import islice
 from pathlib import Path
 
 from fantwin.pipeline.files import sync_folder
-from fantwin.pipeline.recordings.contents import Contents, contents_of
+from fantwin.pipeline.recordings.contents import contents_of
 from fantwin.pipeline.recordings.disk import Disk, DiskError, refused
 from fantwin.pipeline.recordings.indexed import last_messages
 from fantwin.pipeline.recordings.reading import RecordingError, read_metadata, read_recording
@@ -26,6 +26,7 @@ from fantwin.pipeline.recordings.repair import (
     repair_in_place,
 )
 from fantwin.pipeline.recordings.run_recordings import RECORDING_KEY, recorded_files
+from fantwin.pipeline.recordings.scan import Contents
 from fantwin.pipeline.recordings.sequence_ledger import SequenceLedger
 from fantwin.pipeline.recordings.stored_recordings import Stored, StoredPart, StoredRecordings
 from fantwin.pipeline.recordings.writing import RecordingWriter

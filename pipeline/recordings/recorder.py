@@ -6,7 +6,6 @@ from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 
-from fantwin.pipeline.config.registry import RECORDER
 from fantwin.pipeline.recordings.clips.alarm_clips import AlarmClips
 from fantwin.pipeline.recordings.disk import DiskError
 from fantwin.pipeline.recordings.disk_room import DiskRoom
@@ -22,7 +21,6 @@ from fantwin.pipeline.runtime.stage import Core
 from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.health import Health
 from fantwin.schemas.messages import Message
-from fantwin.schemas.streams import StreamId
 from fantwin.schemas.topics import HEALTH
 from fantwin.schemas.units import NS_PER_S
 
@@ -73,8 +71,6 @@ class Recorder(Core):
         self._ledger = SequenceLedger(parts.before, left_out)
         self._before = parts.before
         self._cards: dict[str, Envelope] = {}
-        self._own_producer = ""
-        self._duplicated: dict[StreamId, int] = {}
         self._recorded: Counter[str] = Counter()
         self._counts: Counter[str] = Counter(lost_unwritten=0)
         self._held = HeldMessages()
@@ -109,7 +105,6 @@ class Recorder(Core):
             self._ledger.add_duplicated(item.key, item.header.producer)
             return ()
         if item.topic == HEALTH and isinstance(item.message, Health):
-            self._count_duplicated(item.message)
             if not self._healths.is_due(item, item.message):
                 return ()
             self._is_urgent |= bool(item.message.problem)
@@ -327,17 +322,3 @@ class Recorder(Core):
         self._limited_ns = self._now_ns - LIMITS_CHECK_NS  # due now: the disk may be another
         for envelope in self._held.take_all():
             self._record(envelope)
-
-    def _count_duplicated(self, health: Health) -> None:
-        """Count what the bus delivered twice, from this recorder's own health: the first the runner passes to it."""
-        if health.stage != RECORDER:
-            return
-        self._own_producer = self._own_producer or health.header.producer
-        if health.header.producer == self._own_producer:
-            for line in health.inputs:
-                before = self._duplicated.get((line.key, line.producer), 0)
-                if (
-                    line.producer and line.duplicated > before
-                ):  # without a name: earlier producers, which are counted already
-                    self._ledger.add_duplicated(line.key, line.producer, line.duplicated - before)
-                    self._duplicated[line.key, line.producer] = line.duplicated

@@ -19,7 +19,7 @@ from mcap.records import Attachment, Chunk, Metadata
 from mcap.writer import MCAP0_MAGIC, Writer
 
 from fantwin.pipeline.files import sync_folder
-from fantwin.pipeline.recordings.contents import NOT_A_RECORD, losses_outside_counts
+from fantwin.pipeline.recordings.contents import losses_outside_counts
 from fantwin.pipeline.recordings.disk import AtomicAppendFile, not_being_written, refused
 from fantwin.pipeline.recordings.records import (
     ACTIVE_SUFFIX,
@@ -29,7 +29,7 @@ from fantwin.pipeline.recordings.records import (
     chunk_data,
     records_in,
 )
-from fantwin.pipeline.recordings.scan import Scan, scan
+from fantwin.pipeline.recordings.scan import NOT_A_RECORD, Contents, scan
 from fantwin.pipeline.recordings.sequence_ledger import LEDGER_NAME, ledger_metadata
 from fantwin.pipeline.recordings.writing import CHUNK_BYTES, free_name, write_short_ending
 
@@ -41,7 +41,7 @@ _UNFINISHED_SUFFIX = ".recovering"
 class Recovery:
     """The result of a repair."""
 
-    found: Scan
+    found: Contents
     path: Path
     """the repaired file"""
     original: Path | None = None
@@ -135,7 +135,7 @@ def _add_name(path: Path, name: Path) -> None:
         path.rename(name)
 
 
-def _written_copy(found: Scan, target: Path) -> Path:
+def _written_copy(found: Contents, target: Path) -> Path:
     """A repaired copy, on the disk under a temporary name. Raises OSError, and leaves no file then."""
     unfinished = target.with_name(target.name + _UNFINISHED_SUFFIX)
     lock = AtomicAppendFile(unfinished)  # against a second repair to the same target
@@ -156,7 +156,7 @@ def _written_copy(found: Scan, target: Path) -> Path:
     return unfinished
 
 
-def _write_repaired(found: Scan, file: BinaryIO) -> None:
+def _write_repaired(found: Contents, file: BinaryIO) -> None:
     """Write everything intact in a file, and a ledger that names what was lost."""
     writer = Writer(file, CHUNK_BYTES)
     writer.start(found.profile, "fantwin")
@@ -195,7 +195,7 @@ def _write_repaired(found: Scan, file: BinaryIO) -> None:
     writer.finish()
 
 
-def _ledger_of(found: Scan) -> dict[str, str]:
+def _ledger_of(found: Contents) -> dict[str, str]:
     """The ledger of a repaired file, with the losses that its counts do not show.
 
     The bytes of an unfinished chunk at the end are not listed: the missing end is.

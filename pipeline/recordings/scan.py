@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from zlib import crc32
@@ -34,16 +35,25 @@ from fantwin.pipeline.recordings.sequence_ledger import (
     before_from_metadata,
     correct_for_damage,
     counts_from_metadata,
+    next_sequences,
     recovered_from_metadata,
 )
+from fantwin.schemas.health import Health
+from fantwin.schemas.messages import ModelCard
 from fantwin.schemas.streams import StreamId
 
+TRUNCATED = "it is truncated, as after a crash"
+NOT_A_RECORD = "bytes that belong to no intact record"
+NO_INDEX = "it has no index"
+STILL_WRITTEN = "it is still being written"
+NO_LOSS = frozenset((NO_INDEX, STILL_WRITTEN))
+"""the damage lines of a file that has lost nothing"""
 _KINDS = {int(Opcode.CHUNK): "chunks", int(Opcode.ATTACHMENT): "attachments"}
 
 
 @dataclass
-class Scan:
-    """What was found in a file by `scan`."""
+class Contents:
+    """The contents of one file, and what is wrong with it. Times are times of receipt."""
 
     path: Path
     reader: RecordReader
@@ -80,6 +90,59 @@ class Scan:
     data_end: int = len(MCAP0_MAGIC)
     """offset after the last intact record of the data"""
 
+    is_being_written: bool = False
+    """read up to its last flush"""
+
+    @property
+    def size_bytes(self) -> int:
+        """Size of the file."""
+        return self.reader.size
+
+    @property
+    def others(self) -> dict[str, int]:
+        """Messages on channels that are not fantwin's, by topic."""
+        return {topic: counts.messages for topic, counts in self.counts.others.items()}
+
+    @property
+    def sessions(self) -> list[Health]:
+        """The last health of each session, in the order of the file."""
+        return list(self.counts.sessions.values())
+
+    @property
+    def healths(self) -> list[Health]:
+        """The last health of each stage and tray."""
+        return list({(health.stage, health.instance): health for health in self.sessions}.values())
+
+    @property
+    def cards(self) -> Mapping[str, ModelCard]:
+        """The last card of each twin, by key."""
+        return self.counts.cards
+
+    @property
+    def next(self) -> dict[StreamId, int]:
+        """The next expected sequence number of each stream after this file."""
+        return next_sequences(self.before, self.streams)
+
+    @property
+    def damage(self) -> tuple[str, ...]:
+        """What is wrong with the file, one line each."""
+        if self.is_being_written:
+            return (STILL_WRITTEN,)
+        undecodable = self.counts.undecodable
+        lines = (
+            (not self.is_ended, TRUNCATED),
+            (self.is_ended and not self.has_index, NO_INDEX),
+            (self.discarded_bytes, f"{NOT_A_RECORD}: {self.discarded_bytes}"),
+            *((count, f"damaged {kind}: {count}") for kind, count in self.damaged.items()),
+            (
+                self.lacking and not self.is_damaged,
+                f"messages that its ledger counts and that are gone: {self.lacking}",
+            ),
+            (self.nameless, f"messages whose channel is damaged: {self.nameless}"),
+            (undecodable, f"messages that do not have the type of their channel: {undecodable}"),
+        )
+        return tuple(line for is_so, line in lines if is_so)
+
     @property
     def is_damaged(self) -> bool:
         """Something in the middle cannot be read."""
@@ -107,13 +170,13 @@ class Scan:
         return correct_for_damage(self.recorded, found) if self.is_damaged or self.lacking else self.recorded
 
 
-def scan(path: Path) -> Scan:
-    """Go through a file.
+def scan(path: Path) -> Contents:
+    """What is in a file, by reading all of it.
 
     Raises:
         RecordingError: it cannot be read, or is not an MCAP file.
     """
-    found = Scan(path, RecordReader(path, for_repair=True))
+    found = Contents(path, RecordReader(path, for_repair=True))
     try:
         footer: Record | None = None
         for record in found.reader:
@@ -130,7 +193,7 @@ def scan(path: Path) -> Scan:
     return found
 
 
-def _add(found: Scan, record: Record) -> None:
+def _add(found: Contents, record: Record) -> None:
     """Add a record of the data section."""
     try:
         _add_intact(found, record)
@@ -142,7 +205,7 @@ def _add(found: Scan, record: Record) -> None:
         found.data_end = found.data_end if found.is_ended else record.end
 
 
-def _add_intact(found: Scan, record: Record) -> None:
+def _add_intact(found: Contents, record: Record) -> None:
     match record.parsed:
         case Chunk() as chunk:
             _add_records(found, chunk_data(chunk))
@@ -166,7 +229,7 @@ def _add_intact(found: Scan, record: Record) -> None:
             raise ValueError(f"a record of kind {record.opcode} in the data section, or a damaged one")
 
 
-def _add_metadata(found: Scan, name: str, metadata: dict[str, str]) -> None:
+def _add_metadata(found: Contents, name: str, metadata: dict[str, str]) -> None:
     if name == LEDGER_NAME:
         found.recorded = counts_from_metadata(metadata)
         found.has_ended = ENDED in metadata
@@ -180,7 +243,7 @@ def _add_metadata(found: Scan, name: str, metadata: dict[str, str]) -> None:
         found.counts.ledger = SequenceLedger(found.before, found.counts.ledger.left_out)
 
 
-def _add_records(found: Scan, data: bytes) -> None:
+def _add_records(found: Contents, data: bytes) -> None:
     """Add the records of a chunk, or one that is in no chunk."""
     for _, opcode, start, end in records_in(data):
         if opcode == Opcode.SCHEMA:

@@ -35,7 +35,6 @@ def first_raw(paths: Sequence[Path], metadata: RecordingMetadata) -> dict[str, l
     Raises:
         RecordingError: there are none.
     """
-    trays = [name for name in metadata.metadata.get("trays", "").split(",") if name]
     found: dict[str, list[Raw]] = {}
     samples: dict[str, int] = {}
     for envelope in chain.from_iterable(read_recording(path, ("raw",)).undecoded() for path in paths):
@@ -50,7 +49,7 @@ def first_raw(paths: Sequence[Path], metadata: RecordingMetadata) -> dict[str, l
                 continue
             found.setdefault(tray, []).append(message)
             samples[tray] = samples.get(tray, 0) + len(message.host_receive_t_ns)
-        if trays and all(samples.get(name, 0) >= _SAMPLED for name in trays):
+        if metadata.trays and all(samples.get(name, 0) >= _SAMPLED for name in metadata.trays):
             break
     if not found:
         why = left_out_hint(paths, ("raw",)) or "there is nothing to score"
@@ -149,5 +148,4 @@ def _recorded_overrides(file: Path, metadata: RecordingMetadata) -> list[str]:
 
 def trays_of(files: Iterable[Path]) -> set[str]:
     """The trays in the metadata of recordings."""
-    named = (read_metadata(file).metadata.get("trays", "") for file in files)
-    return {tray for trays in named for tray in trays.split(",") if tray}
+    return {tray for file in files for tray in read_metadata(file).trays}

@@ -25,10 +25,11 @@ from fantwin.schemas.codec import encode
 from fantwin.schemas.enums import StageStatus
 from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.header import Header
-from fantwin.schemas.health import Health, Input, Output
+from fantwin.schemas.health import Output
 from fantwin.schemas.messages import ModelCard, Raw, ScorerSnapshot
 from fantwin.schemas.topics import TOPICS, health_key, tray_key
 from fantwin.stages.recorder import STAGE
+from tests.support.made_messages import health
 from tests.support.message_strategies import any_message, same
 from tests.support.stub_disk import NOW_NS, RAW_KEY, SECOND_NS, Disk, Part, context, envelope, raw, recorder
 
@@ -46,12 +47,6 @@ def card(sequence: int) -> ModelCard:
     return ModelCard(
         header=Header("twin_integrator-1", sequence, "tray1"), t_ns=3, twin="demo", kind="hybrid", sha256="ab"
     )
-
-
-def health_of(producer: str, duplicated: int, stage: str = "recorder") -> Health:
-    line = Input(key=RAW_KEY, producer="a", received=9, missing=0, duplicated=duplicated, next_sequence=9)
-    header = Header(producer, 0, "")
-    return Health(header=header, stage=stage, instance="all", status=StageStatus.OK, t_ns=1, uptime_s=1, inputs=(line,))
 
 
 @settings(deadline=None, max_examples=3)
@@ -303,8 +298,8 @@ def test_of_healths_those_that_report_something_new_are_recorded_and_no_other_is
         status = StageStatus.DEGRADED if problem else StageStatus.OK
         lost = 1 if second >= 900 else 0
         output = Output(key=RAW_KEY, published=0 if second < 999 else 3)
-        now = replace(health_of("acquisition-1", 0, "acquisition"), status=status, problem=problem, lost=lost)
-        now = replace(now, header=Header("acquisition-1", second, ""), outputs=(output,))
+        about = {"status": status, "problem": problem, "lost": lost, "outputs": (output,)}
+        now = health("acquisition", producer="acquisition-1", sequence=second, **about)
         core.step(envelope(now, "health", start_ns + second * SECOND_NS))
         core.tick(start_ns + second * SECOND_NS)
     core.close()
@@ -335,16 +330,8 @@ def test_a_recording_says_which_topics_were_left_out_on_purpose(tmp_path):
     core = STAGE.build(run).core
     for number in range(2):
         outputs = tuple(Output(key=tray_key("plant", "tray1", name), published=3 * number) for name in SAMPLES)
-        health = Health(
-            header=Header("scorer-1", number, ""),
-            stage="scorer",
-            instance="all",
-            status=StageStatus.OK,
-            t_ns=1,
-            uptime_s=0.0,
-            outputs=outputs,
-        )
-        core.step(envelope(health, "health"))
+        said = health("scorer", producer="scorer-1", sequence=number, outputs=outputs)
+        core.step(envelope(said, "health"))
     assert core.notes()[-1] == "not recorded: grid, prediction, score (recorder.topics)"
     core.close()
     path = run.run_folder / "recording.mcap"

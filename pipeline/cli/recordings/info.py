@@ -19,21 +19,14 @@ from fantwin.pipeline.cli.printing import table_of
 from fantwin.pipeline.cli.progress import working
 from fantwin.pipeline.errors import UsageError
 from fantwin.pipeline.recordings.clips.clip import clip_lines
-from fantwin.pipeline.recordings.contents import (
-    NO_LOSS,
-    STILL_WRITTEN,
-    Contents,
-    contents_of,
-    continuity,
-    losses_of,
-    messages_as_text,
-)
+from fantwin.pipeline.recordings.contents import contents_of, continuity, losses_of, messages_as_text
 from fantwin.pipeline.recordings.dates import format_clock, format_local
 from fantwin.pipeline.recordings.metadata import CONFIGURATION
 from fantwin.pipeline.recordings.reading import left_out_of
 from fantwin.pipeline.recordings.records import active_path
 from fantwin.pipeline.recordings.repair import recover as recover_file
 from fantwin.pipeline.recordings.run_recordings import RECORDING_KEY, recorded_files
+from fantwin.pipeline.recordings.scan import NO_LOSS, STILL_WRITTEN, Contents
 from fantwin.pipeline.recordings.sequence_ledger import StreamCounts, sum_by_key
 from fantwin.pipeline.site.loss_accounting import label, losses, refused, refused_lines
 from fantwin.pipeline.site.stage_states import note_lines, notes_as_json

@@ -19,7 +19,7 @@ from fantwin.pipeline.site.stage_states import StageView
 from fantwin.pipeline.timebase.stage_clock import REPLAY
 from fantwin.schemas.health import Health
 from fantwin.schemas.streams import StreamId, input_streams, output_streams
-from fantwin.schemas.topics import ALL_TRAYS, BY_NAME, alive_key, sessions_key, stage_label
+from fantwin.schemas.topics import ALL_TRAYS, BY_NAME, sessions_key, stage_label
 
 _POLL_S = 0.02
 _ANY_STAGE_S = 2.0  # to find any stage: one whose first peer has died tries its endpoint every second
@@ -95,10 +95,8 @@ class Listeners:
         """Start watching, before the replay itself is on the bus."""
         self._site = site
         self._watcher = SiteWatcher(bus, site)
-        self._alive: set[str] = set()
         self._sessions = Sessions()
         bus.watch_alive(sessions_key(site), self._sessions.update)
-        bus.watch_alive(alive_key(site, "*", "*"), self._set_alive)
         self._before: dict[str, int] = {}
         self._present_at_start: set[str] = set()
 
@@ -119,15 +117,14 @@ class Listeners:
                 if waited_for:
                     report(f"waiting for {', '.join(waited_for)} of site {self._site!r}, up to {_ALL_STAGES_S:.0f} s")
             complete = len(views) >= len(self.present()) and now_s - steady_s > _UNCHANGED_S
-            if now_s - began_s > (_ALL_STAGES_S if self._alive else _ANY_STAGE_S) or (views and complete):
+            if now_s - began_s > (_ALL_STAGES_S if self._watcher.alive() else _ANY_STAGE_S) or (views and complete):
                 break
         self._before = self._watcher.losses()
         self._present_at_start = known
 
     def present(self) -> list[Present]:
         """The running stages."""
-        names = [tuple(key.split("/")[3:]) for key in sorted(self._alive)]
-        sessions = {name: self._sessions.named(*name) for name in names}
+        sessions = {name: self._sessions.named(*name) for name in sorted(self._watcher.alive())}
         return [
             Present(load_stage(stage), instance, session.trays if session else ())
             for (stage, instance), session in sessions.items()
@@ -136,7 +133,7 @@ class Listeners:
 
     def is_replaying(self) -> bool:
         """Whether a replay, this one or another, is on the bus."""
-        return alive_key(self._site, REPLAY, ALL_TRAYS) in self._alive
+        return (REPLAY, ALL_TRAYS) in self._watcher.alive()
 
     def readers(self, topics: Collection[str]) -> list[str]:
         """The running stages that read any of these topics."""
@@ -195,9 +192,6 @@ class Listeners:
 
     def _views(self) -> list[StageView]:
         return [view for view in self._watcher.stages() if view.alive and view.health.stage in STAGES]
-
-    def _set_alive(self, key: str, alive: bool) -> None:
-        (self._alive.add if alive else self._alive.discard)(key)
 
 
 def _lacks(health: Health, sent: Mapping[StreamId, int]) -> bool:

@@ -21,7 +21,6 @@ from fantwin.pipeline.replay.offline.kept_bins import KeptBins, RecordedTray, Tr
 from fantwin.pipeline.replay.offline.replay_input import ReplayInput, open_replay_input
 from fantwin.pipeline.tray_scoring.healthy_twin import modelled_fans
 from fantwin.schemas.codec import CodecError
-from fantwin.schemas.messages import Prediction
 from fantwin.schemas.units import NS_PER_S
 from fantwin.scoring.calibration.calibration import Excursions
 from fantwin.scoring.model.bins import Bin, Bins, bin_ns_of
@@ -243,12 +242,8 @@ def _computed(path: Path, part: HealthyPart) -> Iterator[TrayRun]:
             bin_ns = bin_ns_of(first.period_ns, float(fans.held_s.min()))
             bins = Bins(bin_ns, fans.top_rad_s, fans.reads_balance, twin.unseen_error)
             recorded = RecordedTray(path, tray.name, tray.fans, tray.speed_unit)
-            yield TrayRun(recorded, bin_ns, first.period_ns, _binned(bins, chain([first], blocks)))
-
-
-def _binned(bins: Bins, blocks: Iterable[Prediction]) -> Iterator[Bin]:
-    for block in blocks:
-        yield from bins.take(block)
+            binned = chain.from_iterable(map(bins.take, chain([first], blocks)))
+            yield TrayRun(recorded, bin_ns, first.period_ns, binned)
 
 
 def _reported(bins: Iterable[Bin], bin_ns: int, what: str, progress: Callable[[str], None]) -> Iterator[Bin]:

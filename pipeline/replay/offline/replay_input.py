@@ -17,6 +17,7 @@ from fantwin.pipeline.recordings.indexed import rare_messages
 from fantwin.pipeline.recordings.metadata import CONFIGURATION
 from fantwin.pipeline.recordings.parts import in_order
 from fantwin.pipeline.recordings.reading import RecordingError, RecordingMetadata, read_metadata, read_recording
+from fantwin.pipeline.recordings.records import whole_number
 from fantwin.pipeline.recordings.run_recordings import deciding_overrides, run_metadata
 from fantwin.pipeline.replay.offline.offline_pipeline import OfflinePipeline
 from fantwin.pipeline.replay.offline.plan import TrayPlan, undisturbed_plan
@@ -195,7 +196,7 @@ def open_replay_input(
             metadata=metadata,
             config=replace(base, trays=trays),
             twins={each.name: _twin_of(each, base, attached, recorded, twin, ordered) for each in trays},
-            started_t_ns=_started_t_ns(ordered[0], metadata, first_sample_t_ns),
+            started_t_ns=whole_number(metadata.metadata.get("started_t_ns", "")) or first_sample_t_ns,
             first_sample_t_ns=first_sample_t_ns,
             is_as_recorded=is_as_recorded,
             is_same_grid=attached is not None and base.sections["resampler"] == attached.sections["resampler"],
@@ -256,13 +257,3 @@ def _twin_of(
     if any(isinstance(card, ModelCard) and card.content for card in cards):  # learned while it was recorded
         return None
     raise RecordingError(f"{paths[0]}: no twin of {tray.name} in this recording: name one with --twin FILE.onnx")
-
-
-def _started_t_ns(path: Path, metadata: RecordingMetadata, first_sample_t_ns: int) -> int:
-    started = metadata.metadata.get("started_t_ns")
-    if started is None:
-        return first_sample_t_ns
-    try:
-        return int(started)
-    except ValueError as error:
-        raise RecordingError(f"{path}: its metadata are damaged: started_t_ns is not a number") from error

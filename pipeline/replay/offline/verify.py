@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import asdict
 from functools import cache
+from itertools import islice
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -247,17 +249,19 @@ def _alarm_difference(one: Alarm, other: Alarm, note: Callable[[Apart], None]) -
 
 
 def _blocks(envelopes: Iterable[Envelope], producer: str, kind: type[Samples]) -> Iterator[Samples]:
-    waiting: list[bytes] = []
+    payloads = (envelope.payload for envelope in _of_session(envelopes, producer))
+    while waiting := list(islice(payloads, _BLOCK_MESSAGES)):
+        yield from decode_together(kind, waiting)
+
+
+def _of_session(envelopes: Iterable[Envelope], producer: str) -> Iterator[Envelope]:
+    """The messages of one session, in order, each once: parts of a recording may overlap."""
     next_sequence = 0
     for envelope in envelopes:
         header = envelope.header
         if header.producer == producer and header.sequence >= next_sequence:
             next_sequence = header.sequence + 1
-            waiting.append(envelope.payload)
-            if len(waiting) == _BLOCK_MESSAGES:
-                yield from decode_together(kind, waiting)
-                waiting = []
-    yield from decode_together(kind, waiting)
+            yield envelope
 
 
 class _RecordedSnapshots:
@@ -326,15 +330,13 @@ def _state(snapshot: ScorerSnapshot) -> dict[str, Any]:
 
 
 def _saved(envelopes: Iterable[Envelope], producer: str) -> Iterator[ScorerSnapshot]:
-    """The snapshots that a session saved, in order, each once. What cannot be decoded is reported with the plan."""
-    next_sequence = 0
-    for envelope in envelopes:
-        try:
-            message = envelope.message
-        except CodecError:
-            continue
-        header = message.header
-        if isinstance(message, ScorerSnapshot) and header.producer == producer and header.sequence >= next_sequence:
-            next_sequence = header.sequence + 1
-            if not message.restored:
-                yield message
+    """The snapshots that a session saved. What cannot be decoded is reported with the plan."""
+
+    def decodable() -> Iterator[Envelope]:
+        for envelope in envelopes:
+            with suppress(CodecError):
+                _ = envelope.message
+                yield envelope
+
+    saved = (envelope.message for envelope in _of_session(decodable(), producer))
+    return (message for message in saved if isinstance(message, ScorerSnapshot) and not message.restored)

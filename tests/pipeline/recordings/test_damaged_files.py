@@ -13,7 +13,7 @@ from mcap.opcode import Opcode
 from mcap.records import Chunk, DataEnd, Footer
 from mcap.writer import MCAP0_MAGIC
 
-from fantwin.pipeline.recordings.contents import contents_of, damage_of
+from fantwin.pipeline.recordings.contents import contents_of
 from fantwin.pipeline.recordings.indexed import last_messages, rare_messages
 from fantwin.pipeline.recordings.reading import read_metadata, read_recording
 from fantwin.pipeline.recordings.records import RECORD, Record, RecordReader, record_bytes
@@ -161,7 +161,7 @@ def test_a_damage_costs_what_it_touches_and_every_reader_says_so(name: str, whol
 
     output = tmp_path / "out.mcap"
     before = path.read_bytes()
-    lines = damage_of(recover(path, output).found)
+    lines = recover(path, output).found.damage
     assert path.read_bytes() == before
     assert all(any(part in line for line in lines) for part in case.found), lines
     by_others = read_by_others(output)

@@ -9,10 +9,11 @@ from typing import NoReturn
 import pytest
 from mcap.opcode import Opcode
 
-from fantwin.pipeline.recordings.contents import NO_INDEX, contents_of
+from fantwin.pipeline.recordings.contents import contents_of
 from fantwin.pipeline.recordings.parts import RecordingParts
 from fantwin.pipeline.recordings.reading import RecordingError, read_metadata, read_recording
 from fantwin.pipeline.recordings.records import RecordReader
+from fantwin.pipeline.recordings.scan import NO_INDEX
 from fantwin.pipeline.recordings.sequence_ledger import SequenceLedger
 from fantwin.pipeline.recordings.writing import RecordingWriter
 from tests.support.failing_writers import disk_of, kill_a_recorder

@@ -66,5 +66,5 @@ def test_the_last_one_of_each_key_is_found_from_the_end(recording, monkeypatch):
     monkeypatch.setattr(indexed, "chunk_at", chunk_at)
     (payload,) = last_messages(recording, "twin").values()
     assert decode(ModelCard, payload).header.sequence == AT[-1]
-    assert len(read) <= 3, "with those that describe a channel, and the last one"
+    assert len(set(read)) <= 3, "with those that describe a channel"
     assert last_messages(recording, "grid") == {}
