@@ -10,7 +10,6 @@ from queue import SimpleQueue
 
 from fantwin.pipeline.files import replace_file
 from fantwin.pipeline.recordings.clips.clip import Clip, clip_folder, clips_as_text, list_path
-from fantwin.pipeline.recordings.clips.cutting import remove_unfinished
 from fantwin.pipeline.recordings.clips.tracker import ClipTracker, CutResult
 from fantwin.pipeline.recordings.disk import refused
 from fantwin.pipeline.recordings.disk_room import in_bytes
@@ -33,7 +32,6 @@ class AlarmClips:
         self._results: SimpleQueue[CutResult] = SimpleQueue()
         self._saved = tracker.clips
         self._unwritten = self._undeletable = ""
-        remove_unfinished(self._folder)
 
     def add(self, envelope: Envelope) -> None:
         """Follow a message of topic alarm."""

@@ -5,7 +5,7 @@ before makes it a recording that decides the same again: a snapshot of the score
 since that snapshot, and the raw samples of CLOCK_MARGIN_S more, so that the device's clock and the twin's state are
 settled when the scorer continues. Where snapshots are rare, at slow rates, the clip goes back LEAD_S at most.
 
-A clip is written whole or not at all: under another name, flushed to the disk, then renamed.
+A clip is written whole or not at all: it gets its name once it is on the disk.
 """
 
 from __future__ import annotations
@@ -18,10 +18,9 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
-from fantwin.pipeline.files import sync_folder
 from fantwin.pipeline.recordings.clips.clip import CLIP_KEY, CLIP_SNAPSHOT_KEY, Clip, clip_folder
 from fantwin.pipeline.recordings.clips.tracker import SET_BACK_NS, CutResult
-from fantwin.pipeline.recordings.disk import DiskError, is_being_written, refused
+from fantwin.pipeline.recordings.disk import DiskError, refused
 from fantwin.pipeline.recordings.excerpts import CLOCK_MARGIN_S
 from fantwin.pipeline.recordings.indexed import IndexedRecording
 from fantwin.pipeline.recordings.parts import part_files
@@ -47,8 +46,6 @@ ROOM_BYTES = 4 << 20
 """that must be free beyond recorder.min_free_bytes for a clip to be cut"""
 REST_S = 0.002
 """after each chunk, for the thread that records"""
-UNFINISHED = ".unfinished-"
-"""begins the name of a clip that is being written"""
 _JUDGED = ("alarm", "snapshot")
 """topics that a clip has, as samples that were made of others, from its snapshot on"""
 _OF_A_TRAY = ("fans", "speed_unit", TACHO_KEY, "twin_sha256")
@@ -73,24 +70,21 @@ class ClipCutter:
 
     def cut(self, clip: Clip) -> CutResult:
         """Write a clip, and say what came of it."""
-        folder = clip_folder(self.recording)
-        unfinished = folder / f"{UNFINISHED}{clip.name}"
+        path = clip_folder(self.recording) / clip.name
         try:
-            folder.mkdir(parents=True, exist_ok=True)
+            path.parent.mkdir(parents=True, exist_ok=True)
             self._require(self.min_free_bytes + ROOM_BYTES)
-            lacks = self._write(clip, unfinished)
-            size_bytes = unfinished.stat().st_size
-            unfinished.replace(folder / clip.name)
-            sync_folder(folder)
-            return CutResult(clip.name, size_bytes, lacks)
+            lacks = self._write(clip, path)
+            return CutResult(clip.name, path.stat().st_size, lacks)
         except RecordingError as error:
-            failed = CutResult(clip.name, problem=str(error), may_pass=isinstance(error, DiskError | UnreadableError))
+            may_pass = isinstance(error, DiskError | UnreadableError)
+            failed = CutResult(clip.name, problem=str(error), may_pass=may_pass)
         except OSError as error:
-            why = refused(f"{folder}: cannot be written", error, "make room, or correct the folder")
+            why = refused(f"{path.parent}: cannot be written", error, "make room, or correct the folder")
             failed = CutResult(clip.name, problem=str(why), may_pass=True)
-        for path in (unfinished, active_path(unfinished)):  # as far as the disk has taken it
+        for left in (path, active_path(path)):  # as far as the disk has taken it
             with suppress(OSError):
-                path.unlink(missing_ok=True)
+                left.unlink(missing_ok=True)
         return failed
 
     def _write(self, clip: Clip, path: Path) -> str:
@@ -109,8 +103,9 @@ class ClipCutter:
         if judged_after_ns is not None:
             metadata[CLIP_SNAPSHOT_KEY] = str(judged_after_ns)
         twin = _last_before(parts, "twin", start_ns)
-        has_beginning = "continues" not in of_part.metadata or within[0].first_ns <= start_ns
-        lacks, topics = "" if has_beginning else "parts that it needs were deleted to make room", set[str]()
+        is_oldest = within[0] is parts[0] and "continues" in of_part.metadata
+        is_cut_off = is_oldest and within[0].first_ns > start_ns
+        lacks, topics = "parts that it needs were deleted to make room" if is_cut_off else "", set[str]()
         with RecordingWriter(path, metadata, attachments, t_ns=start_ns, overwrite=True) as writer:
             for each in filter(None, (twin, snapshot)):
                 writer.add(each.received_at(start_ns))
@@ -139,14 +134,6 @@ class ClipCutter:
         free = self.free_bytes()
         if free < least_bytes:
             raise DiskError(f"{free / 1e6:,.1f} MB are free on the disk, and {least_bytes / 1e6:,.1f} MB are required")
-
-
-def remove_unfinished(folder: Path) -> None:
-    """Remove what a killed recorder has left of clips that it was writing. Others, of shards, may be writing now."""
-    with suppress(OSError):
-        for path in folder.glob(f"{UNFINISHED}*"):
-            if not is_being_written(path):
-                path.unlink()
 
 
 def _parts_since(recording: Path, tray: str, t_ns: int) -> list[IndexedRecording]:
