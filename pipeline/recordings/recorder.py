@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 
 from fantwin.pipeline.recordings.clips.alarm_clips import AlarmClips
 from fantwin.pipeline.recordings.disk import DiskError
 from fantwin.pipeline.recordings.disk_room import DiskRoom
-from fantwin.pipeline.recordings.held_messages import HeldMessages
 from fantwin.pipeline.recordings.interference import Interference
 from fantwin.pipeline.recordings.parts import RecordingParts
 from fantwin.pipeline.recordings.reading import RecordingError
@@ -73,7 +72,9 @@ class Recorder(Core):
         self._cards: dict[str, Envelope] = {}
         self._recorded: Counter[str] = Counter()
         self._counts: Counter[str] = Counter(lost_unwritten=0)
-        self._held = HeldMessages()
+        self._held: deque[Envelope] = deque()
+        """messages that wait while the disk refuses them"""
+        self._held_bytes = 0
         self._interference = Interference()
         self._healths = RecordedHealths()
         self._lost_in_pause = 0
@@ -149,7 +150,7 @@ class Recorder(Core):
         if self._held:
             self._resume()
             self._attempt(lambda: self._end_part(has_ended=True))
-        self._counts["lost_unwritten"] += len(self._held.take_all())
+        self._counts["lost_unwritten"] += len(self._take_held())
         if self._clips:
             self._clips.close()
         return ()
@@ -180,7 +181,7 @@ class Recorder(Core):
 
     def unsaved(self) -> Sequence[Envelope]:
         """Messages that are not flushed to the disk yet."""
-        return self._part.pending if self._part else self._held.messages
+        return self._part.pending if self._part else tuple(self._held)
 
     def problem(self) -> str:
         """Why nothing is recorded now, what another program did to the file, and why limits are not kept; empty if all
@@ -223,8 +224,7 @@ class Recorder(Core):
             self._pause(str(error))
 
     def _begin(self, about: Mapping[str, str]) -> None:
-        held_since_ns = self._held.first_received_t_ns
-        self._began_ns = self._now_ns if held_since_ns is None else min(held_since_ns, self._now_ns)
+        self._began_ns = min(self._held[0].received_t_ns, self._now_ns) if self._held else self._now_ns
         self._part = self._parts.begin(self._began_ns, self._ledger, about)
         self._least_bytes = 2 * self._part.size
         self._counts["parts"] += 1
@@ -276,10 +276,20 @@ class Recorder(Core):
 
     def _hold(self, unwritten: Sequence[Envelope]) -> None:
         """Keep messages in memory until they can be recorded; beyond HELD_BYTES the oldest are lost."""
-        for lost in self._held.add(unwritten, HELD_BYTES):
+        self._held.extend(unwritten)
+        self._held_bytes += sum(len(envelope.payload) for envelope in unwritten)
+        while self._held_bytes > HELD_BYTES:
+            lost = self._held.popleft()
+            self._held_bytes -= len(lost.payload)
             self._ledger.add_lost(lost.key, lost.message.header.producer, lost.message.header.sequence)
             self._counts["lost_unwritten"] += 1
             self._lost_in_pause += 1
+
+    def _take_held(self) -> list[Envelope]:
+        held = list(self._held)
+        self._held.clear()
+        self._held_bytes = 0
+        return held
 
     def _check_disk(self) -> None:
         try:
@@ -310,7 +320,7 @@ class Recorder(Core):
             "lost_in_pause": str(self._lost_in_pause),
         }
         try:
-            shortage = self._room.shortage(ROOM_TO_RESUME + self._held.size_bytes)
+            shortage = self._room.shortage(ROOM_TO_RESUME + self._held_bytes)
             if not shortage:
                 self._begin(about)
         except RecordingError as error:
@@ -320,5 +330,5 @@ class Recorder(Core):
             return
         self._lost_in_pause = 0
         self._limited_ns = self._now_ns - LIMITS_CHECK_NS  # due now: the disk may be another
-        for envelope in self._held.take_all():
+        for envelope in self._take_held():
             self._record(envelope)
