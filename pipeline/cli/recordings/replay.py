@@ -54,6 +54,7 @@ def replay(
     start: Annotated[float, typer.Option(help="Start, in s since the first message.")] = 0.0,
     end: Annotated[float, typer.Option(help="End, in s since the first message.")] = math.inf,
     pause: Annotated[bool, typer.Option("--pause", help="Start paused; space continues.")] = False,
+    loop: Annotated[bool, typer.Option("--loop", help="Repeat until Ctrl-C; times continue.")] = False,
     topics: Annotated[
         str | None, typer.Option(metavar="A,B", help="Topics to publish. Default: all of the trays.")
     ] = None,
@@ -104,7 +105,7 @@ def replay(
 
     Example: fantwin replay --offline --verify site-*/*.mcap
     """
-    viewing = {"--rate": rate, "--pause": pause, "--topics": topics, "--from": from_topic}
+    viewing = {"--rate": rate, "--pause": pause, "--loop": loop, "--topics": topics, "--from": from_topic}
     deciding = {"--twin": twin, "--output": output, "--verify": verify}
     deciding |= {"--jobs": jobs, "--skip-bad": skip_bad}
     for name in (name for name, value in (viewing if offline else deciding).items() if value):
@@ -142,7 +143,8 @@ def replay(
                 return
             shown_s = time.monotonic()
             at_s = playback.seconds_at(progress.t_ns)
-            reporter.show("", int(at_s), math.ceil(end_s), status_line(progress))
+            ends_s = 0 if progress.round else math.ceil(end_s)
+            reporter.show("", int(at_s), ends_s, status_line(progress))
 
         with keys, reporter:
             outcome = publish(
@@ -150,6 +152,7 @@ def replay(
                 pace,
                 replay_config,
                 stop,
+                loop=loop,
                 keys=keys.pressed,
                 show=show_progress,
                 report=lambda line: console.print(line, markup=False, soft_wrap=True),
@@ -205,9 +208,10 @@ def _rate(text: str) -> float:
 
 def status_line(progress: Progress) -> str:
     """One line: recorded time, rate, messages sent, keys."""
+    rounds = f"  round {progress.round + 1}" if progress.round else ""
     rate = "as fast as possible" if math.isinf(progress.rate) else f"x {progress.rate:g}"
     state = "paused, " if progress.paused else ""
-    return f"{format_utc(progress.t_ns)}  {state}{rate}  {progress.messages:,} sent  ({_KEYS_HELP})"
+    return f"{format_utc(progress.t_ns)}{rounds}  {state}{rate}  {progress.messages:,} sent  ({_KEYS_HELP})"
 
 
 def _summary(outcome: Outcome) -> str:

@@ -174,6 +174,7 @@ class Progress:
     t_ns: int
     rate: float
     paused: bool
+    round: int
     messages: int
 
 
@@ -200,6 +201,7 @@ class Player:
         self._next_beat_s = self._next_health_s = 0.0
         self._steps = 0
         self._leading = len(_RANK)
+        self._round = 0
         self._messages = 0
         self._clock_ns = 0
         self.first_ns = self.last_ns = 0
@@ -207,14 +209,14 @@ class Player:
         self.began_s = self.ended_s = now_s()
         """the same on this process's clock"""
 
-    def play(self, entries: Iterable[Envelope]) -> None:
-        """Play to the end.
+    def play(self, rounds: Iterable[tuple[int, Envelope]]) -> None:
+        """Play to the end. Each message comes with the number of its round.
 
         Raises:
             Stopped: the user asked to stop.
         """
         try:
-            for entry in entries:
+            for self._round, entry in rounds:
                 if not self._messages:
                     self._begin(entry)
                 self._wait_for(entry)
@@ -258,7 +260,7 @@ class Player:
         if now_s >= self._next_health_s:
             self._next_health_s = now_s + HEALTH_PERIOD_S
             self._output.publish_health()
-        self._look(Progress(position_ns, self._pace.rate, self._pace.paused, self._messages))
+        self._look(Progress(position_ns, self._pace.rate, self._pace.paused, self._round, self._messages))
 
     def _press(self, entry: Envelope, now_s: float) -> None:
         """Handle the pressed keys."""

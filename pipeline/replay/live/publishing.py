@@ -55,6 +55,7 @@ def publish(
     config: Config,
     stop: threading.Event,
     *,
+    loop: bool,
     keys: Callable[[], Sequence[Key]],
     show: Callable[[Progress], None],
     report: Callable[[str], None],
@@ -100,7 +101,8 @@ def publish(
         outcome.stopped = True
         try:
             with suppress(Stopped):
-                player.play(entry for entry in playback if entry.topic in topics)
+                rounds = playback.rounds() if loop else ((0, entry) for entry in playback)
+                player.play((number, entry) for number, entry in rounds if entry.topic in topics)
                 if not sender.sent:
                     none = f"it holds no {' or '.join(recorded_topics)}, or none between --start and --end"
                     raise UserError(f"{playback.files[0]}: {none}")

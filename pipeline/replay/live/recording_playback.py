@@ -14,9 +14,10 @@ from __future__ import annotations
 import heapq
 import math
 from collections.abc import Collection, Generator, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from itertools import islice
 from pathlib import Path
+from typing import Any
 
 from fantwin.pipeline.recordings.indexed import last_message_ns, rare_messages
 from fantwin.pipeline.recordings.parts import Seen, in_order
@@ -67,16 +68,19 @@ def read_versions(files: Iterable[Path]) -> dict[str, list[Version]]:
 
 
 class ComingVersions:
-    """The versions that a replay has still to publish."""
+    """The versions that one round of a replay has still to publish."""
 
-    def __init__(self, versions: Mapping[str, Sequence[Version]], end_ns: int | None = None) -> None:
-        """end_ns: later versions do not take over in this replay; None: all do."""
+    def __init__(
+        self, versions: Mapping[str, Sequence[Version]], end_ns: int | None = None, *, is_first_round: bool = True
+    ) -> None:
+        """end_ns: later versions do not take over in this round; None: all do."""
         self._coming = {
             tray: [each for each in of_tray if end_ns is None or each.first_t_ns <= end_ns]
             for tray, of_tray in versions.items()
         }
+        self._is_first_round = is_first_round
         self._begin_ns: dict[str, int] = {}
-        """by tray: time of its first sample"""
+        """by tray: time of its first sample in this round"""
         self._published_until_ns: dict[str, int] = {}
         """by tray: when the newest version that was published takes over"""
 
@@ -93,17 +97,22 @@ class ComingVersions:
             del coming[0]
         while coming and self._published_until_ns.get(tray, oldest_ns) <= newest_ns:
             version = coming.pop(0)
-            self._published_until_ns[tray] = version.first_t_ns
-            yield _message(entry, version, oldest_ns)
+            first_t_ns = version.first_t_ns
+            if not self._is_first_round:
+                # Not at samples of the round before. In the first round there are none; its grid may begin a little
+                # before its first raw sample.
+                first_t_ns = max(first_t_ns, begin_ns)
+            self._published_until_ns[tray] = first_t_ns
+            yield _message(entry, version.card, oldest_ns, first_t_ns)
 
 
-def _message(entry: Envelope, version: Version, t_ns: int) -> Envelope:
-    key, card = entry.key.rpartition("/")[0] + f"/{NEW_TWIN}", version.card
-    about = {"twin": card.twin, "sha256": card.sha256, "content": card.content}
-    message = NewTwin(t_ns=t_ns, first_sample_t_ns=version.first_t_ns, **about)
+def _message(entry: Envelope, card: ModelCard, t_ns: int, first_t_ns: int) -> Envelope:
+    key = entry.key.rpartition("/")[0] + f"/{NEW_TWIN}"
+    message = NewTwin(t_ns=t_ns, twin=card.twin, sha256=card.sha256, content=card.content, first_sample_t_ns=first_t_ns)
     return Envelope.of(key, message, entry.received_t_ns)
 
 
+LOOP_GAP_NS = 10_000_000  # between two rounds of a recording without a grid, whose period would say more
 OUT_OF_ORDER_NS = 10 * NS_PER_S
 """how much later than its followers a message may be recorded, because it was recovered from its producer"""
 LATCHED_TOPIC = TWIN
@@ -149,7 +158,23 @@ class RecordingPlayback:
         return self.seconds_at(min(recorded, self._end_ns) if self._end_ns is not None else recorded)
 
     def __iter__(self) -> Iterator[Envelope]:
-        versions = ComingVersions(self._versions, self._end_ns)
+        """One round."""
+        return self._round(is_first=True)
+
+    def rounds(self) -> Iterator[tuple[int, Envelope]]:
+        """Endless rounds, each message with its round's number; times are shifted so that they never go back."""
+        number, by_ns = 0, 0
+        while True:
+            extent = TimeExtent()
+            for entry in self._round(is_first=not number):
+                extent.add(entry)
+                yield number, shifted(entry, by_ns)
+            number, by_ns = number + 1, by_ns + extent.length_ns()
+            if not by_ns:
+                return
+
+    def _round(self, *, is_first: bool) -> Iterator[Envelope]:
+        versions = ComingVersions(self._versions, self._end_ns, is_first_round=is_first)
         seen = Seen()
         latched: dict[str, Envelope] = {}
         damage: dict[Path, str] = {}
@@ -183,3 +208,43 @@ class RecordingPlayback:
             finally:
                 if reading.damage:
                     damage[file] = reading.damage
+
+
+class TimeExtent:
+    """The first and the last time of messages, by receipt or by sample."""
+
+    def __init__(self) -> None:
+        self._times_ns: list[int] = []
+        """first and last, once there was a message"""
+        self._periods_ns: set[int] = set()
+
+    def add(self, entry: Envelope) -> None:
+        """Include a message."""
+        times = sample_times(entry.message)
+        times_ns = [*self._times_ns, entry.received_t_ns, *times[:1].tolist(), *times[-1:].tolist()]
+        self._times_ns = [min(times_ns), max(times_ns)]
+        if (period_ns := getattr(entry.message, "period_ns", 0)) > 0:
+            self._periods_ns.add(period_ns)
+
+    def length_ns(self) -> int:
+        """The shift in ns of the next round: a whole number of grid periods. 0: there was no message."""
+        if not self._times_ns:
+            return 0
+        period_ns = math.lcm(*self._periods_ns) if self._periods_ns else LOOP_GAP_NS
+        first_ns, last_ns = self._times_ns
+        return ((last_ns - first_ns) // period_ns + 1) * period_ns
+
+
+def shifted(entry: Envelope, by_ns: int) -> Envelope:
+    """The same message with all its times later."""
+    if not by_ns:
+        return entry
+    message = entry.message
+    times = {f.name: _later(getattr(message, f.name), by_ns) for f in fields(message) if f.name.endswith("t_ns")}
+    return Envelope.of(entry.key, replace(message, **times), entry.received_t_ns + by_ns)
+
+
+def _later(t_ns: Any, by_ns: int) -> Any:
+    """A time, or an array of times, shifted. Values that stand for `never` or `until it clears` are not."""
+    is_none = isinstance(t_ns, int) and not 0 < t_ns < 2**63 - 1
+    return t_ns if is_none else t_ns + by_ns

@@ -40,12 +40,12 @@ class Script:
         return due
 
 
-def raws(count: int, period_ns: int = STEP_NS, samples: int = 1) -> list[Envelope]:
+def raws(count: int, period_ns: int = STEP_NS, samples: int = 1) -> list[tuple[int, Envelope]]:
     found = []
     for k in range(count):
         raw = raw_of(k * samples, 1, sequence=k, samples=samples)
         log_ns = START_NS + ((k + 1) * samples - 1) * period_ns
-        found.append(Envelope.of("fantwin/demo/tray1/raw", raw, log_ns))
+        found.append((0, Envelope.of("fantwin/demo/tray1/raw", raw, log_ns)))
     return found
 
 
@@ -54,7 +54,7 @@ def alarm(log_ns: int, sequence: int) -> Envelope:
 
 
 def play(
-    entries: Sequence[Envelope],
+    rounds: Sequence[tuple[int, Envelope]],
     rate: float = 1.0,
     *,
     paused: bool = False,
@@ -67,7 +67,7 @@ def play(
     sent = Sent(time, cost_s=cost_s)
     pace, pressed = Pace(rate, paused=paused), Script(time, *keys)
     player = Player(cast(Any, sent), pace, time.wait, now_s=time.now_s, keys=pressed, look=look)
-    player.play(entries)
+    player.play(rounds)
     return sent, player
 
 
@@ -104,15 +104,15 @@ def test_the_clock_waits_before_samples_that_are_still_to_come_however_late_thei
 
 
 def test_the_clock_continues_through_a_silence_of_the_link():
-    silent = [*raws(10), alarm(START_NS + 3 * 10**9, 0)]
+    silent = [*raws(10), (0, alarm(START_NS + 3 * 10**9, 0))]
     sent, _ = play(silent)
     assert [t_ns for at_s, t_ns, _ in sent.clocks if 1.0 < at_s < 2.0][-1] == pytest.approx(2e9, abs=6e7)
 
 
 def test_the_published_time_never_runs_back():
-    entries = raws(4, samples=100)
-    entries.insert(1, alarm(START_NS + 1_500_000_000, 0))  # published before older samples
-    sent, _ = play(entries, keys=[(1.0, Key.FASTER), (1.2, Key.PAUSE), (1.5, Key.STEP), (1.6, Key.PAUSE)])
+    rounds = raws(4, samples=100)
+    rounds.insert(1, (0, alarm(START_NS + 1_500_000_000, 0)))  # published before older samples
+    sent, _ = play(rounds, keys=[(1.0, Key.FASTER), (1.2, Key.PAUSE), (1.5, Key.STEP), (1.6, Key.PAUSE)])
     times = [t_ns for _, t_ns, _ in sent.clocks]
     assert times == sorted(times)
 
@@ -131,10 +131,10 @@ def test_in_a_pause_only_clock_and_health_are_sent_and_recorded_time_stands_stil
 
 
 def test_a_step_is_one_message_of_the_first_topic_and_all_recorded_before_it():
-    entries = raws(10)
-    entries.insert(3, alarm(START_NS + 2 * STEP_NS + 1, 0))
+    rounds = raws(10)
+    rounds.insert(3, (0, alarm(START_NS + 2 * STEP_NS + 1, 0)))
     sent, _ = play(
-        entries, paused=True, keys=[(1, Key.STEP), (2, Key.STEP), (3, Key.STEP), (4, Key.STEP), (5, Key.PAUSE)]
+        rounds, paused=True, keys=[(1, Key.STEP), (2, Key.STEP), (3, Key.STEP), (4, Key.STEP), (5, Key.PAUSE)]
     )
     by_second = [[topic for at_s, topic, _ in sent.messages if round(at_s) == second] for second in (1, 2, 3, 4)]
     assert by_second == [["raw"], ["raw"], ["raw"], ["alarm", "raw"]]
@@ -144,7 +144,7 @@ def test_a_step_is_one_message_of_the_first_topic_and_all_recorded_before_it():
 
 def test_a_twin_that_is_published_before_a_sample_is_no_step_of_its_own():
     twin = NewTwin(t_ns=START_NS, twin="t", sha256="", content=b"")
-    first = Envelope.of("fantwin/demo/tray1/new_twin", twin, START_NS)
+    first = (0, Envelope.of("fantwin/demo/tray1/new_twin", twin, START_NS))
     sent, _ = play([first, *raws(5)], paused=True, keys=[(1, Key.STEP), (2, Key.STEP), (3, Key.PAUSE)])
     by_second = [[topic for at_s, topic, _ in sent.messages if round(at_s) == second] for second in (1, 2)]
     assert by_second == [["new_twin", "raw"], ["raw"]]
@@ -176,4 +176,4 @@ def test_progress_is_reported_and_an_error_of_its_callback_ends_the_replay():
     with pytest.raises(ValueError, match="enough"):
         play(raws(1000), look=look)
     assert seen[-1].t_ns == pytest.approx(START_NS + 1_000_000_000, abs=1e8)
-    assert (seen[-1].rate, seen[-1].paused) == (1.0, False)
+    assert (seen[-1].rate, seen[-1].paused, seen[-1].round) == (1.0, False, 0)

@@ -6,6 +6,7 @@ import math
 import threading
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from itertools import takewhile
 from pathlib import Path
 from typing import Any, cast
 
@@ -113,10 +114,10 @@ def player_of(stages: Stages) -> Player:
     return Player(cast(Any, stages), Pace(1.0), stages.time.wait, now_s=stages.time.now_s)
 
 
-def played(learned: Learned, start: str, start_s: float = 0.0, end_s: float = math.inf) -> Stages:
+def played(learned: Learned, start: str, start_s: float = 0.0, end_s: float = math.inf, rounds: int = 1) -> Stages:
     stages = Stages(learned)
     playback = RecordingPlayback([learned.path], TOPICS[start], start_s, end_s)
-    player_of(stages).play(playback)
+    player_of(stages).play(takewhile(lambda each: each[0] < rounds, playback.rounds()))
     stages.close()
     return stages
 
@@ -163,6 +164,22 @@ def test_a_twin_that_takes_over_after_the_stretch_is_not_published(learned):
     assert [twin.twin for twin in stages.new_twins] == ["tray1-1"]
 
 
+def test_each_round_of_a_loop_changes_the_twins_at_the_same_samples(learned):
+    at_s = learned.seconds_until(learned.firsts[0][1]) + 0.5
+    stages = played(learned, "raw", at_s, rounds=3)
+    assert [twin.twin for twin in stages.new_twins] == ["tray1-1", "tray1-2"] * 3
+    found = changes(stages.predictions)
+    assert [twin for twin, _ in found] == ["tray1-1", "tray1-2"] * 3
+    seconds = [t_ns for twin, t_ns in found if twin == "tray1-2"]
+    assert seconds[0] == learned.firsts[1][1]
+    assert seconds[1] - seconds[0] == seconds[2] - seconds[1] > 2 * 10**9
+    begins = [twin.t_ns for twin in stages.new_twins if twin.twin == "tray1-1"]
+    named = [twin.first_sample_t_ns for twin in stages.new_twins if twin.twin == "tray1-1"]
+    assert named[1:] == begins[1:], "not a sample of the round before, which stages may still have to predict"
+    late_ns = [t_ns - begin for (_, t_ns), begin in zip(found[2::2], begins[1:], strict=True)]
+    assert late_ns == pytest.approx([0, 0], abs=4 * STEP_NS), "with the first message of its round"
+
+
 def test_the_clock_does_not_pass_the_samples_that_follow_a_twin(learned):
     stages = Stages(learned)
     stages.cost_s = 0.2  # a beat is due before each message
@@ -170,7 +187,7 @@ def test_the_clock_does_not_pass_the_samples_that_follow_a_twin(learned):
     versions = ComingVersions({TRAY: read_versions([learned.path])[TRAY]})
     entries = [*versions.before(block), block]
     assert [entry.topic for entry in entries] == ["new_twin", "raw"]
-    player_of(stages).play(entries)
+    player_of(stages).play((0, entry) for entry in entries)
     before = [t_ns for at_s, t_ns, _ in stages.clocks if at_s <= stages.messages[1][0]]
     assert before
     assert max(before) <= 0
@@ -187,6 +204,7 @@ def test_a_learner_that_is_running_is_the_only_one_to_publish_new_twins(learned,
             Pace(math.inf),
             config,
             threading.Event(),
+            loop=False,
             keys=tuple,
             show=lambda _progress: None,
             report=lines.append,

@@ -1,23 +1,33 @@
-"""Playback of recordings: parts in order, each message once, and a time range."""
+"""Playback of recordings: parts in order, each message once, a time range, and in a loop."""
 
 from __future__ import annotations
 
 import random
+from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 
+import numpy as np
 import pytest
 from mcap.reader import make_reader
 from mcap.records import ChunkIndex
 
 from fantwin.pipeline.recordings.reading import RecordingError
 from fantwin.pipeline.recordings.writing import RecordingWriter
-from fantwin.pipeline.replay.live.recording_playback import RecordingPlayback
+from fantwin.pipeline.replay.live.recording_playback import RecordingPlayback, TimeExtent, shifted
+from fantwin.schemas.enums import InvalidReason
+from fantwin.schemas.envelope import Envelope
+from fantwin.schemas.fields import columns
 from fantwin.schemas.header import Header
-from fantwin.schemas.messages import ModelCard
+from fantwin.schemas.messages import Alarm, Grid, ModelCard
 from fantwin.schemas.topics import tray_key
+from fantwin.scoring.alarms.alarm_state import UNTIL_IT_CLEARS_T_NS
+from tests.support import made_messages
 from tests.support.replay_data import START_NS, STEP_NS, raw_of, write_raw
 
 RAW = tray_key("demo", "tray1", "raw")
+
+ALARM_KEY = "fantwin/demo/tray1/alarm"
 
 
 def part(path: Path, sequences: range, log_s: float = 0.0, **metadata: str) -> Path:
@@ -77,6 +87,54 @@ def test_a_time_range_starts_with_the_card_of_the_twin_then_in_force(tmp_path):
     assert first.message.twin == "twin1"
     assert first.received_t_ns == START_NS + 10**9
     assert second.message.header.sequence == 100
+
+
+def test_times_continue_from_round_to_round_without_a_gap_and_on_the_grid(tmp_path):
+    rounds = islice(RecordingPlayback([write_raw(tmp_path / "r.mcap", 200)], ("raw",), 0.5).rounds(), 450)
+    numbers, entries = zip(*rounds, strict=True)
+    assert [numbers.count(n) for n in range(3)] == [150, 150, 150]
+    times = np.concatenate([entry.message.host_receive_t_ns for entry in entries])
+    assert (np.diff(times) == STEP_NS).all()
+    assert (np.diff([entry.received_t_ns for entry in entries]) == STEP_NS).all()
+    assert sequences(entries)[:150] == sequences(entries)[150:300]
+
+
+def test_a_recording_without_messages_to_replay_ends_even_in_a_loop(tmp_path):
+    assert list(RecordingPlayback([write_raw(tmp_path / "r.mcap", 10)], ("score",)).rounds()) == []
+
+
+@pytest.mark.parametrize("span_ns", [10 * 33_333_333, 10 * 33_333_333 + 5])
+def test_a_round_is_a_whole_number_of_grid_steps_and_longer_than_all_that_is_in_it(span_ns):
+    extent = TimeExtent()
+    for t_ns in (START_NS, START_NS + span_ns):
+        zeros = np.zeros((1, 1))
+        why = np.full((1, 1), InvalidReason.NONE, np.uint8)
+        states = {"valid": zeros == 0, "invalid_reason": why, "command": zeros, "speed_rad_s": zeros}
+        grid = Grid(fans=1, period_ns=33_333_333, t_ns=np.array([t_ns]), **states)
+        extent.add(Envelope.of("fantwin/demo/tray1/grid", grid, START_NS + 7))
+    assert extent.length_ns() % 33_333_333 == 0
+    assert span_ns < extent.length_ns() <= span_ns + 33_333_333
+
+
+def test_all_times_of_a_message_are_shifted_and_nothing_else():
+    alarm = made_messages.alarm(1, 50, onset_t_ns=40)
+    later = shifted(Envelope.of(ALARM_KEY, alarm, 60), 1000)
+    assert later.received_t_ns == 1060
+    assert vars(later.message) == vars(replace(alarm, t_ns=1050, onset_t_ns=1040))
+    for until, moved in ((70, 1070), (UNTIL_IT_CLEARS_T_NS, UNTIL_IT_CLEARS_T_NS)):
+        shelved = shifted(Envelope.of(ALARM_KEY, replace(alarm, shelved_until_t_ns=until), 60), 1000).message
+        assert isinstance(shelved, Alarm) and shelved.shelved_until_t_ns == moved
+    raw = raw_of(3, 2)
+    moved = shifted(Envelope.of("fantwin/demo/tray1/raw", raw, 60), 1000).message
+    assert (moved.host_receive_t_ns == raw.host_receive_t_ns + 1000).all()  # type: ignore[union-attr]
+    assert (moved.device_clock_us == raw.device_clock_us).all()  # type: ignore[union-attr]
+
+
+def test_columns_in_ns_are_times_since_the_epoch_and_named_t_ns():
+    assert {name for kind in made_messages.MESSAGE_TYPES for name in columns(kind) if name.endswith("_ns")} == {
+        "host_receive_t_ns",
+        "t_ns",
+    }
 
 
 def test_a_truncated_part_is_played_as_far_as_it_can_be_read_and_reported(tmp_path):
