@@ -9,18 +9,20 @@ import sys
 import threading
 
 
-def stop_on_signals(stop: threading.Event) -> None:
-    """Set `stop` on the first SIGINT or SIGTERM; exit on the second, with status 128 + its number.
+def stop_on_signals() -> threading.Event:
+    """An event that the first SIGINT or SIGTERM sets; the second ends the process, with status 128 + its number.
 
     A handler in Python runs only when the main thread returns from whatever it has called, which may be never. So the
     interpreter writes the number of the signal to a socket, at once, and a thread reads it.
     """
+    stop = threading.Event()
     reader, writer = socket.socketpair()
     writer.setblocking(False)
     signal.set_wakeup_fd(writer.fileno(), warn_on_full_buffer=False)
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda _number, _frame: None)
     threading.Thread(target=_obey, args=(reader, writer, stop), name="signals", daemon=True).start()
+    return stop
 
 
 def set_when_stdin_closes(event: threading.Event) -> None:

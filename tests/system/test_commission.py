@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -49,7 +50,7 @@ def tray(tmp_path: Path) -> Iterator[RunningCommand]:
 def test_a_tray_that_its_plant_moves_gets_a_calibrated_twin_and_meanwhile_a_second_one_is_refused(
     configuration: Path, tray: RunningCommand, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(commission, "stop_on_signals", lambda _stop: None)  # this process has its own
+    monkeypatch.setattr(commission, "stop_on_signals", threading.Event)  # this process has its own
     for name, least in (("NEEDED_RANGES", 2), ("NEEDED_S", 3.0), ("NEEDED_CHANGES", 2)):
         monkeypatch.setattr(ordinary_operation, name, least)
     before, operate, refused = configuration.read_text(encoding="utf-8"), Commissioning._operate, ""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import threading
 import time
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -128,8 +127,7 @@ def replay(
         playback = RecordingPlayback(files, chosen, start, end)
         missing = _left_out(playback.files, chosen, is_asked_for=bool(topics or from_topic))
         replay_config = resolve_config(playback.files[0], playback.first, config, overrides or ())
-        stop = threading.Event()
-        stop_on_signals(stop)
+        stop = stop_on_signals()
         reporter, end_s = Reporter(has_lines=False), playback.end_s()
         console = reporter.console
         if missing:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import threading
 import time as clock
 from collections.abc import Callable
 from dataclasses import asdict, replace
@@ -140,8 +139,7 @@ def serve_line(
     err: bool,
 ) -> PlaybackCounts:
     """Play the device on a pseudo-terminal. wait: for a reader. err: say on stderr where it is."""
-    stop = threading.Event()
-    stop_on_signals(stop)
+    stop = stop_on_signals()
     line = PseudoTerminal(link)
     try:
         fans_on = "1 fan on" if device.fans == 1 else f"{device.fans} fans on"
@@ -155,8 +153,7 @@ def serve_line(
 
 def serve_hwmon(tray: SimulatedTray, root: Path, chip: str, *, err: bool) -> PlaybackCounts:
     """Run the tray behind a tree of files until Ctrl-C. err: say where on stderr."""
-    stop = threading.Event()
-    stop_on_signals(stop)
+    stop = stop_on_signals()
     tree = HwmonTree(root, chip, tray.fans)
     try:
         typer.echo(

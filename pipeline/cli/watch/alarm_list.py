@@ -4,11 +4,14 @@ the rate of false alarms.
 
 from __future__ import annotations
 
+import math
 import queue
 import threading
 import time
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from contextlib import closing, suppress
+from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
 
@@ -33,7 +36,7 @@ from fantwin.pipeline.replay.offline.alarm_episodes import Episode, alarms_in, e
 from fantwin.pipeline.site.alarm_history import FILE, AlarmHistory
 from fantwin.pipeline.site.alarm_rates import AlarmRates
 from fantwin.pipeline.site.fleet import Fan
-from fantwin.pipeline.site.judging import JudgedChanges, Unjudged, as_judged, at_rest, unjudged
+from fantwin.pipeline.site.judging import JudgedChanges, as_judged, at_rest, unjudged
 from fantwin.pipeline.site.site_watcher import SiteWatcher
 from fantwin.pipeline.site.stage_states import note_lines
 from fantwin.schemas.codec import CodecError, decode
@@ -50,7 +53,7 @@ _SCORES_S = 3.0  # a score of every tray arrives in this time
 _POLL_S = 0.02
 _WATCH_S = 0.2  # between two looks at the stages while no alarm comes
 NS_PER_HOUR = 3600 * NS_PER_S
-_STYLES = {Severity.NONE: "", Severity.WARNING: "yellow", Severity.ALARM: "bold red"}
+STYLES = {Severity.NONE: "", Severity.WARNING: "yellow", Severity.ALARM: "bold red"}
 
 
 def show_list(
@@ -63,15 +66,16 @@ def show_list(
         typer.Exit: 1, a fan is not judged.
     """
     news: queue.Queue[Alarm] = queue.Queue()
-    trays, roles = config.trays, roles_of(config)
-    watcher = SiteWatcher(bus, config.site, roles, trays, has_scores=True, hear_alarm=news.put)
+    watcher = SiteWatcher(bus, config.site, roles_of(config), config.trays, has_scores=True, hear_alarm=news.put)
     wait_for_stages(bus, watcher, config, stop)
     watcher.ask_for_past_alarms()
-    lacking = _wait_until_judged(watcher, config, stop)
+    until_s = time.monotonic() + _SCORES_S
+    while lacking := unjudged(watcher.model, watcher.states(process_list(config))):
+        if time.monotonic() > until_s or stop.wait(_POLL_S):
+            break
     for _ in range(news.qsize()):
         news.get()
-    found = [each for each in watcher.current_alarms() if show_all or is_listed(each.newest)]
-    found = as_judged(found, lacking)
+    found = as_judged([each for each in watcher.current_alarms() if show_all or is_listed(each.newest)], lacking)
     slow = _slow_changes(watcher)
     shown = {"alarms": [each.as_json() for each in found], "not_judged": [each.as_json() for each in lacking]}
     shown |= {"at_rest": [each.as_json() for each in at_rest(watcher.model)], "slow_changes": slow}
@@ -116,20 +120,11 @@ def _watch(
 
 def _slow_changes(watcher: SiteWatcher) -> list[str]:
     """What scorers say about fans that change slowly, which is no alarm yet."""
-    healths = (view.health for view in watcher.stages() if view.alive)
     return note_lines(
-        replace(health, notes=tuple(note for note in health.notes if is_of_slow_change(note.text)))
-        for health in healths
+        replace(view.health, notes=tuple(note for note in view.health.notes if is_of_slow_change(note.text)))
+        for view in watcher.stages()
+        if view.alive
     )
-
-
-def _wait_until_judged(watcher: SiteWatcher, config: Config, stop: threading.Event) -> list[Unjudged]:
-    """The fans that are not judged now; waits for scores, which come in blocks."""
-    until_s = time.monotonic() + _SCORES_S
-    while True:
-        lacking = unjudged(watcher.model, watcher.states(process_list(config)))
-        if not lacking or time.monotonic() > until_s or stop.wait(_POLL_S):
-            return lacking
 
 
 def word(alarm: Alarm) -> str:
@@ -143,12 +138,13 @@ def alarm_lines(current: CurrentAlarm, now: str = "") -> Text:
     by = f" by {current.acknowledged_by}" if current.acknowledged_by else ""
     words = [f"{word}{by}" if word == "acknowledged" else word for word in current.states()]
     words += [f"now {now}"] if now else []
-    style = _STYLES.get(alarm.severity, "bold red") if is_presented(alarm) else "dim"
-    text = Text.assemble((f"{name_of(alarm)}  {alarm.severity.name:7}", style), f"  {', '.join(words)}")
+    style = STYLES.get(alarm.severity, "bold red") if is_presented(alarm) else "dim"
+    text = Text.assemble(
+        (f"{alarm.header.tray} fan {alarm.fan}  {alarm.severity.name:7}", style), f"  {', '.join(words)}"
+    )
     if alarm.severity != Severity.NONE:
-        text.append(
-            f"  since {clock(alarm.onset_t_ns)} ({duration_text(max(0, time.time_ns() - alarm.onset_t_ns) / NS_PER_S)})"
-        )
+        lasted = duration_text(max(0, time.time_ns() - alarm.onset_t_ns) / NS_PER_S)
+        text.append(f"  since {clock(alarm.onset_t_ns)} ({lasted})")
     if current.causes:
         evidence = current.causes[0].evidence
         is_shown = not evidence or evidence in current.message
@@ -162,18 +158,14 @@ def alarm_lines(current: CurrentAlarm, now: str = "") -> Text:
 def _transition_line(alarm: Alarm) -> Text:
     by = f" by {alarm.operator_name}" if alarm.operator_name else ""
     why = f"  {probable(alarm.causes)}" if alarm.causes else ""
-    word = Text(
-        f"{alarm.transition.name.replace('_', ' ')}{by}",
-        style=_STYLES.get(alarm.severity, "bold red") if alarm.active else "",
-    )
     return Text.assemble(
-        f"{clock(alarm.t_ns)}  {name_of(alarm)}  {alarm.severity.name:7}  ", word, f"{why}  {alarm.message}"
+        f"{clock(alarm.t_ns)}  {alarm.header.tray} fan {alarm.fan}  {alarm.severity.name:7}  ",
+        (
+            f"{alarm.transition.name.replace('_', ' ')}{by}",
+            STYLES.get(alarm.severity, "bold red") if alarm.active else "",
+        ),
+        f"{why}  {alarm.message}",
     )
-
-
-def name_of(alarm: Alarm) -> str:
-    """The fan, for people."""
-    return f"{alarm.header.tray} fan {alarm.fan}"
 
 
 def probable(causes: Iterable[Diagnosis]) -> str:
@@ -183,43 +175,26 @@ def probable(causes: Iterable[Diagnosis]) -> str:
     )
 
 
-@dataclass
-class _Tray:
-    """What is known of a tray. judged_ns: summed over fans."""
-
-    judged_ns: int = 0
-    since_t_ns: int = 0
-    declared_per_day: float | None = None
-
-
-@dataclass
-class _Past:
-    """Alarms, their rates by tray, and what is not known."""
-
-    alarms: list[Episode]
-    rates: dict[str, ObservedRate]
-    notes: list[str] = field(default_factory=list)
-
-
 def show_history(recordings: Sequence[Path], config: Config | None, *, json_output: bool) -> None:
     """Print the alarms of recordings, or, without any, those that the gateway keeps on this host.
 
     Raises:
         UserError: a recording cannot be read, or there is no gateway's file.
     """
+    notes: list[str] = []
     if recordings:
         with working(f"reading {', '.join(map(str, recordings))}"):
-            past = _recorded(recorded_files(recordings))
+            alarms, by_tray = _recorded(recorded_files(recordings), notes)
     else:
         assert config is not None
-        past = _kept_by_gateway(config)
-    rates = list(past.rates.values())
-    found = {"alarms": [each.as_json() for each in past.alarms], "notes": past.notes}
-    found |= {"rates": {tray: rate.as_json() for tray, rate in past.rates.items()}, "rate": together(rates).as_json()}
-    named = list(past.rates.items()) + ([("together", together(rates))] if len(rates) > 1 else [])
-    lines = [_line(each) for each in past.alarms] or [Text("no alarms", style="green")]
+        alarms, by_tray = _kept_by_gateway(config)
+    rates = list(by_tray.values())
+    found = {"alarms": [each.as_json() for each in alarms], "notes": notes}
+    found |= {"rates": {tray: rate.as_json() for tray, rate in by_tray.items()}, "rate": together(rates).as_json()}
+    named = list(by_tray.items()) + ([("together", together(rates))] if len(rates) > 1 else [])
+    lines = [_line(each) for each in alarms] or [Text("no alarms", style="green")]
     lines += [Text(f"{name}: {_dated(rate)}") for name, rate in named]
-    lines += [Text(note, style="yellow") for note in past.notes]
+    lines += [Text(note, style="yellow") for note in notes]
     show(found, *lines, json_output=json_output)
 
 
@@ -235,106 +210,87 @@ def _line(alarm: Episode) -> Text:
     cause = f"  {with_share(alarm.causes[0])}" if alarm.causes else ""
     by = f" by {alarm.feedback_by}" if alarm.feedback_by else ""
     reason = f": {alarm.feedback_reason}" if alarm.feedback_reason else ""
-    said = "not marked" if alarm.feedback == Feedback.NONE else f"{alarm.feedback.words}{by}{reason}"
+    is_marked = alarm.feedback != Feedback.NONE
     return Text.assemble(
         f"{format_local(alarm.onset_ns)}  {alarm.tray} fan {alarm.fan}  ",
-        (f"{alarm.severity.upper():7}", _STYLES[Severity[alarm.severity.upper()]]),
+        (f"{alarm.severity.upper():7}", STYLES[Severity[alarm.severity.upper()]]),
         f"  {lasted}{cause}  ",
-        (said, "" if alarm.feedback == Feedback.NONE else "bold"),
+        (f"{alarm.feedback.words}{by}{reason}" if is_marked else "not marked", "bold" if is_marked else ""),
     )
 
 
-def _recorded(paths: Sequence[Path]) -> _Past:
-    trays: dict[str, _Tray] = {}
+@dataclass
+class _Tray:
+    """What recordings say of a tray. judged_ns: summed over fans."""
+
+    judged_ns: int = 0
+    since_t_ns: int = 0
+    declared_per_day: float | None = None
+
+
+def _recorded(paths: Sequence[Path], notes: list[str]) -> tuple[list[Episode], dict[str, ObservedRate]]:
+    """The alarms of recordings, and the rates by tray; what two recordings have counts once. notes: is given what is
+    not known."""
+    trays: defaultdict[str, _Tray] = defaultdict(_Tray)
     alarms: dict[tuple[str, str, int], Alarm] = {}
-    without_scores: list[Path] = []
     newest: dict[tuple[str, str], int] = {}
-    for path in _in_order(paths):
+    """by producer and tray, the sequence of the newest score"""
+    for path in sorted(paths, key=_first_score_ns):
         require_no_clip(path, "and a rate from clips says nothing")
         for _, alarm in alarms_in(path):
             alarms[alarm.header.producer, alarm.header.tray, alarm.header.sequence] = alarm
         for envelope in rare_messages(path, "twin"):
             card = envelope.message
             if isinstance(card, ModelCard):
-                trays.setdefault(card.header.tray, _Tray()).declared_per_day = declared_per_day(card.card_json)
+                trays[card.header.tray].declared_per_day = declared_per_day(card.card_json)
         if "score" in read_metadata(path).left_out:
-            without_scores.append(path)
+            notes.append(f"{path}: the recorder has left out the scores, so how long fans were judged is not known")
         for envelope in read_recording(path, ("score",)).undecoded():
-            _add_score(envelope.payload, trays, newest)
-    notes = [
-        f"{path}: the recorder has left out the scores, so how long fans were judged is not known"
-        for path in without_scores
-    ]
-    return _with_rates(episodes(alarms.values()), trays, notes)
-
-
-def _in_order(paths: Iterable[Path]) -> list[Path]:
-    """By their first scores, so that what two of them have counts once."""
-
-    def first_ns(path: Path) -> int:
-        first = next(iter(read_recording(path, ("score",)).undecoded()), None)
-        return first.received_t_ns if first else 0
-
-    return sorted(paths, key=first_ns)
-
-
-def _add_score(payload: bytes, trays: dict[str, _Tray], newest: dict[tuple[str, str], int]) -> None:
-    """newest: by producer and tray, the sequence of the newest score: another recorder may have it, too."""
-    try:
-        score = decode(Score, payload, ("valid",))
-    except CodecError:
-        return
-    tray = trays.setdefault(score.header.tray, _Tray())
-    stream = (score.header.producer, score.header.tray)
-    if score.header.sequence <= newest.get(stream, -1) or not len(score.t_ns):
-        return
-    newest[stream] = score.header.sequence
-    first_t_ns = int(score.t_ns[0])
-    tray.since_t_ns = min(tray.since_t_ns, first_t_ns) if tray.since_t_ns else first_t_ns
-    tray.judged_ns += score.period_ns * int(np.count_nonzero(score.valid))
-
-
-def _with_rates(alarms: Sequence[Episode], trays: dict[str, _Tray], notes: list[str]) -> _Past:
-    for alarm in alarms:
-        trays.setdefault(alarm.tray, _Tray())
-    rates = {
+            with suppress(CodecError):
+                _add_score(decode(Score, envelope.payload, ("valid",)), trays, newest)
+    found = episodes(alarms.values())
+    marks = Counter((each.tray, each.feedback) for each in found)
+    return found, {
         name: ObservedRate(
-            since_t_ns=tray.since_t_ns,
-            fan_hours=tray.judged_ns / NS_PER_HOUR,
-            false_alarms=_count(alarms, name, Feedback.FALSE_ALARM),
-            true_alarms=_count(alarms, name, Feedback.TRUE_ALARM),
-            unmarked=_count(alarms, name, Feedback.NONE),
-            declared_per_day=tray.declared_per_day,
+            since_t_ns=trays[name].since_t_ns,
+            fan_hours=trays[name].judged_ns / NS_PER_HOUR,
+            false_alarms=marks[name, Feedback.FALSE_ALARM],
+            true_alarms=marks[name, Feedback.TRUE_ALARM],
+            unmarked=marks[name, Feedback.NONE],
+            declared_per_day=trays[name].declared_per_day,
         )
-        for name, tray in sorted(trays.items())
+        for name in sorted({*trays, *(each.tray for each in found)})
     }
-    return _Past(list(alarms), rates, notes)
 
 
-def _count(alarms: Iterable[Episode], tray: str, feedback: Feedback) -> int:
-    return sum(each.tray == tray and each.feedback == feedback for each in alarms)
+def _first_score_ns(path: Path) -> int:
+    return next((each.received_t_ns for each in read_recording(path, ("score",)).undecoded()), 0)
 
 
-def _kept_by_gateway(config: Config) -> _Past:
+def _add_score(score: Score, trays: defaultdict[str, _Tray], newest: dict[tuple[str, str], int]) -> None:
+    tray, stream = trays[score.header.tray], (score.header.producer, score.header.tray)
+    if score.header.sequence > newest.get(stream, -1) and len(score.t_ns):
+        newest[stream] = score.header.sequence
+        tray.since_t_ns = min(tray.since_t_ns or math.inf, int(score.t_ns[0]))
+        tray.judged_ns += score.period_ns * int(np.count_nonzero(score.valid))
+
+
+def _kept_by_gateway(config: Config) -> tuple[list[Episode], dict[str, ObservedRate]]:
     """From the files of the gateway's processes in the run folder.
 
     Raises:
         UserError: there is none, or one cannot be read.
     """
     files = [config.run_folder / own_file(shard.name, FILE) for shard in shards_of("gateway", config)]
-    present = [file for file in files if file.exists()]
-    if not present:
+    alarms: list[Alarm] = []
+    rates: dict[str, ObservedRate] = {}
+    for file in filter(Path.exists, files):
+        alarms += [alarm for _, alarm in alarms_in(file)]
+        with closing(AlarmHistory(file, read_only=True)) as kept:
+            rates |= AlarmRates(kept).observed()
+    if not any(map(Path.exists, files)):
         raise UserError(
             f"{files[0]}: no gateway has kept a history of alarms there; take it from recordings: "
             "fantwin alarms --history --recordings FILE..."
         )
-    alarms: list[Alarm] = []
-    rates: dict[str, ObservedRate] = {}
-    for file in present:
-        alarms += [alarm for _, alarm in alarms_in(file)]
-        kept = AlarmHistory(file, read_only=True)
-        try:
-            rates |= AlarmRates(kept).observed()
-        finally:
-            kept.close()
-    return _Past(episodes(alarms), rates)
+    return episodes(alarms), rates

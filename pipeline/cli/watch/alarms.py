@@ -5,7 +5,6 @@ from __future__ import annotations
 import getpass
 import os
 import re
-import threading
 import time
 from datetime import datetime
 from enum import StrEnum
@@ -114,18 +113,14 @@ def alarms(
         raise UsageError("--recordings needs --history: fantwin alarms --history --recordings FILE...")
     if history and (asked or show_all or watch or duration or comment or operator or onset):
         raise UsageError("--history only lists: of the other options it takes --recordings and --json")
-    if history and recordings:
-        show_history(recordings, None, json_output=json_output)
+    settings = None if recordings else load_config(config, overrides or (), stages=())
+    if history or settings is None:
+        show_history(recordings or (), settings, json_output=json_output)
         return
-    settings = load_config(config, overrides or (), stages=())
-    stop = threading.Event()
-    if history:
-        show_history((), settings, json_output=json_output)
-        return
+    if asked is None and (duration or comment or operator or onset):
+        raise UsageError("--for, --comment, --operator and --onset need an action: fantwin alarms ack TRAY FAN")
     if asked is None:
-        if duration or comment or operator or onset:
-            raise UsageError("--for, --comment, --operator and --onset need an action: fantwin alarms ack TRAY FAN")
-        stop_on_signals(stop)
+        stop = stop_on_signals()
         with join_bus(settings, listens=False) as bus:
             show_list(bus, settings, stop, show_all=show_all, watch=watch, json_output=json_output)
         return
@@ -141,7 +136,7 @@ def alarms(
         comment=comment,
         onset_t_ns=_onset_t_ns(asked, onset),
     )
-    stop_on_signals(stop)
+    stop = stop_on_signals()
     with join_bus(settings, listens=False, roles=(OPERATOR,)) as bus:
         watcher = SiteWatcher(bus, settings.site, roles_of(settings))
         wait_for_stages(bus, watcher, settings, stop, tray=name)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from typing import Annotated
 
 import typer
@@ -80,8 +79,7 @@ def command(
     require_commandable(chosen, "")
     number, value = fan
     message = command_of(chosen, {number: value}, is_set_point=set_point)
-    stop = threading.Event()
-    stop_on_signals(stop)
+    stop = stop_on_signals()
     with join_bus(settings, listens=False, roles=(OPERATOR,)) as bus:
         sender = CommandSender(bus, settings.site, chosen.name, stop)
         sender.connect()

@@ -148,8 +148,7 @@ def _works(settings: Config, chosen: Sequence[TrayConfig], output: Path | None) 
 
 def _stopped_by_signals() -> threading.Event:
     """Set when the user wants to stop."""
-    stop = threading.Event()
-    stop_on_signals(stop)
+    stop = stop_on_signals()
     if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # as nohup sets it
         signal.signal(signal.SIGHUP, lambda _number, _frame: stop.set())
     return stop

@@ -126,8 +126,7 @@ def _run(config: Config, overrides: list[str], out: Path, console: Console) -> d
     Raises:
         UserError: it was interrupted, did not start, failed, or did not stop in time.
     """
-    stop = threading.Event()
-    stop_on_signals(stop)
+    stop = stop_on_signals()
     tray = config.trays[0]
     simulate = [
         *("simulate", "--fans", str(tray.fans), "--profile", "manual", "--seed", str(SEED)),

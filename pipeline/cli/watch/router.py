@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from pathlib import Path
 from typing import Annotated
 
@@ -64,8 +63,7 @@ def router(
     bus = _bus(settings, listen)
     credentials = credentials_of(bus, (ROUTER,))
     site = SiteRoles.of(settings) if settings and credentials else None
-    stop = threading.Event()
-    stop_on_signals(stop)
+    stop = stop_on_signals()
     with (
         checked_exposure(bus, lambda line: typer.echo(line, err=True), insecure=insecure),
         open_router(bus.endpoint, credentials, site, bus.zenoh, connect or ()),

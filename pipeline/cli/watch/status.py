@@ -74,8 +74,7 @@ def status(
     Example: fantwin status -c fantwin.toml --stage scorer --shard 2/8
     """
     settings = load_for_any_host(config, overrides or (), stages=())
-    stop = threading.Event()
-    stop_on_signals(stop)
+    stop = stop_on_signals()
     if stage is not None:
         _probe(settings, _process(settings, stage, trays, shard), stop, json_output=json_output)
         return

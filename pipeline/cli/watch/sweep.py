@@ -59,8 +59,7 @@ def sweep(
     require_commandable(chosen, "run `fantwin up` while the fans' own controller varies their commands; it is recorded")
     numbers = _fans(fans, chosen)
     lowest, highest = range_within(chosen, low, high, safe)
-    stop = threading.Event()
-    stop_on_signals(stop)
+    stop = stop_on_signals()
     steps: list[str] = []
 
     def progress(line: str) -> None:

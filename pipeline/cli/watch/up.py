@@ -60,8 +60,7 @@ def up(
 
     Example: fantwin up --only scorer --shard 2/8
     """
-    stop = threading.Event()
-    stop_on_signals(stop)  # first: what follows takes a second or two
+    stop = stop_on_signals()  # first: what follows takes a second or two
     if only is None:
         ignore_hangup()
         if until_stdin_closes:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import threading
 from collections.abc import Iterable
 from datetime import datetime
 from pathlib import Path
@@ -60,8 +59,7 @@ def wear(
         nothing = f"no wear in {', '.join(map(str, recordings))}: a scorer records it regularly and when it stops"
     else:
         settings, damage = load_config(config, overrides or (), stages=()), []
-        stop = threading.Event()
-        stop_on_signals(stop)
+        stop = stop_on_signals()
         with join_bus(settings, listens=False) as bus:
             watcher = SiteWatcher(bus, settings.site, roles_of(settings))
             wait_for_stages(bus, watcher, settings, stop, what="wear")

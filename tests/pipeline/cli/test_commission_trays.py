@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+import threading
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -128,7 +129,7 @@ def played(tmp_path: Path, endpoint: str, monkeypatch: pytest.MonkeyPatch) -> Pl
     played.configuration.write_text(text, encoding="utf-8")
     for name, value in (("now_s", 0.0), ("count", 0), ("still", ())):
         monkeypatch.setattr(PlayedSite, name, value)
-    monkeypatch.setattr(commission, "stop_on_signals", lambda _stop: None)  # this process has its own
+    monkeypatch.setattr(commission, "stop_on_signals", threading.Event)  # this process has its own
     monkeypatch.setattr(commissioning, "RecordingSite", PlayedSite)
     monkeypatch.setattr(commissioning, "time", SimpleNamespace(monotonic=lambda: PlayedSite.now_s))
     for name in ("run", "check"):

@@ -27,14 +27,14 @@ KEEP = float("nan")
 @contextmanager
 def simulated(folder: Path, *words: Path, **options: Any) -> Iterator[tuple[threading.Event, threading.Thread]]:
     """`fantwin simulate` in a thread, once its line is there, and what stops it; link and truth lie in the folder."""
-    stops: list[threading.Event] = []
+    stop = threading.Event()
     files = {"link": folder / "tray", "truth": folder / "truth.json", "wait": True}
     thread = threading.Thread(target=simulate, args=words, kwargs=files | options)
-    with patch("fantwin.pipeline.cli.simulation.simulate.stop_on_signals", stops.append):
+    with patch("fantwin.pipeline.cli.simulation.simulate.stop_on_signals", lambda: stop):
         thread.start()
         eventually((folder / "tray").is_symlink, "the line is there")
-    yield stops[0], thread
-    stops[0].set()
+    yield stop, thread
+    stop.set()
     thread.join(10.0)
     assert not thread.is_alive()
 

@@ -194,7 +194,7 @@ def test_row_04_a_source_that_raises_while_it_is_stopped_does_not_keep_the_stage
 BLOCKED = """
 import ctypes, threading
 from fantwin.pipeline.runtime.signals import stop_on_signals
-stop_on_signals(threading.Event())
+stop_on_signals()
 libc, mutex = ctypes.CDLL(None), ctypes.create_string_buffer(64)
 libc.pthread_mutex_lock(mutex)
 print("blocked", flush=True)
