@@ -11,18 +11,18 @@ import signal
 import subprocess
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from fantwin.pipeline.bus.publisher import Publisher
-from fantwin.pipeline.selftest.scratch_site import FANS, SITE, STAGES, TRAY, NotKept, ScratchSite
+from fantwin.pipeline.selftest.scratch_site import FANS, GO_ON_LIMIT_S, SITE, STAGES, TRAY, NotKept, ScratchSite
 from fantwin.schemas.codec import encode, type_name
 from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Raw
 from fantwin.schemas.topics import BY_NAME, tray_key
 
-REPLACED_LIMIT_S = 60.0
 SILENCE = "no raw samples"
 STALL_S = 8.0
 FAR_AHEAD_S = 3600.0
@@ -59,22 +59,6 @@ def _require(condition: object, otherwise: str) -> None:
         raise NotKept(otherwise)
 
 
-def _judged(site: ScratchSite, after: str = "") -> float:
-    """Seconds until all fans were judged again. after: what, for people."""
-    took_s = site.seconds_until_judged(REPLACED_LIMIT_S)
-    if took_s is None:
-        raise NotKept(f"judging did not go on within {REPLACED_LIMIT_S:.0f} s{after}")
-    return took_s
-
-
-def _replaced(site: ScratchSite, label: str, old: int) -> float:
-    """Seconds until another process ran a stage."""
-    took_s = site.replaced(label, old, REPLACED_LIMIT_S)
-    if took_s is None:
-        raise NotKept(f"{label} was not restarted within {REPLACED_LIMIT_S:.0f} s")
-    return took_s
-
-
 def _stranger(site: ScratchSite) -> Publisher:
     return site.bus.publisher(tray_key(SITE, TRAY, "raw"), BY_NAME["raw"], type_name(Raw), "stranger")
 
@@ -97,8 +81,8 @@ def _kills(site: ScratchSite) -> str:
     for label in STAGES:
         old = site.process_id(label)
         os.kill(old, signal.SIGKILL)
-        took_s = _replaced(site, label, old)
-        _judged(site, f" after {label} was restarted")
+        took_s = site.seconds_until_replaced(label, old)
+        site.seconds_until_judged(after=f" after {label} was restarted")
         seen.append(f"{label} {took_s:.1f} s")
     return "back after " + ", ".join(seen)
 
@@ -108,7 +92,7 @@ def _hang(site: ScratchSite) -> str:
     old = site.process_id(label)
     os.kill(old, signal.SIGSTOP)
     try:
-        return f"killed and restarted after {_replaced(site, label, old):.0f} s"
+        return f"killed and restarted after {site.seconds_until_replaced(label, old):.0f} s"
     except NotKept:
         os.kill(old, signal.SIGCONT)
         raise
@@ -116,9 +100,11 @@ def _hang(site: ScratchSite) -> str:
 
 def _silence(site: ScratchSite) -> str:
     site.line.is_cut = True
-    took_s = site.seconds_until(lambda: SILENCE in site.problem("resampler"), 20.0)
-    site.line.is_cut = False
-    _require(took_s is not None, f"the resampler did not report {SILENCE!r} within 20 s")
+    try:
+        otherwise = f"the resampler did not report {SILENCE!r}"
+        took_s = site.seconds_until(lambda: SILENCE in site.problem("resampler"), 20.0, otherwise)
+    finally:
+        site.line.is_cut = False
     return f"reported by the resampler after {took_s:.1f} s"
 
 
@@ -126,12 +112,12 @@ def _backlog(site: ScratchSite) -> str:
     site.line.is_held = True
     threading.Event().wait(STALL_S)
     site.line.is_held = False
-    return f"judged again {_judged(site):.1f} s after the line was back"
+    return f"judged again {site.seconds_until_judged():.1f} s after the line was back"
 
 
 def _noise(site: ScratchSite) -> str:
     site.line.inject(bytes((index * 197 + index // 256 * 31) % 256 for index in range(NOISE_BYTES)))
-    return f"{NOISE_BYTES:,} bytes of noise skipped; judged again after {_judged(site):.1f} s"
+    return f"{NOISE_BYTES:,} bytes of noise skipped; judged again after {site.seconds_until_judged():.1f} s"
 
 
 def _garbage(site: ScratchSite) -> str:
@@ -139,7 +125,7 @@ def _garbage(site: ScratchSite) -> str:
     lost = sum(site.watcher.losses().values())
     for _ in range(GARBAGE_MESSAGES):
         publisher.put(b"\xff\xfe no message")
-    _judged(site)
+    site.seconds_until_judged()
     more = sum(site.watcher.losses().values()) - lost
     _require(not more, f"counted as {more} losses of this site")
     return f"{GARBAGE_MESSAGES:,} undecodable messages, none counted as a loss"
@@ -149,14 +135,14 @@ def _far_ahead(site: ScratchSite) -> str:
     view = site.view("resampler")
     assert view
     _stranger(site).put(encode(_forged(view.health.t_ns + round(FAR_AHEAD_S * 1e9))))
-    return f"refused; judging went on (the next hundred samples took {_judged(site):.1f} s)"
+    return f"refused; judging went on (the next hundred samples took {site.seconds_until_judged():.1f} s)"
 
 
 def _second_owner(site: ScratchSite) -> str:
     for words in (("up",), ("up", "--only", "acquisition")):
         what = f"fantwin {' '.join(words)}"
         try:
-            done = site.command(*words, *site.configured(), limit_s=REPLACED_LIMIT_S)
+            done = site.command(*words, *site.configured(), limit_s=GO_ON_LIMIT_S)
         except subprocess.TimeoutExpired as error:
             raise NotKept(f"a second `{what}` was not refused") from error
         _require(done.returncode == 1, f"a second `{what}` ended with exit code {done.returncode}, not 1")
@@ -167,26 +153,23 @@ def _second_owner(site: ScratchSite) -> str:
 def _recording_deleted(site: ScratchSite) -> str:
     for path in site.run_folder.glob("*.active"):
         path.unlink()
-    took_s = site.seconds_until(lambda: list(site.run_folder.glob("*.active")), 20.0)
-    _require(took_s is not None, "no recording file was there again within 20 s")
+    otherwise = "no recording file was there again"
+    took_s = site.seconds_until(lambda: list(site.run_folder.glob("*.active")), 20.0, otherwise)
     return f"a recording file was there again after {took_s:.1f} s"
 
 
 def _full_disk(site: ScratchSite) -> str:
     ballast = site.run_folder / "ballast"
-    with ballast.open("wb", buffering=0) as file:
-        try:
-            while True:
-                file.write(bytes(1 << 16))
-        except OSError:  # full
-            pass
-    took_s = site.seconds_until(lambda: site.problem("recorder"), REPLACED_LIMIT_S)
-    _require(took_s, "the recorder did not report the full disk")
+    with ballast.open("wb", buffering=0) as file, suppress(OSError):  # until it is full
+        while True:
+            file.write(bytes(1 << 16))
+    otherwise = "the recorder did not report the full disk"
+    took_s = site.seconds_until(lambda: site.problem("recorder"), GO_ON_LIMIT_S, otherwise)
     reported = site.problem("recorder")
-    _judged(site, " while the disk was full")
+    site.seconds_until_judged(after=" while the disk was full")
     ballast.unlink()
-    again_s = site.seconds_until(lambda: not site.problem("recorder"), REPLACED_LIMIT_S)
-    _require(again_s, f"recording did not resume after room was made: {site.problem('recorder')}")
+    otherwise = "recording did not resume after room was made"
+    again_s = site.seconds_until(lambda: not site.problem("recorder"), GO_ON_LIMIT_S, otherwise)
     return f"reported after {took_s:.1f} s ({reported}); recording resumed {again_s:.1f} s after room was made"
 
 
@@ -195,7 +178,7 @@ def _strangers(site: ScratchSite) -> str:
     publisher = _stranger(site)
     for number in range(STRANGERS):
         publisher.put(encode(replace(_forged(0), header=Header(f"stranger-{number}", 0, TRAY))))
-    judged_s = _judged(site)
+    judged_s = site.seconds_until_judged()
     grown = max(site.memory_bytes(label) - before[label] for label in STAGES) / 1e6
     _require(grown < STRANGERS_LIMIT_MB, f"a stage grew by {grown:.0f} MB")
     return f"judged again {judged_s:.1f} s after {STRANGERS:,} messages; no stage grew by more than {grown:.0f} MB"
@@ -203,19 +186,19 @@ def _strangers(site: ScratchSite) -> str:
 
 def _clock_back(site: ScratchSite) -> str:
     site.set_clock(-FAR_AHEAD_S)
-    judged_s = _judged(site)
+    judged_s = site.seconds_until_judged()
     old = {label: site.process_id(label) for label in (STAGES[0], "resampler")}
     for process_id in old.values():
         os.kill(process_id, signal.SIGKILL)
     for label, process_id in old.items():
-        _replaced(site, label, process_id)
-    again_s = _judged(site, " after acquisition and resampler were restarted")
+        site.seconds_until_replaced(label, process_id)
+    again_s = site.seconds_until_judged(after=" after acquisition and resampler were restarted")
     return f"judged again after {judged_s:.1f} s, and {again_s:.1f} s after acquisition and resampler were restarted"
 
 
 def _clock_forward(site: ScratchSite) -> str:
     site.set_clock(FAR_AHEAD_S)
-    return f"judged again after {_judged(site):.1f} s"
+    return f"judged again after {site.seconds_until_judged():.1f} s"
 
 
 SCENARIOS = (

@@ -12,9 +12,8 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 from fantwin.pipeline.bus.session import Bus
@@ -27,7 +26,7 @@ from fantwin.pipeline.sources.simulated.device import Device, PseudoTerminal, pl
 from fantwin.schemas.codec import decode
 from fantwin.schemas.enums import Transition
 from fantwin.schemas.messages import Alarm, Score
-from fantwin.schemas.topics import tray_key
+from fantwin.schemas.topics import stage_label, tray_key
 from fantwin.schemas.units import RAD_S_PER_UNIT
 
 FANTWIN = (sys.executable, "-P", "-m", "fantwin")
@@ -35,6 +34,8 @@ CONFIGURATION = Path(__file__).parents[1] / "demo" / "demo.toml"
 SITE, TRAY, FANS = "demo", "tray1", 8
 STAGES = (f"acquisition/{TRAY}", "resampler", "twin_integrator", "scorer", "recorder")
 START_LIMIT_S = 60.0
+GO_ON_LIMIT_S = 60.0
+"""until judging goes on after a fault"""
 _POLL_S = 0.05
 _WRITE_BYTES = 1024
 """bytes in one write: a pseudo-terminal accepts a write of this size completely or not at all"""
@@ -81,17 +82,17 @@ class ScratchSite:
         self.run_folder = folder / "runs"
         """what the stages write"""
         self.run_folder.mkdir(exist_ok=True)
-        self.endpoint = f"tcp/127.0.0.1:{free_port()}"
         self.overrides = (
             *(f"run_folder={json.dumps(str(self.run_folder))}", f"tray.0.port={json.dumps(str(folder / 'tray'))}"),
-            *(f"bus.endpoint='{self.endpoint}'", "launcher.stages=" + json.dumps([s.split("/")[0] for s in STAGES])),
+            f"bus.endpoint='tcp/127.0.0.1:{free_port()}'",
+            "launcher.stages=" + json.dumps([stage.split("/")[0] for stage in STAGES]),
             *settings,
         )
         self.line = DisturbedLine(folder / "tray")
         self._unplugged = threading.Event()
         self._device = threading.Thread(target=self._play, args=(device,), daemon=True)
         self._clock_file = folder / "clock"
-        self.up: subprocess.Popen[str] | None = None
+        self._ending = ExitStack()
         self.raised: list[Alarm] = []
         """the alarms raised so far"""
         self.judged = 0
@@ -101,41 +102,38 @@ class ScratchSite:
         set_offset_ns(self._clock_file, 0)
         code = "from fantwin.pipeline.selftest import stepped_clock\n\nstepped_clock.install()\n"
         (self.folder / "sitecustomize.py").write_text(code, encoding="utf-8")
-        self.bus = Bus(load_config(CONFIGURATION, self.overrides).bus, listens=False)
-        self.watcher = SiteWatcher(self.bus, SITE)
-        self._log = (self.folder / "up.log").open("w", encoding="utf-8")
-        try:
+        path = os.pathsep.join(filter(None, (str(self.folder), os.environ.get("PYTHONPATH", ""))))
+        environment = {**os.environ, VARIABLE: str(self._clock_file), "PYTHONPATH": path}
+        with self._ending as ending:
+            log = ending.enter_context((self.folder / "up.log").open("w", encoding="utf-8"))
+            self.bus = ending.enter_context(Bus(load_config(CONFIGURATION, self.overrides).bus, listens=False))
+            self.watcher = SiteWatcher(self.bus, SITE)
             self.bus.subscribe(tray_key(SITE, "*", "alarm"), self._on_alarm)
             self.bus.subscribe(tray_key(SITE, "*", "score"), self._on_score)
-            self._start()
-        except BaseException:
-            self.__exit__(None, None, None)
-            raise
+            ending.callback(self.line.close)
+            ending.callback(self._unplug)
+            self._device.start()
+            up = ("up", *self.configured(), "--json")
+            self.up = started(up, stdout=subprocess.PIPE, stderr=log, env=environment)
+            ending.callback(self._kill)
+            try:
+                self.seconds_until_judged(START_LIMIT_S)
+            except NotKept as error:
+                raise UserError(f"the site of the self-test did not start: {error}: {self.last_line()}") from error
+            self._ending = ending.pop_all()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_error: object) -> None:
+        self._ending.close()
+
+    def _kill(self) -> None:
+        """All its processes, if they run."""
         stages = [view.health.process_id for view in self.watcher.stages() if view.alive]
-        if self.up:
-            self.up.kill()
-            self.up.wait()
+        self.up.kill()
+        self.up.wait()
         for process_id in stages:
             with suppress(ProcessLookupError):
                 os.kill(process_id, signal.SIGKILL)
-        self._unplug()
-        self.line.close()
-        self.bus.close()
-        self._log.close()
-
-    def _start(self) -> None:
-        self._device.start()
-        path = os.pathsep.join(filter(None, (str(self.folder), os.environ.get("PYTHONPATH", ""))))
-        environment = {**os.environ, VARIABLE: str(self._clock_file), "PYTHONPATH": path}
-        up = ("up", *self.configured(), "--json")
-        self.up = started(up, stdout=subprocess.PIPE, stderr=self._log, env=environment)
-        if self.seconds_until_judged(START_LIMIT_S) is None:
-            raise UserError(f"the site of the self-test did not start within {START_LIMIT_S:.0f} s: {self.last_line()}")
 
     def _play(self, device: Device) -> None:
         wait_for_reader(self.line, "binary", self._unplugged)
@@ -143,8 +141,7 @@ class ScratchSite:
 
     def _unplug(self) -> None:
         self._unplugged.set()
-        if self._device.is_alive():
-            self._device.join()
+        self._device.join()
 
     def configured(self) -> tuple[str, ...]:
         """The words that give a command this site's configuration."""
@@ -171,10 +168,8 @@ class ScratchSite:
 
     def view(self, label: str) -> StageView | None:
         """The stage as it reports itself; None if it has not."""
-        stage, _, tray = label.partition("/")
-        instance = tray or "all"
         views = self.watcher.stages()
-        return next((v for v in views if (v.health.stage, v.health.instance) == (stage, instance)), None)
+        return next((each for each in views if stage_label(each.health.stage, each.health.instance) == label), None)
 
     def process_id(self, label: str) -> int:
         """The process of a stage.
@@ -197,28 +192,40 @@ class ScratchSite:
         pages = Path(f"/proc/{self.process_id(label)}/statm").read_text(encoding="ascii").split()[1]
         return int(pages) * os.sysconf("SC_PAGE_SIZE")
 
-    def seconds_until(self, condition: Callable[[], Any], limit_s: float) -> float | None:
-        """How long it took until the condition held; None if it did not within the limit."""
+    def seconds_until(self, condition: Callable[[], Any], limit_s: float, otherwise: str) -> float:
+        """How long it took until the condition held.
+
+        Raises:
+            NotKept: it did not within the limit; `otherwise` says what that means.
+        """
         began_s = time.monotonic()
         while not condition():
             if time.monotonic() - began_s > limit_s:
-                return None
+                raise NotKept(f"{otherwise} within {limit_s:.0f} s")
             time.sleep(_POLL_S)
         return time.monotonic() - began_s
 
-    def seconds_until_judged(self, limit_s: float = 30.0) -> float | None:
-        """Seconds until another hundred samples of all fans have been judged; None if the limit passed first."""
-        before = self.judged
-        return self.seconds_until(lambda: self.judged >= before + 100, limit_s)
+    def seconds_until_judged(self, limit_s: float = GO_ON_LIMIT_S, after: str = "") -> float:
+        """Seconds until another hundred samples of all fans have been judged. after: what, for people.
 
-    def replaced(self, label: str, old_process_id: int, limit_s: float) -> float | None:
-        """Seconds until a new process runs the stage; None if none did within the limit."""
+        Raises:
+            NotKept: the limit passed first.
+        """
+        before = self.judged
+        return self.seconds_until(lambda: self.judged >= before + 100, limit_s, f"judging did not go on{after}")
+
+    def seconds_until_replaced(self, label: str, old_process_id: int) -> float:
+        """Seconds until a new process runs the stage.
+
+        Raises:
+            NotKept: none does.
+        """
 
         def is_new() -> bool:
             view = self.view(label)
             return view is not None and view.alive and view.health.process_id != old_process_id
 
-        return self.seconds_until(is_new, limit_s)
+        return self.seconds_until(is_new, GO_ON_LIMIT_S, f"{label} was not restarted")
 
     def last_line(self) -> str:
         """The last line of what the processes have printed."""
@@ -230,7 +237,6 @@ class ScratchSite:
         Raises:
             NotKept: it does not stop.
         """
-        assert self.up
         self.up.send_signal(signal.SIGINT)
         try:
             output, _ = self.up.communicate(timeout=START_LIMIT_S)

@@ -13,7 +13,6 @@ from fantwin.pipeline.selftest.scenarios import SMALL_DISK_BYTES, Scenario
 from fantwin.pipeline.selftest.scratch_site import NotKept, ScratchSite
 from fantwin.pipeline.sources.simulated.device import Device
 
-BACK_LIMIT_S = 60.0
 LOST = 3
 """exit code where all is in order but what was lost, as the last messages of a killed acquisition may be"""
 VERIFY_LIMIT_S = 1800.0
@@ -30,28 +29,22 @@ class Row:
     kept: bool | None
 
 
-def run_scenarios(
-    folder: Path, scenarios: Sequence[Scenario], device: Callable[[], Device], report: Callable[[Row], None]
-) -> list[Row]:
-    """Run them in order. device: makes the tray of a site. report: is called with each row when it is known."""
-    rows: list[Row] = []
-
-    def add(row: Row) -> None:
-        rows.append(row)
-        report(row)
-
-    for number, group in enumerate(_by_site(scenarios), start=1):
+def run_scenarios(folder: Path, scenarios: Sequence[Scenario], device: Callable[[], Device]) -> Iterator[Row]:
+    """Run them in order, those first that share a site; yields each row when it is known. device: makes the tray of a
+    site."""
+    shared = [scenario for scenario in scenarios if not scenario.needs_own_site]
+    groups = [*([shared] if shared else []), *([each] for each in scenarios if each.needs_own_site)]
+    for number, group in enumerate(groups, start=1):
         place = folder / f"site-{number}"
         (place / "runs").mkdir(parents=True)
         with small_disk(place / "runs", any(scenario.needs_small_disk for scenario in group)) as is_there:
             if not is_there:
-                add(Row(group[0].name, group[0].promise, "not run: only root may mount a small disk", kept=None))
+                yield Row(group[0].name, group[0].promise, "not run: only root may mount a small disk", kept=None)
                 continue
             with ScratchSite(place, device(), *(each for scenario in group for each in scenario.settings)) as site:
                 for scenario in group:
-                    add(run_scenario(site, scenario))
-                add(account(site, ", ".join(scenario.name for scenario in group)))
-    return rows
+                    yield run_scenario(site, scenario)
+                yield account(site, ", ".join(scenario.name for scenario in group))
 
 
 @contextmanager
@@ -70,41 +63,48 @@ def small_disk(place: Path, is_needed: bool) -> Iterator[bool]:
         subprocess.run(["umount", "-l", str(place)], capture_output=True, check=False)
 
 
-def _by_site(scenarios: Sequence[Scenario]) -> list[list[Scenario]]:
-    """The scenarios that share a site, and then each that needs its own."""
-    shared = [scenario for scenario in scenarios if not scenario.needs_own_site]
-    return [*([shared] if shared else []), *([each] for each in scenarios if each.needs_own_site)]
-
-
 def run_scenario(site: ScratchSite, scenario: Scenario) -> Row:
     """Run one scenario on a running site; afterwards all fans must be judged again, without a new alarm."""
-    alarms = len(site.raised)
-    try:
-        seen = scenario.run(site)
-        if site.seconds_until_judged(BACK_LIMIT_S) is None:
-            raise NotKept(f"{seen}; but not all fans were judged again within {BACK_LIMIT_S:.0f} s")
+
+    def seen() -> str:
+        alarms = len(site.raised)
+        found = scenario.run(site)
+        try:
+            site.seconds_until_judged()
+        except NotKept as result:
+            raise NotKept(f"{found}; but {result}") from result
         if len(site.raised) > alarms:
-            raise NotKept(f"{seen}; but {len(site.raised) - alarms} healthy fans raised an alarm")
-    except NotKept as result:
-        return Row(scenario.name, scenario.promise, str(result), kept=False)
-    return Row(scenario.name, scenario.promise, seen, kept=True)
+            raise NotKept(f"{found}; but {len(site.raised) - alarms} healthy fans raised an alarm")
+        return found
+
+    return _row(scenario.name, scenario.promise, seen)
 
 
 def account(site: ScratchSite, names: str) -> Row:
     """Stop the site and verify its recording. names: of the scenarios that ran on it."""
-    name, promise = f"shutdown after {names}", "it stops in order, and its recording replays to the same decisions"
+    promise = "it stops in order, and its recording replays to the same decisions"
+    return _row(f"shutdown after {names}", promise, lambda: _accounted(site))
+
+
+def _row(name: str, promise: str, seen: Callable[[], str]) -> Row:
     try:
-        status, outcome = site.stop()
+        return Row(name, promise, seen(), kept=True)
     except NotKept as result:
         return Row(name, promise, str(result), kept=False)
+
+
+def _accounted(site: ScratchSite) -> str:
+    status, outcome = site.stop()
     if status not in (0, LOST):
-        return Row(name, promise, f"exit code {status}: {site.last_line()}", kept=False)
+        raise NotKept(f"exit code {status}: {site.last_line()}")
     try:
         verified = site.command("replay", "--offline", "--verify", *site.recordings(), limit_s=VERIFY_LIMIT_S)
-    except subprocess.TimeoutExpired:
-        return Row(name, promise, f"the recording was not verified within {VERIFY_LIMIT_S:.0f} s", kept=False)
+    except subprocess.TimeoutExpired as error:
+        raise NotKept(f"the recording was not verified within {VERIFY_LIMIT_S:.0f} s") from error
     lines = (verified.stdout.strip() or verified.stderr.strip()).splitlines()
     compared = [line.strip() for line in lines if line.startswith(("equal:", "not comparable:"))] or lines[-1:]
     lost = ", ".join(f"{stage} {count}" for stage, count in outcome["lost"].items() if count)
     seen = f"lost: {lost or 'nothing'}; {' '.join(compared)}"
-    return Row(name, promise, seen, kept=verified.returncode in (0, LOST))
+    if verified.returncode not in (0, LOST):
+        raise NotKept(seen)
+    return seen

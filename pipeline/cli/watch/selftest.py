@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
-from rich.table import Table
 from rich.text import Text
 
 from fantwin.pipeline.cli.options import JsonOption
@@ -58,9 +57,15 @@ def selftest(
         if out and out.exists() and any(out.iterdir()):
             raise UserError(f"{out}: is not empty; name a new folder with -o")
         with working(f"running {len(chosen)} scenarios"):
-            rows = run_scenarios(folder, chosen, simulated_tray, lambda row: console.print(_line(row), markup=False))
+            rows: list[Row] = []
+            for row in run_scenarios(folder, chosen, simulated_tray):
+                console.print(f"{_STATES[row.kept]:8}  {row.name}: {row.seen}", markup=False)
+                rows.append(row)
     is_kept = all(row.kept is not False for row in rows)
-    show({"rows": [asdict(row) for row in rows], "kept": is_kept}, _table(rows), json_output=json_output)
+    table = table_of([""], (), ("scenario", "promised", "seen"))
+    for row in rows:
+        table.add_row(Text(_STATES[row.kept], style=_STYLES[row.kept]), row.name, row.promise, row.seen)
+    show({"rows": [asdict(row) for row in rows], "kept": is_kept}, table, json_output=json_output)
     if not is_kept:
         raise typer.Exit(1)
 
@@ -76,14 +81,3 @@ def _chosen(names: list[str] | tuple[str, ...]) -> list[Scenario]:
         if name not in by_name:
             raise UsageError(f"no scenario {name!r}{nearest(name, by_name)}")
     return [by_name[name] for name in names] or list(SCENARIOS)
-
-
-def _line(row: Row) -> str:
-    return f"{_STATES[row.kept]:8}  {row.name}: {row.seen}"
-
-
-def _table(rows: list[Row]) -> Table:
-    table = table_of([""], (), ("scenario", "promised", "seen"))
-    for row in rows:
-        table.add_row(Text(_STATES[row.kept], style=_STYLES[row.kept]), row.name, row.promise, row.seen)
-    return table
