@@ -13,22 +13,21 @@ import subprocess
 import threading
 import time
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from itertools import count
 from pathlib import Path
 from tempfile import TemporaryFile
-from types import TracebackType
 from typing import Any, Self
 
 import typer
 
+from fantwin.pipeline.acquisition.raw_samples import RawSamples
 from fantwin.pipeline.bus.session import join_bus
 from fantwin.pipeline.config.registry import RECORDER
 from fantwin.pipeline.config.settings import Config, TrayConfig
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.selftest.scratch_site import lines_of, started
-from fantwin.schemas.codec import CodecError, decode
 from fantwin.schemas.messages import Raw
-from fantwin.schemas.topics import tray_key
 
 RECORDING_ONLY = (
     *("--set", f"launcher.stages={json.dumps(['acquisition', 'resampler', 'recorder'])}"),
@@ -58,14 +57,34 @@ class Commands:
         self.say = say
         self.to_standard_error = to_standard_error
 
-    def run(self, *words: object, site: RecordingSite | None = None) -> None:
-        """Run a command to its end. site: of which it needs the samples.
+    def run(self, *words: object, site: RecordingSite | None = None, findings: Any = None) -> None:
+        """Run a command to its end; it ends early if its site does or the user wants to stop.
+
+        Args:
+            words: the command.
+            site: of which it needs the samples.
+            findings: a file for what it prints.
 
         Raises:
             Stopped: the user wants to stop.
             UserError: it failed, and has said why.
         """
-        self._run(words, STANDARD_ERROR if self.to_standard_error else None, site)
+        line = [str(word) for word in words]
+        self.say(f"fantwin {shlex.join(line)}")
+        child = started(line, stdout=findings or (STANDARD_ERROR if self.to_standard_error else None))
+        while child.poll() is None:
+            is_stopped = self.stop.wait(_POLL_S)
+            if site:
+                site.samples.take()  # nobody else does
+            if is_stopped or (site and site.has_ended):
+                child.send_signal(signal.SIGINT)
+                child.wait()
+        if self.stop.is_set():
+            raise Stopped
+        if site:
+            site.check()
+        if child.returncode:
+            raise UserError(f"`fantwin {line[0]}` failed (exit code {child.returncode}) and has said why")
 
     def check(self, *words: object) -> None:
         """Run a command that prints what it finds; if it fails, that is the reason, and goes to standard error.
@@ -75,33 +94,11 @@ class Commands:
         with TemporaryFile("w+", encoding="utf-8") as findings:
             failed = True
             try:
-                self._run(words, findings)
+                self.run(*words, findings=findings)
                 failed = False
             finally:
                 findings.seek(0)
                 typer.echo(findings.read(), nl=False, err=failed or self.to_standard_error)
-
-    def _run(self, words: Sequence[object], stdout: Any, site: RecordingSite | None = None) -> None:
-        line = [str(word) for word in words]
-        self.say(f"fantwin {shlex.join(line)}")
-        child = started(line, stdout=stdout)
-        self.wait(child, site)
-        if child.returncode:
-            raise UserError(f"`fantwin {line[0]}` failed (exit code {child.returncode}) and has said why")
-
-    def wait(self, child: subprocess.Popen[str], site: RecordingSite | None = None) -> None:
-        """Wait for its end, and end it early if its site ends or the user wants to stop."""
-        while child.poll() is None:
-            is_stopped = self.stop.wait(_POLL_S)
-            if site:
-                site.discard_samples()
-            if is_stopped or (site and site.has_ended):
-                child.send_signal(signal.SIGINT)
-                child.wait()
-        if self.stop.is_set():
-            raise Stopped
-        if site:
-            site.check()
 
 
 class RecordingSite:
@@ -118,9 +115,8 @@ class RecordingSite:
         file = f"recorder.file={json.dumps(str(next_recording_file(config)))}"
         self._words = ["up", *configured, "--json", "--until-stdin-closes", *RECORDING_ONLY, "--set", file]
         self._log = log
-        self._received: list[bytes] = []
         self._last_sample_s = dict.fromkeys(self._fans, time.monotonic())
-        self._lock = threading.Lock()
+        self._ending = ExitStack()
         self.recordings: list[Path] = []
         """after the end"""
         self.lost: dict[str, int] = {}
@@ -129,35 +125,24 @@ class RecordingSite:
     def __enter__(self) -> Self:
         with self._log.open("a", encoding="utf-8") as log:
             self._up = started(self._words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log)
-        try:
-            self._bus = join_bus(self._config, listens=False)
-            for tray in self._fans:
-                self._bus.subscribe(tray_key(self._config.site, tray, "raw"), self._take)
-        except BaseException:
-            self._end()
-            raise
+        with self._ending as ending:
+            ending.callback(self._end)
+            bus = ending.enter_context(join_bus(self._config, listens=False))
+            self.samples = RawSamples(bus, self._config.site, self._fans)
+            self._ending = ending.pop_all()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._bus.close()
-        self._end()
-        if error is None:
-            if self._up.returncode not in (0, 3):
-                raise self._failed()
-            if not self.recordings:
-                raise UserError(f"nothing was recorded (all lines: {self._log})")
+    def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
+        self._ending.close()
+        if error is None and self._up.returncode not in (0, 3):
+            raise self._failed()
+        if error is None and not self.recordings:
+            raise UserError(f"nothing was recorded (all lines: {self._log})")
 
     @property
     def has_ended(self) -> bool:
         """Whether it has, by itself."""
         return self._up.poll() is not None
-
-    def discard_samples(self) -> None:
-        """Forget those that have arrived since the last call of `wait`."""
-        with self._lock:
-            self._received.clear()
 
     def check(self) -> None:
         """Raises UserError if the site has ended."""
@@ -179,14 +164,8 @@ class RecordingSite:
         if self._commands.stop.wait(seconds):
             raise Stopped
         self.check()
-        with self._lock:
-            received, self._received = self._received, []
-        samples = [
-            message
-            for message in map(_raw, received)
-            if message is not None and message.fans == self._fans.get(message.header.tray)
-        ]
-        self._last_sample_s |= dict.fromkeys((message.header.tray for message in samples), time.monotonic())
+        samples = [sample for sample in self.samples.take() if sample.fans == self._fans.get(sample.header.tray)]
+        self._last_sample_s |= dict.fromkeys((sample.header.tray for sample in samples), time.monotonic())
         silences = [self.silence_of(tray) for tray in self._fans]
         if all(silences):
             raise UserError(silences[0])
@@ -208,10 +187,6 @@ class RecordingSite:
     def _failed(self) -> UserError:
         return UserError(f"recording failed: {lines_of(self._log)[-1]} (all lines: {self._log})")
 
-    def _take(self, _key: str, payload: bytes) -> None:
-        with self._lock:
-            self._received.append(payload)
-
 
 def next_recording_file(config: Config) -> Path:
     """The name of a recording in a new folder of its own, relative to the run folder.
@@ -223,11 +198,3 @@ def next_recording_file(config: Config) -> Path:
     folders = (file.with_name(f"commissioned-{number}") for number in count(1))
     free = next(folder for folder in folders if not (config.run_folder / folder).exists())
     return free / f"{free.name}.mcap"
-
-
-def _raw(payload: bytes) -> Raw | None:
-    try:
-        message = decode(Raw, payload)
-    except CodecError:
-        return None
-    return message if isinstance(message, Raw) else None

@@ -6,7 +6,6 @@ import json
 import os
 import shlex
 import signal
-import threading
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -96,11 +95,21 @@ def commission(
     settings = load_config(config, overrides or (), stages=(RECORDER,))
     chosen = [settings.tray(name) for name in dict.fromkeys(tray or ())] or list(settings.trays)
     works = _works(settings, chosen, output)
+    given = {"--low": low, "--high": high, "--safe": safe}
+    options = [word for name, value in given.items() if value is not None for word in (name, repr(value))]
+    if options and not sweep:
+        raise UsageError(f"{options[0]} needs --sweep, which moves the fans: add --sweep")
     for work in works:
-        _refuse_wrong_range(config, work.tray, sweep, low, high, safe)
-    _refuse_what_cannot_end_well(settings, works)
+        _refuse_what_cannot_end_well(settings, work, "-o" if len(works) == 1 else f"--tray {work.name} -o")
+        if sweep:
+            instead = "leave out --sweep, and let the fans' own controller vary their commands meanwhile"
+            require_commandable(work.tray, instead)
+            range_within(work.tray, low, high, safe)
+    _refuse_site_that_cannot_end_well(settings, works)
     configured = ["-c", str(config), *(word for override in overrides or () for word in ("--set", override))]
-    stop = _stopped_by_signals()
+    stop = stop_on_signals()
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # as nohup sets it
+        signal.signal(signal.SIGHUP, lambda _number, _frame: stop.set())
 
     def say(line: str) -> None:
         typer.echo(line, err=json_output)
@@ -108,8 +117,7 @@ def commission(
     for each in chosen:
         if each.twin is not None:
             say(f"{config}: tray {each.name} keeps its twin {each.twin}")
-    with_sweep = _sweep_words(low, high, safe) if sweep else None
-    plan = Plan(with_sweep, rounds, 60.0 * minutes, 3600.0 * at_most_hours, false_alarms_per_day)
+    plan = Plan(options if sweep else None, rounds, 60.0 * minutes, 3600.0 * at_most_hours, false_alarms_per_day)
     commands = Commands(stop, say, to_standard_error=json_output)
     commissioning = Commissioning(settings, configured, commands, works, plan)
     _run(commissioning, works)
@@ -120,9 +128,12 @@ def commission(
                 "calibrate again later"
             )
     if json_output:
-        typer.echo(json.dumps(_as_json(settings, commissioning, works)))
+        found = {"config": str(config), "trays": [_tray_as_json(work) for work in works if work.entry]}
+        found |= {"failed": {work.name: work.failure for work in works if work.failure}}
+        found |= {"recordings": list(map(str, commissioning.recordings)), "lost": commissioning.lost}
+        typer.echo(json.dumps(found))
     if commissioning.failures:
-        raise UserError(f"{commissioning.failures}; recorded: {_listed(commissioning.recordings)}")
+        raise UserError(f"{commissioning.failures}; recorded: {commissioning.recorded}")
     if watch and not json_output and not stop.is_set():
         say(f"fantwin up {shlex.join(configured)}")
         os.execv(FANTWIN[0], [*FANTWIN, "up", *configured])
@@ -146,27 +157,18 @@ def _works(settings: Config, chosen: Sequence[TrayConfig], output: Path | None) 
     return works
 
 
-def _stopped_by_signals() -> threading.Event:
-    """Set when the user wants to stop."""
-    stop = stop_on_signals()
-    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # as nohup sets it
-        signal.signal(signal.SIGHUP, lambda _number, _frame: stop.set())
-    return stop
+def _refuse_what_cannot_end_well(settings: Config, work: TrayWork, option: str) -> None:
+    """Before anything is recorded. option: names another file for its twin."""
+    if work.tray.command_min == work.tray.command_max:
+        raise UserError(
+            f"{settings.path}: command_min and command_max of tray {work.name} are equal: no twin can be made"
+        )
+    if work.twin.exists():
+        raise UserError(f"{work.twin}: exists already: name another with {option}")
+    check_writable(work.twin, ".onnx")
 
 
-def _refuse_wrong_range(
-    path: Path, tray: TrayConfig, sweep: bool, low: float | None, high: float | None, safe: float | None
-) -> None:
-    if tray.command_min == tray.command_max:
-        raise UserError(f"{path}: command_min and command_max of tray {tray.name} are equal: no twin can be made")
-    if sweep:
-        require_commandable(tray, "leave out --sweep, and let the fans' own controller vary their commands meanwhile")
-        range_within(tray, low, high, safe)
-    elif given := [name for name, value in (("--low", low), ("--high", high), ("--safe", safe)) if value is not None]:
-        raise UsageError(f"{given[0]} needs --sweep, which moves the fans: add --sweep")
-
-
-def _refuse_what_cannot_end_well(settings: Config, works: Sequence[TrayWork]) -> None:
+def _refuse_site_that_cannot_end_well(settings: Config, works: Sequence[TrayWork]) -> None:
     """Before anything is recorded."""
     judging = [name for name, row in STAGES.items() if row.needs_twin]
     if missing := [name for name in judging if name not in settings.stages]:
@@ -180,19 +182,9 @@ def _refuse_what_cannot_end_well(settings: Config, works: Sequence[TrayWork]) ->
         raise UserError(
             f"{settings.path}: its folder is not writable, so the twin could not be added to the configuration"
         )
-    for work in works:
-        if work.twin.exists():
-            alone = f"--tray {work.name} " if len(works) > 1 else ""
-            raise UserError(f"{work.twin}: exists already: name another with {alone}-o")
-        check_writable(work.twin, ".onnx")
     if accepts_connections(settings.bus.endpoint) and (running := running_sessions(settings)):
         names = ", ".join(dict.fromkeys(session.name for session in running))
         raise UserError(f"site {settings.site!r} runs already ({names}): stop it first")
-
-
-def _sweep_words(low: float | None, high: float | None, safe: float | None) -> list[str]:
-    given = {"--low": low, "--high": high, "--safe": safe}
-    return [word for name, value in given.items() if value is not None for word in (name, repr(value))]
 
 
 def _run(commissioning: Commissioning, works: Sequence[TrayWork]) -> None:
@@ -202,28 +194,12 @@ def _run(commissioning: Commissioning, works: Sequence[TrayWork]) -> None:
     except Stopped:
         written = [work.name for work in works if work.entry]
         twins = f"twins were written of tray {', '.join(written)} only" if written else "no twin was written"
-        recorded = _listed(commissioning.recordings)
-        typer.echo(f"interrupted: {twins}; recorded until then: {recorded or 'nothing'}", err=True)
+        typer.echo(f"interrupted: {twins}; recorded until then: {commissioning.recorded or 'nothing'}", err=True)
         raise typer.Exit(EXIT_INTERRUPTED) from None
     except UserError as error:
         if not commissioning.recordings:
             raise
-        raise UserError(f"{error}; recorded until then: {_listed(commissioning.recordings)}") from error
-
-
-def _listed(recordings: Sequence[Path]) -> str:
-    return ", ".join(map(str, recordings))
-
-
-def _as_json(settings: Config, commissioning: Commissioning, works: Sequence[TrayWork]) -> dict[str, Any]:
-    """The result as JSON fields."""
-    return {
-        "config": str(settings.path),
-        "trays": [_tray_as_json(work) for work in works if work.entry],
-        "failed": {work.name: work.failure for work in works if work.failure},
-        "recordings": list(map(str, commissioning.recordings)),
-        "lost": commissioning.lost,
-    }
+        raise UserError(f"{error}; recorded until then: {commissioning.recorded}") from error
 
 
 def _tray_as_json(work: TrayWork) -> dict[str, Any]:

@@ -81,6 +81,11 @@ class Commissioning:
         return [work for work in self._works if not work.failure]
 
     @property
+    def recorded(self) -> str:
+        """The recordings, for people; empty if there is none."""
+        return ", ".join(map(str, self.recordings))
+
+    @property
     def failures(self) -> str:
         """The trays that have failed, and why, in one line; empty if none has."""
         return "; ".join(f"tray {work.name} failed: {work.failure}" for work in self._works if work.failure)
@@ -166,7 +171,9 @@ class Commissioning:
         while recorded_s < at_least_s or missing:
             for raw in site.wait(1.0):
                 seen[raw.header.tray].take(raw)
-            self._drop_silent(site)
+            for work in self.left:
+                if silence := site.silence_of(work.name):
+                    self._fail(work, silence)
             recorded_s = time.monotonic() - began_s
             if at_most_s is not None:
                 missing = {work.name: lacks for work in self.left if (lacks := seen[work.name].missing())}
@@ -178,11 +185,6 @@ class Commissioning:
                 lacks = "; ".join(f"tray {tray}, {line}" for tray, lines in missing.items() for line in lines)
                 still = f"; still missing: {lacks}" if lacks else ""
                 self._commands.say(f"{recorded_s / 60:.0f} min of at least {at_least_s / 60:.3g}{still}")
-
-    def _drop_silent(self, site: RecordingSite) -> None:
-        for work in self.left:
-            if silence := site.silence_of(work.name):
-                self._fail(work, silence)
 
     def _drop_unmoved(self, missing: dict[str, list[str]], waited_s: float) -> None:
         for work in self.left:

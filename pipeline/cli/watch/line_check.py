@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from fantwin.pipeline.acquisition.raw_samples import RawSamples
 from fantwin.pipeline.bus.session import join_bus
 from fantwin.pipeline.config.settings import Config, TrayConfig
 from fantwin.pipeline.prediction.tray_twin import TrayTwin, load_tray_twin, twin_path
@@ -23,9 +24,7 @@ from fantwin.pipeline.sources.tacho_evidence import find_tacho, tacho_hints
 from fantwin.pipeline.timebase.device_clock import UINT32
 from fantwin.pipeline.timebase.grid_timing import GridTiming, grid_rate_hz, is_too_slow, leaves_gaps
 from fantwin.pipeline.timebase.line_rate import MAX_SAMPLES, SampleTimes
-from fantwin.schemas.codec import CodecError, decode
 from fantwin.schemas.messages import Array, Raw
-from fantwin.schemas.topics import tray_key
 from fantwin.schemas.units import NS_PER_S, RAD_S_PER_UNIT, SpeedUnit
 from fantwin.schemas.wire import DEVICE_COUNTERS
 
@@ -48,7 +47,7 @@ def check_line(context: Context, config: Config, seconds: float, *, is_running: 
     tray = context.tray
     if tray.source.takes_pushed and not is_running:
         return [(True, f"{tray.name}: {PUSHED_LATER}")]
-    samples, problem = _from_bus(config, tray, seconds) if is_running else _from_source(context, seconds)
+    samples, problem = (_from_bus(config, tray, seconds), "") if is_running else _from_source(context, seconds)
     found = [(False, f"{tray.name}: {problem}")] if problem else []
     if not samples:
         return found or [(False, f"{tray.name}: no sample in {FIRST_SAMPLE_S:g} s")]
@@ -100,20 +99,13 @@ _DISTURBED_SHARE = 0.01
 """of the samples: so many lines may be cut or garbled"""
 
 
-def _from_bus(config: Config, tray: TrayConfig, seconds: float) -> tuple[list[Raw], str]:
-    received: queue.SimpleQueue[bytes] = queue.SimpleQueue()
-    samples: list[Raw] = []
+def _from_bus(config: Config, tray: TrayConfig, seconds: float) -> list[Raw]:
     with join_bus(config, listens=False) as bus:
-        bus.subscribe(tray_key(config.site, tray.name, "raw"), lambda _key, payload: received.put(payload))
-        until_s = time.monotonic() + FIRST_SAMPLE_S
-        while (left_s := until_s - time.monotonic()) > 0:
-            with suppress(queue.Empty, CodecError):
-                message = decode(Raw, received.get(timeout=min(left_s, 0.05)))
-                assert isinstance(message, Raw)
-                if not samples:
-                    until_s = time.monotonic() + seconds
-                samples.append(message)
-    return samples, ""
+        arriving = RawSamples(bus, config.site, [tray.name])
+        first = arriving.take(FIRST_SAMPLE_S)
+        if first:
+            time.sleep(seconds)
+        return [*first, *arriving.take()]
 
 
 def _twin(context: Context) -> TrayTwin | None:

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import math
-import queue
 import threading
 from collections.abc import Mapping
-from contextlib import suppress
 
 import numpy as np
 import typer
@@ -18,6 +16,7 @@ from fantwin.pipeline.acquisition.command_sender import (
     require_commandable,
     require_within_limits,
 )
+from fantwin.pipeline.acquisition.raw_samples import RawSamples
 from fantwin.pipeline.bus.session import Bus, join_bus
 from fantwin.pipeline.cli.printing import show
 from fantwin.pipeline.config.roles import OPERATOR
@@ -25,9 +24,8 @@ from fantwin.pipeline.config.settings import Config, TrayConfig
 from fantwin.pipeline.errors import UsageError, UserError
 from fantwin.pipeline.learning.sweep_steps import Excitation, Observed, StoppedError
 from fantwin.pipeline.runtime.signals import stop_on_signals
-from fantwin.schemas.codec import CodecError, decode
 from fantwin.schemas.messages import Raw
-from fantwin.schemas.topics import sweep_key, tray_key
+from fantwin.schemas.topics import sweep_key
 from fantwin.schemas.units import NS_PER_S
 
 _FIRST_SAMPLE_S = 5.0
@@ -197,10 +195,9 @@ class _BusLine:
     def __init__(self, bus: Bus, site: str, tray: TrayConfig, stop: threading.Event) -> None:
         self.stop = stop
         self._tray = tray
-        self._received: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+        self._arriving = RawSamples(bus, site, [tray.name])
         self._samples: list[Raw] = []
         self._sender = CommandSender(bus, site, tray.name, stop)
-        bus.subscribe(tray_key(site, tray.name, "raw"), lambda _key, payload: self._received.put(payload))
 
     def connect(self) -> np.ndarray:
         """Wait for acquisition and its first sample; returns the commands (fans,) of that."""
@@ -246,10 +243,5 @@ class _BusLine:
 
     def _take(self) -> bool:
         """Take what has arrived; returns whether there is any sample."""
-        with suppress(queue.Empty):
-            while True:
-                with suppress(CodecError):
-                    sample = decode(Raw, self._received.get_nowait())
-                    if isinstance(sample, Raw) and sample.fans == self._tray.fans and len(sample.host_receive_t_ns):
-                        self._samples.append(sample)
+        self._samples += [sample for sample in self._arriving.take() if sample.fans == self._tray.fans]
         return bool(self._samples)
