@@ -30,7 +30,7 @@ from cryptography.hazmat.primitives.serialization import (
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from fantwin.pipeline.errors import UserError
-from fantwin.pipeline.files import PRIVATE, PUBLIC, is_read_by_others, replace_file
+from fantwin.pipeline.files import PRIVATE, PUBLIC, is_read_by_others, write_whole
 
 LONGEST_NAME = 64
 """characters of a common name"""
@@ -88,7 +88,9 @@ class Certificate:
         early = min(WARN_BEFORE, (self.not_after - self.not_before) * WARN_SHARE)
         if (problem := self.time_problem(now)) or now < self.not_after - early:
             return problem
-        return f"{self.path}: expires {_left(self.not_after - now)}, on {in_words(self.not_after)}"
+        hours = (self.not_after - now).total_seconds() / 3600
+        left = f"{hours / 24:.0f} days" if hours >= 48 else f"{hours:.0f} hours"
+        return f"{self.path}: expires in {left}, on {in_words(self.not_after)}"
 
 
 def read_certificate(path: Path) -> Certificate:
@@ -113,11 +115,14 @@ def check_pair(certificate: Path, key: Path, ca: Path | None = None, *, needs_rs
         UserError: a file cannot be read or used, or they do not belong together.
     """
     own = _certificate(certificate)
-    _require_private(key)
     try:
+        if is_read_by_others(key.stat()):
+            raise UserError(f"{key}: others may read this private key: chmod 600 {key}")
         private = _parsed(
             key, lambda text: load_pem_private_key(text, None), lambda text: load_der_private_key(text, None), "key"
         )
+    except OSError as error:
+        raise UserError(f"{key}: {error.strerror}") from error
     except TypeError as error:
         raise UserError(
             f"{key}: the key has a password, which nobody is asked for: `openssl pkey -in KEY -out NEW` takes it out"
@@ -200,8 +205,7 @@ class Authority:
         """Make one."""
         key = ec.generate_private_key(ec.SECP256R1())
         name = _named(f"fantwin {site}"[:LONGEST_NAME])
-        basic = x509.BasicConstraints(ca=True, path_length=0)
-        return cls(_begun(name, name, key, lifetime, basic, _OF_AUTHORITY).sign(key, hashes.SHA256()), key)
+        return cls(_signed(name, key, (name, key), lifetime, _OF_AUTHORITY), key)
 
     @classmethod
     def read(cls, folder: Path) -> Authority:
@@ -233,11 +237,9 @@ class Authority:
     def issue(self, role: str, hosts: Sequence[str], lifetime: timedelta) -> tuple[x509.Certificate, Key]:
         """Make a certificate for a role, which ends with the authority at the latest, and its key."""
         key = ec.generate_private_key(ec.SECP256R1())
-        left = self.certificate.not_valid_after_utc - datetime.now(UTC)
-        signer = x509.AuthorityKeyIdentifier.from_issuer_public_key(self._key.public_key())
-        builder = _begun(_named(role), self.certificate.subject, key, min(lifetime, left), _NO_AUTHORITY, _SIGNATURE)
-        builder = _of_owner(builder, [_alternative(host) for host in hosts]).add_extension(signer, critical=False)
-        return builder.sign(self._key, hashes.SHA256()), key
+        until_the_end = min(lifetime, self.certificate.not_valid_after_utc - datetime.now(UTC))
+        signer, names = (self.certificate.subject, self._key), [_alternative(host) for host in hosts]
+        return _signed(_named(role), key, signer, until_the_end, _SIGNATURE, names), key
 
 
 def make_self_signed(certificate: Path, key: Path, name: str, uri: str, hosts: Sequence[str]) -> None:
@@ -249,14 +251,14 @@ def make_self_signed(certificate: Path, key: Path, name: str, uri: str, hosts: S
     if certificate.exists() and key.exists():
         return
     private = rsa.generate_private_key(public_exponent=65537, key_size=RSA_BITS)
-    alternatives = [x509.UniformResourceIdentifier(uri), *map(_alternative, dict.fromkeys(hosts))]
-    begun = _begun(_named(name), _named(name), private, SELF_SIGNED_LIFETIME, _NO_AUTHORITY, _OF_OPCUA)
-    signed = _of_owner(begun, alternatives).sign(private, hashes.SHA256())
+    names = [x509.UniformResourceIdentifier(uri), *map(_alternative, dict.fromkeys(hosts))]
+    signed = _signed(_named(name), private, (_named(name), private), SELF_SIGNED_LIFETIME, _OF_OPCUA, names)
     write_pair(certificate, key, signed, private, replace=True)
 
 
 def write_pair(certificate: Path, key: Path, signed: x509.Certificate, private: Key, *, replace: bool) -> None:
-    """Write a certificate, in DER if its file is called so, and its key.
+    """Write a certificate, in DER if its file is called so, and its key, which is never readable by others, not for a
+    moment.
 
     Raises:
         UserError: they cannot be written, or one exists and `replace` is False.
@@ -265,21 +267,8 @@ def write_pair(certificate: Path, key: Path, signed: x509.Certificate, private: 
         if path.exists() and not replace:
             raise UserError(f"{path} exists: --replace makes a new one in its place")
     encoding = Encoding.DER if certificate.suffix == ".der" else Encoding.PEM
-    write_file(key, private.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption()), is_private=True)
-    write_file(certificate, signed.public_bytes(encoding), is_private=False)
-
-
-def write_file(path: Path, content: bytes, *, is_private: bool) -> None:
-    """Put a whole file in its place; a private one is never readable by others, not for a moment.
-
-    Raises:
-        UserError: it cannot be written.
-    """
-    try:
-        path.parent.mkdir(mode=0o700 if is_private else 0o755, parents=True, exist_ok=True)
-        replace_file(path, content, PRIVATE if is_private else PUBLIC)
-    except OSError as error:
-        raise UserError(f"{path}: cannot be written: {error.strerror}") from error
+    write_whole(key, private.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption()), "", PRIVATE)
+    write_whole(certificate, signed.public_bytes(encoding), "", PUBLIC)
 
 
 def is_host(text: str) -> bool:
@@ -296,41 +285,38 @@ def in_words(time: datetime) -> str:
     return f"{time:%Y-%m-%d %H:%M} UTC"
 
 
-_NO_AUTHORITY = x509.BasicConstraints(ca=False, path_length=None)
-
-
-def _begun(
+def _signed(
     subject: x509.Name,
-    issuer: x509.Name,
     key: Key,
+    signer: tuple[x509.Name, Key],
     lifetime: timedelta,
-    basic: x509.BasicConstraints,
     usages: Sequence[str],
-) -> x509.CertificateBuilder:
+    names: Sequence[x509.GeneralName] = (),
+) -> x509.Certificate:
+    """A certificate. signer: name and key. usages: those of an authority make one. names: of its owner."""
+    is_authority = usages == _OF_AUTHORITY
     now = datetime.now(UTC).replace(microsecond=0)
-    return (
+    known = ("key_agreement", "encipher_only", "decipher_only", *_OF_OPCUA, *_OF_AUTHORITY)
+    extensions: list[tuple[x509.ExtensionType, bool]] = [
+        (x509.SubjectKeyIdentifier.from_public_key(key.public_key()), False),
+        (x509.AuthorityKeyIdentifier.from_issuer_public_key(signer[1].public_key()), False),
+        (x509.BasicConstraints(ca=is_authority, path_length=0 if is_authority else None), True),
+        (x509.KeyUsage(**{usage: usage in usages for usage in known}), True),
+    ]
+    if not is_authority:
+        extensions += [(x509.ExtendedKeyUsage(_USAGES), False), (x509.SubjectAlternativeName(names), False)]
+    builder = (
         x509.CertificateBuilder()
         .subject_name(subject)
-        .issuer_name(issuer)
+        .issuer_name(signer[0])
         .public_key(key.public_key())
         .serial_number(x509.random_serial_number())
         .not_valid_before(now - CLOCK_SKEW)
         .not_valid_after(now + lifetime)
-        .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
-        .add_extension(basic, critical=True)
-        .add_extension(_key_usage(usages), critical=True)
     )
-
-
-def _of_owner(builder: x509.CertificateBuilder, names: Sequence[x509.GeneralName]) -> x509.CertificateBuilder:
-    usages = x509.ExtendedKeyUsage(_USAGES)
-    alternatives = x509.SubjectAlternativeName(names)
-    return builder.add_extension(usages, critical=False).add_extension(alternatives, critical=False)
-
-
-def _key_usage(usages: Sequence[str]) -> x509.KeyUsage:
-    known = ("key_agreement", "encipher_only", "decipher_only", *_OF_OPCUA, *_OF_AUTHORITY)
-    return x509.KeyUsage(**{name: name in usages for name in known})
+    for extension, is_critical in extensions:
+        builder = builder.add_extension(extension, critical=is_critical)
+    return builder.sign(signer[1], hashes.SHA256())
 
 
 def _named(common_name: str) -> x509.Name:
@@ -356,15 +342,6 @@ def _parsed(path: Path, pem: Callable[[bytes], Parsed], der: Callable[[bytes], P
         raise UserError(f"{path}: {error.strerror}") from error
     except ValueError as error:
         raise UserError(f"{path}: no {what} in PEM or DER") from error
-
-
-def _require_private(key: Path) -> None:
-    try:
-        status = key.stat()
-    except OSError as error:
-        raise UserError(f"{key}: {error.strerror}") from error
-    if is_read_by_others(status):
-        raise UserError(f"{key}: others may read this private key: chmod 600 {key}")
 
 
 def _load_chain(context: ssl.SSLContext, certificate: Path, key: Path) -> None:
@@ -400,8 +377,3 @@ def _extension(certificate: x509.Certificate, kind: type[Any]) -> Any:
 def _common_name(name: x509.Name) -> str:
     values = [str(each.value) for each in name.get_attributes_for_oid(NameOID.COMMON_NAME)]
     return values[0] if values else ""
-
-
-def _left(time: timedelta) -> str:
-    hours = time.total_seconds() / 3600
-    return f"in {hours / 24:.0f} days" if hours >= 48 else f"in {hours:.0f} hours"

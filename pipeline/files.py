@@ -63,14 +63,16 @@ def replace_file(path: Path, content: bytes, mode: int | None = None) -> None:
         sync_folder(path.parent)
 
 
-def write_whole(path: Path, content: bytes, advice: str = "; name another file with -o") -> None:
-    """Write a file as a whole: no reader finds a part of it.
+def write_whole(
+    path: Path, content: bytes, advice: str = "; name another file with -o", mode: int | None = None
+) -> None:
+    """Write a file as a whole: no reader finds a part of it. mode: as of `replace_file`.
 
     Raises:
         UserError: it cannot be written.
     """
     try:
-        replace_file(path, content)
+        replace_file(path, content, mode)
     except OSError as error:
         raise UserError(f"{path}: cannot be written: {error.strerror}{advice}") from error
 

@@ -7,8 +7,9 @@ from pathlib import Path
 
 from cryptography.hazmat.primitives.serialization import Encoding
 
-from fantwin.pipeline.certificates import Authority, write_file, write_pair
+from fantwin.pipeline.certificates import Authority, write_pair
 from fantwin.pipeline.config.settings import SecurityConfig
+from fantwin.pipeline.files import write_whole
 
 HOSTS = ("localhost", "127.0.0.1")
 DAY = timedelta(days=1)
@@ -22,7 +23,7 @@ class SiteCertificates:
         self.folder = folder
         self.authority = authority or Authority.new("site", 10 * DAY)
         if is_new:
-            write_file(folder / "ca.pem", self.authority.certificate.public_bytes(Encoding.PEM), is_private=False)
+            write_whole(folder / "ca.pem", self.authority.certificate.public_bytes(Encoding.PEM))
         self.security = SecurityConfig(
             ca=folder / "ca.pem", certificate=folder / "{role}.pem", key=folder / "{role}.key"
         )

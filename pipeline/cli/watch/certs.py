@@ -23,7 +23,6 @@ from fantwin.pipeline.certificates import (
     in_words,
     is_host,
     read_certificate,
-    write_file,
     write_pair,
 )
 from fantwin.pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
@@ -32,6 +31,7 @@ from fantwin.pipeline.config.loading import load_config
 from fantwin.pipeline.config.roles import default_roles, roles_of
 from fantwin.pipeline.config.settings import ROLE_PLACE, Config, SecurityConfig, nearest
 from fantwin.pipeline.errors import UsageError, UserError
+from fantwin.pipeline.files import PUBLIC, write_whole
 
 _AUTHORITY_DAYS, _DAYS = 3653, 397
 _HERE = ("localhost", "127.0.0.1", "::1")
@@ -163,18 +163,17 @@ def _init(request: _Request) -> tuple[list[Certificate], list[Path]]:
         raise UserError(f"{ca} exists: --replace makes a new authority, and all certificates must be issued again")
     made = Authority.new(request.config.site, timedelta(days=request.days or _AUTHORITY_DAYS))
     made.write(request.authority, replace=request.replace)
-    write_file(ca, made.certificate.public_bytes(Encoding.PEM), is_private=False)
+    write_whole(ca, made.certificate.public_bytes(Encoding.PEM), "", PUBLIC)
     return [read_certificate(request.authority / "ca.pem"), read_certificate(ca)], []
 
 
 def _issue(request: _Request) -> tuple[list[Certificate], list[Path]]:
-    wanted = list(request.roles) or default_roles(request.config)
-    kept: list[Path] = []
-    if not request.roles and not request.replace:
-        kept = [path for role in wanted if (path := of_role(request.security.certificate, role)).exists()]
-        wanted = [role for role in wanted if not of_role(request.security.certificate, role).exists()]
-    made = [_make(request, role, _hosts(request), replace=request.replace) for role in wanted]
-    return made, kept
+    files = {
+        role: of_role(request.security.certificate, role) for role in request.roles or default_roles(request.config)
+    }
+    stays = [] if request.roles or request.replace else [path for path in files.values() if path.exists()]
+    wanted = [role for role, path in files.items() if path not in stays]
+    return [_make(request, role, _hosts(request), replace=request.replace) for role in wanted], stays
 
 
 def _renew(request: _Request) -> tuple[list[Certificate], list[Path]]:
@@ -184,34 +183,23 @@ def _renew(request: _Request) -> tuple[list[Certificate], list[Path]]:
         old = [each for each in _issued(request) if not each.is_authority]
     if not old:
         raise UserError(f"{request.security.certificate.parent}: no certificates: `fantwin certs issue` makes them")
-    lifetimes = [(each.not_after - each.not_before).days for each in old]
-    made = [
-        _make(request, each.role, (*each.hosts, *request.hosts), days=days, replace=True)
-        for each, days in zip(old, lifetimes, strict=True)
-    ]
-    return made, []
+    return [
+        _make(request, each.role, (*each.hosts, *request.hosts), (each.not_after - each.not_before).days, replace=True)
+        for each in old
+    ], []
 
 
-def _make(
-    request: _Request, role: str, hosts: Iterable[str], *, days: int | None = None, replace: bool = False
-) -> Certificate:
+def _make(request: _Request, role: str, hosts: Iterable[str], days: int = _DAYS, *, replace: bool) -> Certificate:
     security = request.security
     if ROLE_PLACE not in str(security.certificate) and len(request.roles) != 1:
         raise UsageError(f"{security.certificate}: name the one role of this file, or write {ROLE_PLACE} into its path")
     authority = Authority.read(request.authority)
-    if authority.certificate.public_bytes(Encoding.PEM) != _content(security.ca):
+    if authority.certificate.public_bytes(Encoding.PEM) != (security.ca.read_bytes() if security.ca.exists() else b""):
         raise UserError(f"{security.ca} is not the certificate of {request.authority}: use the files of one site")
-    signed, key = authority.issue(role, list(dict.fromkeys(hosts)), timedelta(days=request.days or days or _DAYS))
+    signed, key = authority.issue(role, list(dict.fromkeys(hosts)), timedelta(days=request.days or days))
     certificate = of_role(security.certificate, role)
     write_pair(certificate, of_role(security.key, role), signed, key, replace=replace)
     return read_certificate(certificate)
-
-
-def _content(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise UserError(f"{path}: {error.strerror}: `fantwin certs init` makes it") from error
 
 
 def _hosts(request: _Request) -> list[str]:
