@@ -6,19 +6,18 @@ in here.
 
 from __future__ import annotations
 
-import inspect
-import json
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
 from textwrap import fill
 from typing import Any
 
 import typer
+from typer.cli import get_docs_for_click
 from typer.main import get_command
 
-from fantwin.pipeline.cli.main import COMMANDS, PANELS, VARIADIC, app, function_of
+from fantwin.pipeline.cli.main import COMMANDS, PANELS, app, function_of
 from fantwin.pipeline.cli.simulation.scenario import ClockScenario, FileScenario, Scenario, SurroundingsScenario
 from fantwin.pipeline.config.reference_page import table
 from fantwin.pipeline.config.registry import STAGES
@@ -31,9 +30,10 @@ went wrong as one line on standard error.
 
 {fill(app.info.epilog or "", 120)}
 
-This page is made from the commands in the code: `make reference`. Options of several commands:
+This page is made from the commands in the code: `make reference`.
 """
-_HEAD = ("| | default | |", "|---|---|---|")
+_EXAMPLE = re.compile(r"^Example: ((?:.+\n)+)", re.MULTILINE)
+_HELP = re.compile(r"^\* `--help`.*\n", re.MULTILINE)
 
 
 def page() -> str:
@@ -41,64 +41,17 @@ def page() -> str:
     group = typer.Typer()
     for name in COMMANDS:
         group.command(name)(function_of(name))
-    commands: dict[str, Any] = get_command(group).commands  # pyright: ignore[reportAttributeAccessIssue]
-    common = _in_several(commands)
-    parts = [_INTRODUCTION, "\n".join([*_HEAD, *common, ""])]
+    click: Any = get_command(group)
+    parts = [_INTRODUCTION]
     for folder, heading in PANELS.items():
         parts.append(f"## {heading}\n")
         for name in (name for name, module in COMMANDS.items() if module.startswith(f"{folder}.")):
-            parts += _command(name, commands[name], common)
+            about = get_docs_for_click(
+                obj=click.commands[name], ctx=typer.Context(click), indent=2, name=name, call_prefix="fantwin"
+            )
+            examples = _EXAMPLE.sub(lambda found: f"    {' '.join(found[1].split())}\n", about)
+            parts.append(f"{_HELP.sub('', examples).strip()}\n")
     return "\n".join(parts)
-
-
-def _command(name: str, command: Any, common: Sequence[str]) -> Iterator[str]:
-    arguments = [each for each in command.params if each.param_type_name == "argument"]
-    options = [each for each in command.params if each.param_type_name == "option" and not each.hidden]
-    options = [each for each in options if each.name != "help"]
-    usage = " ".join(each.metavar or each.name.upper() for each in arguments)
-    yield f"### `fantwin {' '.join(filter(None, (name, usage)))}`\n"
-    about, *examples = (inspect.cleandoc(command.help).split("\n\nExample: ")) if command.help else ("",)
-    yield f"{about}\n"
-    if examples:
-        yield "\n".join(f"    {' '.join(example.split())}" for example in examples) + "\n"
-    rows = [f"| `{each.metavar or each.name.upper()}` | | {_text(each.help)} |" for each in arguments]
-    rows += [_row(each, name) for each in options if _row(each, name) not in common]
-    shared = [each.opts[0] for each in options if _row(each, name) in common]
-    yield "\n".join([*_HEAD, *rows, ""] if rows else [])
-    if shared:
-        yield f"{'And' if rows else 'Options:'} {', '.join(f'`{each}`' for each in shared)}.\n"
-
-
-def _row(option: Any, command: str = "") -> str:
-    return f"| {_names(option, command)} | {_default(option)} | {_text(option.help)} |"
-
-
-def _in_several(commands: dict[str, Any]) -> list[str]:
-    """The rows of the options that are the same in three commands or more."""
-    rows = [_row(each) for command in commands.values() for each in command.params if each.param_type_name == "option"]
-    return [row for row in dict.fromkeys(rows) if rows.count(row) > 2 and "`--help`" not in row]
-
-
-def _names(option: Any, command: str) -> str:
-    names = ", ".join(f"`{each}`" for each in (*option.opts, *option.secondary_opts))
-    if option.is_flag:
-        return names
-    more = "..." if option.opts[-1] in VARIADIC.get(command, ()) else ""
-    plain = str(option.display_type(None)).strip("<>").removesuffix(" range").upper()
-    value = (option.metavar or plain).removesuffix("...")
-    return f"{names} `{value}{more}`".replace("|", "\\|")
-
-
-def _default(option: Any) -> str:
-    default = option.default
-    if default is None or default is False or default == () or default == float("inf"):
-        return ""
-    is_number = isinstance(default, int | float) and not isinstance(default, bool)
-    return f"{default:g}" if is_number else f"`{json.dumps(default, default=str)}`"
-
-
-def _text(text: str | None) -> str:
-    return " ".join((text or "").split()).replace("|", "\\|")
 
 
 PAGES = Path("docs", "reference")
