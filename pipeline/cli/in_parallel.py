@@ -66,12 +66,6 @@ def in_processes(work: Callable[[Item], Result], items: Sequence[Item], jobs: in
         raise UserError(f"{ENDED_FROM_OUTSIDE.format(what=what)}: fewer --jobs than {jobs} need less") from error
 
 
-def end_processes() -> None:
-    """End those of in_processes, busy or not."""
-    running: Any = {"reuse": True}
-    get_reusable_executor(**running).shutdown(kill_workers=True)
-
-
 def _leave_ctrl_c_to_the_command() -> None:
     """A terminal sends it to all processes; the command ends its workers itself."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -126,16 +120,15 @@ class RecordingsInParallel:
         self._bad: dict[Path | tuple[Path, ...], UserError] = {}
 
     def __enter__(self) -> RecordingsInParallel:
-        """Raises UserError: there is no such scheduler, or no worker."""
-        if self._scheduler:
-            self._client = self._resources.enter_context(_connected(self._scheduler))
         folder = TemporaryDirectory(prefix="fantwin-copies-", ignore_cleanup_errors=True)
         self._copies = Path(self._resources.enter_context(folder))
         return self
 
     def __exit__(self, *_error: object) -> None:
         if self._has_processes:
-            end_processes()  # a fit that follows needs their memory
+            running: Any = {"reuse": True}
+            get_reusable_executor(**running).shutdown(kill_workers=True)  # a fit that follows needs their memory
+        self._has_processes, self._client = False, None
         self._resources.close()
 
     def map(self, work: Callable[[Recording], Result], recordings: Sequence[Recording], doing: str) -> Iterator[Result]:
@@ -144,8 +137,11 @@ class RecordingsInParallel:
         doing: what is done, for people.
 
         Raises:
-            UserError: of the first recording that `work` raises it for, unless bad ones are skipped or none is left.
+            UserError: of the first recording that `work` raises it for, unless bad ones are skipped or none is left; or
+                there is no such scheduler, or no worker.
         """
+        if self._scheduler and self._client is None:
+            self._client = self._resources.enter_context(_connected(self._scheduler))
         left = [recording for recording in recordings if recording not in self._bad]
         attempt = partial(_attempt, work=work, copies=self._copies)
         begun = self._on_cluster(attempt, left) if self._client else self._here(attempt, left)
@@ -160,6 +156,29 @@ class RecordingsInParallel:
                 advance()
         if recordings and all(recording in self._bad for recording in recordings):
             raise self._bad[recordings[0]]
+
+    def each_network(
+        self, work: Callable[[Item, Progress], Result], items: Sequence[Item], doing: str, progress: Progress
+    ) -> list[Result]:
+        """A twin.each_network.ForEachNetwork with processes of this host.
+
+        Raises:
+            UserError: a process was ended from outside.
+        """
+        from fantwin.twin.each_network import one_after_another  # noqa: PLC0415  loaded only when it is needed
+
+        jobs = min(self.jobs, len(items))
+        if jobs == 1:
+            with threadpool_limits(1):
+                return one_after_another(work, items, doing, progress)
+        self._has_processes = True
+        part, results = f"{doing}, {jobs} networks at a time", list[Result]()
+        with closing(in_processes(partial(_alone, work), items, jobs, "a network")) as found:
+            progress(part, 0, len(items), float("nan"))
+            for result in found:
+                results.append(result)
+                progress(part, len(results), len(items), float("nan"))
+        return results
 
     def _here(self, attempt: Callable[[Recording], Any], recordings: Sequence[Recording]) -> Generator[Any]:
         """The outcomes in the order of the recordings. When it is closed early, the processes are ended."""
@@ -272,45 +291,6 @@ def _connected(scheduler: str) -> Iterator[Client]:
 
 def _versions() -> str:
     return ", ".join(f"{package} {version(package)}" for package in SAME_VERSIONS)
-
-
-class NetworksInParallel:
-    """A twin.each_network.ForEachNetwork with processes. A context manager: its end is theirs."""
-
-    def __init__(self, jobs: int | None = None) -> None:
-        """jobs: networks at a time; None: one for each core."""
-        self._jobs = jobs or cpu_count()
-        self._has_processes = False
-
-    def __enter__(self) -> NetworksInParallel:
-        return self
-
-    def __exit__(self, *_error: object) -> None:
-        if self._has_processes:
-            end_processes()
-
-    def __call__(
-        self, work: Callable[[Item, Progress], Result], items: Sequence[Item], doing: str, progress: Progress
-    ) -> list[Result]:
-        """See twin.each_network.ForEachNetwork.
-
-        Raises:
-            UserError: a process was ended from outside.
-        """
-        from fantwin.twin.each_network import one_after_another  # noqa: PLC0415  loaded only when it is needed
-
-        jobs = min(self._jobs, len(items))
-        if jobs == 1:
-            with threadpool_limits(1):
-                return one_after_another(work, items, doing, progress)
-        self._has_processes = True
-        part, results = f"{doing}, {jobs} networks at a time", list[Result]()
-        with closing(in_processes(partial(_alone, work), items, jobs, "a network")) as found:
-            progress(part, 0, len(items), float("nan"))
-            for result in found:
-                results.append(result)
-                progress(part, len(results), len(items), float("nan"))
-        return results
 
 
 def _alone(work: Callable[[Item, Progress], Result], item: Item) -> Result:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from fantwin.pipeline.cli.in_parallel import JobsOption, NetworksInParallel, RecordingsInParallel, SkipBadOption
+from fantwin.pipeline.cli.in_parallel import JobsOption, RecordingsInParallel, SkipBadOption
 from fantwin.pipeline.cli.options import JsonOption, fan_numbers
 from fantwin.pipeline.cli.progress import interruptible, training_progress
 from fantwin.pipeline.cli.twins.data_options import (
@@ -148,11 +148,11 @@ def train(
             show_hints(training_data.hints)
         settings = replace(given, model=chosen[0].name)
         named = name or output.stem
-        with training_progress(training_data) as start, NetworksInParallel(pool.jobs) as each_network:
+        with training_progress(training_data) as start, pool:
             if type_twin:
                 trained = _place(type_twin, training_data, held_out, named, start(""))
             else:
-                trained = fit_twin(training_data, held_out, named, settings, start(""), each_network)
+                trained = fit_twin(training_data, held_out, named, settings, start(""), pool.each_network)
         write_whole(output, trained.onnx())
     result = as_json(trained, training_data, output)
     if type_twin:

@@ -52,23 +52,13 @@ FAULTS = (
     ("rotor", "fan=5,start=18,stop=24,size=0.8"),
 )
 OUTPUTS = (
-    *(
-        "recording*.mcap*",
-        "view*.rrd",
-        "bands.png",
-        "summary.json",
-        "truth.json",
-        "up.log",
-        "tray.log",
-        "tray",
-    ),
+    *("recording*.mcap*", "view*.rrd", "bands.png", "summary.json", "truth.json", "up.log", "tray.log", "tray"),
     *("*.snapshot", "alarms.sqlite*", "clips/*"),
 )
 ERROR_PREFIX = "fantwin: "
 """start of the line in which a command says why it failed"""
 _STYLES = {FanGroup.NORMAL: "green", FanGroup.SUSPECT: "yellow", FanGroup.NOT_JUDGED: "dim", FanGroup.AT_REST: "dim"}
-_START_TIMEOUT_S = 60.0
-_STOP_TIMEOUT_S = 60.0
+_START_TIMEOUT_S = _STOP_TIMEOUT_S = 60.0
 
 
 def demo(
@@ -258,9 +248,9 @@ def _print_report(summary: Summary, out: Path, took_s: float, console: Console) 
     title = "what happened, seconds since the first sample"
     table = table_of(["fault"], columns, ["probable cause"], title=title)
     for fault in summary.faults:
-        times = (fault.start_ns, fault.alarm_ns, None, fault.stop_ns, fault.cleared_ns)
+        times = (fault.start_ns, fault.alarm_ns, fault.stop_ns, fault.cleared_ns)
         cells = ["missed" if t is None else f"{(t - summary.start_ns) / NS_PER_S:.2f}" for t in times]
-        cells[2] = "" if fault.delay_s is None else f"{fault.delay_s:.2f}"
+        cells.insert(2, "" if fault.delay_s is None else f"{fault.delay_s:.2f}")
         cause = f"{short_name(fault.cause)}, {fault.probability:.0%}" if fault.cause else ""
         table.add_row(fault.kind, str(fault.fan), *cells, cause)
     console.print(table)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -59,77 +59,56 @@ class Summary:
         return json.dumps(asdict(self), indent=2, allow_nan=False)
 
 
-@dataclass
-class _Recorded:
-    """What recordings hold. Each sample counts once, by tray and number, so that a repeated one hides no lost one."""
-
-    samples: set[tuple[str, int]] = field(default_factory=set)
-    latencies_ms: list[float] = field(default_factory=list)
-    alarms: list[Alarm] = field(default_factory=list)
-
-
 def summarise(truth_path: Path, recordings: Iterable[Path], lost_by_stage: dict[str, int]) -> Summary:
     """Compare the recordings of one run with the simulated tray's own report.
 
     Raises:
         UserError: a file is missing or unreadable.
     """
-    truth = _read_truth(truth_path)
-    recorded = _read(recordings)
-    alarms = episodes(recorded.alarms)
-    faults = [_match(fault, alarms) for fault in truth["faults"]]
-    false_alarms = sum(not any(_explains(fault, alarm) for fault in truth["faults"]) for alarm in alarms)
-    lost = max(0, truth["samples_sent"] - len(recorded.samples)) + sum(lost_by_stage.values())
-    latency_ms: dict[str, float | None] = {"p50": None, "p99": None}
-    if recorded.latencies_ms:
-        percentiles = np.percentile(recorded.latencies_ms, (50, 99))
-        latency_ms = {name: round(float(value), 3) for name, value in zip(latency_ms, percentiles, strict=True)}
-    summary = Summary(
-        faults=faults,
-        false_alarms=false_alarms,
-        samples_sent=truth["samples_sent"],
-        samples_recorded=len(recorded.samples),
-        lost=lost,
-        latency_ms=latency_ms,
-        lost_by_stage=lost_by_stage,
-        fans=truth["fans"],
-        start_ns=truth["start_ns"],
-    )
-    summary.problems.extend(_problems(summary))
-    return summary
-
-
-def _read_truth(path: Path) -> dict[str, Any]:
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        truth = json.loads(truth_path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
-        raise UserError(f"{path}: no report of the simulated tray: {error}; did `fantwin simulate` run?") from error
-
-
-def _read(recordings: Iterable[Path]) -> _Recorded:
-    recorded = _Recorded()
+        raise UserError(
+            f"{truth_path}: no report of the simulated tray: {error}; did `fantwin simulate` run?"
+        ) from error
+    samples: set[tuple[str, int]] = set()
+    """by tray and number, so that a repeated one hides no lost one"""
+    latencies_ms: list[float] = []
+    alarms: list[Alarm] = []
     for path in recordings:
         for entry in read_recording(path, topics=("raw", "score", "alarm")):
             message = entry.message
             if isinstance(message, Raw):
-                recorded.samples |= {(message.header.tray, number) for number in message.device_sequence.tolist()}
+                samples |= {(message.header.tray, number) for number in message.device_sequence.tolist()}
             elif isinstance(message, Score):
-                recorded.latencies_ms += ((entry.received_t_ns - message.t_ns) / 1e6).tolist()
+                latencies_ms += ((entry.received_t_ns - message.t_ns) / 1e6).tolist()
             elif isinstance(message, Alarm):
-                recorded.alarms.append(message)
-    return recorded
+                alarms.append(message)
+    found = episodes(alarms)
+    percentiles = np.percentile(latencies_ms, (50, 99)).tolist() if latencies_ms else (None, None)
+    summary = Summary(
+        faults=[_match(fault, found) for fault in truth["faults"]],
+        false_alarms=sum(not any(_explains(fault, alarm) for fault in truth["faults"]) for alarm in found),
+        samples_sent=truth["samples_sent"],
+        samples_recorded=len(samples),
+        lost=max(0, truth["samples_sent"] - len(samples)) + sum(lost_by_stage.values()),
+        latency_ms={name: t_ms and round(t_ms, 3) for name, t_ms in zip(("p50", "p99"), percentiles, strict=True)},
+        lost_by_stage=lost_by_stage,
+        fans=truth["fans"],
+        start_ns=truth["start_ns"],
+    )
+    return replace(summary, problems=list(_problems(summary)))
 
 
 def _match(fault: dict[str, Any], alarms: list[Episode]) -> FaultSeen:
-    times = (fault["start_ns"], fault["stop_ns"])
-    mine = (each for each in alarms if each.fan == fault["fan"] and times[0] <= each.raised_ns <= times[1])
-    alarm = next(mine, None)
-    if alarm is None:
-        return FaultSeen(fault["fan"], fault["kind"], *times, None, None)
-    cause, probability = (alarm.causes[0].cause, alarm.causes[0].probability) if alarm.causes else ("", 0.0)
-    return FaultSeen(
-        fault["fan"], fault["kind"], *times, alarm.raised_ns, alarm.cleared_ns, cause, round(probability, 4)
-    )
+    seen = FaultSeen(fault["fan"], fault["kind"], fault["start_ns"], fault["stop_ns"], None, None)
+    mine = (each for each in alarms if each.fan == seen.fan and seen.start_ns <= each.raised_ns <= seen.stop_ns)
+    if (alarm := next(mine, None)) is None:
+        return seen
+    seen = replace(seen, alarm_ns=alarm.raised_ns, cleared_ns=alarm.cleared_ns)
+    if not alarm.causes:
+        return seen
+    return replace(seen, cause=alarm.causes[0].cause, probability=round(alarm.causes[0].probability, 4))
 
 
 def _explains(fault: dict[str, Any], alarm: Episode) -> bool:

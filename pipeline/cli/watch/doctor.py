@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 from collections.abc import Collection, Iterator, Sequence
+from dataclasses import replace
 from enum import StrEnum
 from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
@@ -164,19 +165,13 @@ def _check_packages() -> Iterator[tuple[bool, str]]:
         name = re.split(r"[^A-Za-z0-9._-]", requirement)[0]
         if extra := re.search(r"\bextra\s*==\s*['\"]([^'\"]+)", requirement):
             extras.setdefault(extra[1], []).append(name)
+        elif installed := _version(name):
+            yield True, f"{name} {installed}"
         else:
-            installed = _version(name)
-            yield (
-                bool(installed),
-                f"{name} {installed}" if installed else f"{name} is not installed; {how_to_install('fantwin')}",
-            )
-    for extra, names in extras.items():
-        if extra in _NOT_LISTED:
-            continue
-        missing = [name for name in names if not _version(name)]
-        state = (
-            f"not installed ({', '.join(missing)}); {how_to_install(f'fantwin[{extra}]')}" if missing else "installed"
-        )
+            yield False, f"{name} is not installed; {how_to_install('fantwin')}"
+    for extra in sorted(extras.keys() - _NOT_LISTED):
+        missing = ", ".join(name for name in extras[extra] if not _version(name))
+        state = f"not installed ({missing}); {how_to_install(f'fantwin[{extra}]')}" if missing else "installed"
         yield True, f"extra {extra!r}: {state}"
 
 
@@ -186,33 +181,29 @@ def _check_run_folder(folder: Path) -> Iterator[tuple[bool, str]]:
         yield False, f"run_folder {folder}: {existing} is not a folder this user may write to; name another"
         return
     free = shutil.disk_usage(existing).free
-    enough = free > _MIN_FREE_BYTES
-    advice = "" if enough else "; make room or name another folder"
-    yield enough, f"run_folder {folder}: {free / 1e9:.1f} GB free{advice}"
+    advice = "" if free > _MIN_FREE_BYTES else "; make room or name another folder"
+    yield not advice, f"run_folder {folder}: {free / 1e9:.1f} GB free{advice}"
 
 
 def _check_bus(settings: Config, running: list[Session]) -> Iterator[tuple[bool, str]]:
     """Whether processes can meet at the endpoint. Adds the sessions of the site that run there."""
     config, endpoint = settings.bus, settings.bus.endpoint
-    problem = endpoint_problem(endpoint)
-    if not problem and is_exposed(config):
-        yield False, exposure_problem(config)
-    if problem:
+    if problem := endpoint_problem(endpoint):
         yield False, problem
-    elif not accepts_connections(endpoint):
-        yield (
-            True,
-            f"bus.endpoint {endpoint}: free" if config.mode == "peer" else f"bus.endpoint {endpoint}: no router yet",
-        )
-    else:
-        try:
-            running += running_sessions(settings)
-            site = f"site {settings.site!r} runs there" if running else "fantwin answers there"
-            yield True, f"bus.endpoint {endpoint}: {site}"
-        except NoAnswerError as error:
-            yield False, str(error)
-        except BusError:
-            yield False, foreign_program(endpoint, is_secure=config.security is not None)
+        return
+    if is_exposed(config):
+        yield False, exposure_problem(config)
+    if not accepts_connections(endpoint):
+        yield True, f"bus.endpoint {endpoint}: {'free' if config.mode == 'peer' else 'no router yet'}"
+        return
+    try:
+        running += running_sessions(settings)
+        site = f"site {settings.site!r} runs there" if running else "fantwin answers there"
+        yield True, f"bus.endpoint {endpoint}: {site}"
+    except NoAnswerError as error:
+        yield False, str(error)
+    except BusError:
+        yield False, foreign_program(endpoint, is_secure=config.security is not None)
 
 
 def _check_certificates(settings: Config) -> Iterator[tuple[bool, str]]:
@@ -222,12 +213,8 @@ def _check_certificates(settings: Config) -> Iterator[tuple[bool, str]]:
     if security is None:
         return
     answers = settings.bus.mode == "client" and accepts_connections(settings.bus.endpoint)
-    processes = [role_names(row.stage, row.shard) for row in process_list(settings)]
-    here = [
-        role
-        for role in dict.fromkeys(role for names in (*processes, READERS) for role in names)
-        if of_role(security.certificate, role).exists()
-    ]
+    roles = [role for row in process_list(settings) for role in role_names(row.stage, row.shard)]
+    here = [role for role in dict.fromkeys((*roles, *READERS)) if of_role(security.certificate, role).exists()]
     if not here:
         yield False, f"{security.certificate}: no certificate of any role here: `fantwin certs issue` makes them"
     for role in here:
@@ -250,12 +237,12 @@ def _check_certificates(settings: Config) -> Iterator[tuple[bool, str]]:
 
 def running_sessions(settings: Config) -> list[Session]:
     """The sessions of the site that run, by name; those are waited for that the first one met still introduces."""
-    stop, found = threading.Event(), set[str]()
+    found: set[str] = set()
     with join_bus(settings, listens=False) as bus:
-        bus.wait_for_others(stop)
+        bus.wait_for_others(threading.Event())
         for _ in range(_LOOKS):
             found |= bus.alive(sessions_key(settings.site))
-            stop.wait(GOSSIP_S)
+            time.sleep(GOSSIP_S)
     return sorted(filter(None, map(Session.of_key, found)), key=lambda session: session.name)
 
 
@@ -266,54 +253,46 @@ def _check_stages(
     found: dict[str, list[str]] = {}
     """by problem: the processes that have it"""
     for row in process_list(config):
-        ours = Session.of_this_process(row.stage, row.shard, 0, "")
-        session = next((s for s in running if s.stage == row.stage and s.shares_a_tray_with(ours)), None)
-        is_here = session is not None and session.host == ours.host
-        stage = load_stage(row.stage)
         has_devices = STAGES[row.stage].scope == "tray"
         trays = tuple(config.tray(name) for name in row.shard.trays if not has_devices or name in lines)
         if not trays:
             continue
-        groups = [(tray,) for tray in trays] if stage.core_per_tray else [trays]
-        contexts = [
-            Context(
-                site=config.site,
-                trays=group,
-                config=config.sections[row.stage],
-                folder=config.folder,
-                run_folder=config.run_folder,
-                instance=row.instance,
-                shard_number=row.shard.number,
-                started_t_ns=time.time_ns(),
-                is_running=is_here,
-            )
-            for group in groups
-        ]
-        problems = [problem for context in contexts for problem in stage.check(context)]
-        for problem in dict.fromkeys(problems):
-            found.setdefault(problem, []).append(row.label)
-        if not problems:
-            yield True, f"{row.label}: {_runs_already(session, row.label) if session else 'can start'}"
-        if row.stage == RECORDER and not problems:
-            yield from _check_recordings(contexts[0], row.label)
-        if row.stage == "acquisition" and listen_s and not problems:
+        ours = Session.of_this_process(row.stage, row.shard, 0, "")
+        session = next((s for s in running if s.stage == row.stage and s.shares_a_tray_with(ours)), None)
+        whole = Context(
+            site=config.site,
+            trays=trays,
+            config=config.sections[row.stage],
+            folder=config.folder,
+            run_folder=config.run_folder,
+            instance=row.instance,
+            shard_number=row.shard.number,
+            started_t_ns=time.time_ns(),
+            is_running=session is not None and session.host == ours.host,
+        )
+        stage = load_stage(row.stage)
+        contexts = [replace(whole, trays=(tray,)) for tray in trays] if stage.core_per_tray else [whole]
+        if problems := dict.fromkeys(problem for context in contexts for problem in stage.check(context)):
+            for problem in problems:
+                found.setdefault(problem, []).append(row.label)
+            continue
+        other = f" as {session.name}" if session and session.name != row.label else ""
+        yield True, f"{row.label}: {f'runs already{other} ({session.process})' if session else 'can start'}"
+        if row.stage == RECORDER:
+            yield _recordings(whole, row.label)
+        if row.stage == "acquisition" and listen_s:
             for context in contexts:
                 yield from check_line(context, config, listen_s, is_running=session is not None)
     yield from ((False, f"{', '.join(labels)}: {problem}") for problem, labels in found.items())
 
 
-def _check_recordings(context: Context, label: str) -> Iterator[tuple[bool, str]]:
+def _recordings(context: Context, label: str) -> tuple[bool, str]:
     """The space and days that recordings take of their limits."""
     try:
         folder = context.own_file(context.config.file).parent
-        yield True, f"{label}: {usage_of(folder, context.config, context.started_t_ns)}"
+        return True, f"{label}: {usage_of(folder, context.config, context.started_t_ns)}"
     except (OSError, UserError) as error:
-        yield False, f"{label}: the recordings cannot be read: {error}"
-
-
-def _runs_already(session: Session, label: str) -> str:
-    other = "" if session.name == label else f" as {session.name}"
-    return f"runs already{other} ({session.process})"
+        return False, f"{label}: the recordings cannot be read: {error}"
 
 
 def _version(package: str) -> str:
