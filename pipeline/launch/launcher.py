@@ -229,11 +229,8 @@ class Launcher:
             if stop.is_set():
                 return
             for slot in reversed(group):
-                try:
-                    self._start(slot)
-                except OSError as error:
-                    why = f"{slot.row.label}: no process could be started: {_reason(error)}"
-                    raise UserError(f"{why}; free memory, or allow more processes and open files (ulimit)") from error
+                if why := self._start(slot):
+                    raise UserError(f"{why}; free memory, or allow more processes and open files (ulimit)")
             self._wait_until_ready(group, stop)
         self._is_started = not stop.is_set()
 
@@ -247,27 +244,24 @@ class Launcher:
                 self._say(f"{late}: not ready after {_READY_TIMEOUT_S:.0f} s, continuing; see `fantwin doctor`")
                 return
 
-    def _start(self, slot: _Slot) -> None:
-        slot.child = Child(
-            slot.row,
-            self._path,
-            self._overrides,
-            lambda row, line: self._say(f"{row.label} | {line}"),
-            HOST_CLOCK.offset_ns,
-        )
-        slot.was_seen = False
-        slot.sessions.append((slot.row.label, slot.child.process_id))
-        self._watcher.add_launched(slot.sessions[-1])
-        self._hang_detector.started(slot.row.label, time.monotonic())
-        self._say(f"{slot.row.label}: started, process {slot.child.process_id}")
-
-    def _start_again(self, slot: _Slot, now: float) -> None:
+    def _start(self, slot: _Slot) -> str:
+        """Start its process; returns why the system has none for it, empty if it has."""
+        slot.child, label = None, slot.row.label
         try:
-            self._start(slot)
+            slot.child = Child(
+                slot.row,
+                self._path,
+                self._overrides,
+                lambda row, line: self._say(f"{row.label} | {line}"),
+                HOST_CLOCK.offset_ns,
+            )
         except OSError as error:
-            again = f"trying again in {slot.delay_s:.1f} s"
-            self._say(f"{slot.row.label}: no process could be started: {_reason(error)}; {again}")
-            self._delay_start(slot, now)
+            return f"{label}: no process could be started: {error.strerror or error}"
+        slot.was_seen, slot.hung = False, ""
+        slot.sessions.append((label, slot.child.process_id))
+        self._watcher.add_launched(slot.sessions[-1])
+        self._say(f"{label}: started, process {slot.child.process_id}")
+        return ""
 
     def _delay_start(self, slot: _Slot, now: float) -> None:
         slot.start_at_s = now + slot.delay_s
@@ -279,15 +273,15 @@ class Launcher:
         now = time.monotonic()
         for slot in self._slots:
             if slot.child is None:
-                if slot.start_at_s and now >= slot.start_at_s:
-                    self._start_again(slot, now)
+                if slot.start_at_s and now >= slot.start_at_s and (why := self._start(slot)):
+                    self._say(f"{why}; trying again in {slot.delay_s:.1f} s")
+                    self._delay_start(slot, now)
                 continue
             status = slot.child.exit_status()
             if status is None:
                 slot.was_seen = slot.was_seen or self._watcher.is_ready(slot.child.process_id)
                 slot.was_ready = slot.was_ready or slot.was_seen
-                if slot.child.notices.read():
-                    self._hang_detector.heard(slot.row.label, now, is_ready=slot.child.notices.is_ready)
+                slot.child.hear(now)
                 continue
             if status == EXIT_CANNOT_START and not slot.was_ready:
                 slot.child.stop(0.1)
@@ -297,18 +291,19 @@ class Launcher:
         self._kill_what_hangs(now)
 
     def _kill_what_hangs(self, now: float) -> None:
-        hung = self._hang_detector.hung(now)
+        running = [slot.child for slot in self._slots if slot.child and not slot.hung]
+        hung = self._hang_detector.hung(running, now)
         for slot in self._slots:
-            if hung and slot.child and slot.row.label == hung[0]:
-                status = slot.child.notices.status
+            if hung and slot.child is hung:
+                status = hung.notices.status
                 before = f" (before that: {status})" if status not in ("", StageStatus.OK.words) else ""
-                slot.hung = f"hangs: its main loop has not run for {hung[1]:.0f} s{before}; killed"
-                slot.child.kill()
+                slot.hung = f"hangs: its main loop has not run for {now - hung.heard_s:.0f} s{before}; killed"
+                hung.kill()
 
     def _report_changes(self) -> None:
         now = time.monotonic()
         processes = {
-            slot.row.label: RunningProcess(slot.child.process_id, self._hang_detector.is_at_work(slot.row.label, now))
+            slot.row.label: RunningProcess(slot.child.process_id, slot.child.is_at_work(now))
             for slot in self._slots
             if slot.child and slot.was_seen
         }
@@ -324,8 +319,6 @@ class Launcher:
             slot.child.stop(0.1)  # its last line may still be in the pipe
             how = f"cannot start: {slot.child.last_line}"
         self._say(f"{slot.row.label}: {slot.hung or how}, restarting in {slot.delay_s:.1f} s")
-        slot.hung = ""
-        self._hang_detector.ended(slot.row.label)
         slot.child.notices.close()
         self.outcome.restarts[slot.row.label] = self.outcome.restarts.get(slot.row.label, 0) + 1
         slot.child = None
@@ -336,13 +329,9 @@ class Launcher:
         started = [slot for slot in self._slots if slot.child or slot.start_at_s]
         down = [slot for slot in started if slot.child is None or slot.child.exit_status() is not None]
         for slot in down:
-            try:
-                self._start(slot)
-            except OSError as error:
-                slot.child = None
+            if why := self._start(slot):
                 self.outcome.failed.append(slot.row.label)
-                why = f"no process could be started: {_reason(error)}"
-                self._say(f"{slot.row.label}: {why}; what it missed while it was down is lost")
+                self._say(f"{why}; what it missed while it was down is lost")
         until_s = time.monotonic() + self._config.launcher.watchdog_s
         awaited = [slot for slot in started if slot.was_ready or slot in down]
         while time.monotonic() < until_s and not all(map(self._is_back, awaited)):
@@ -362,19 +351,19 @@ class Launcher:
                 self._stop(slot, child)
 
     def _stop(self, slot: _Slot, child: Child) -> None:
-        status = child.stop(self._config.launcher.watchdog_s)
+        status, problem = child.stop(self._config.launcher.watchdog_s), ""
         if status is None:
             self.outcome.killed.append(slot.row.label)
             self._say(f"{slot.row.label}: did not stop in {self._config.launcher.watchdog_s:.0f} s, killed")
         elif status not in _ORDERLY:
-            self.outcome.failed.append(slot.row.label)
-            self._say(f"{slot.row.label}: ended with status {status}: {child.last_line}")
+            problem = f"ended with status {status}: {child.last_line}"
         elif not self._has_reported(slot):
-            self.outcome.failed.append(slot.row.label)
-            self._say(f"{slot.row.label}: its last health message did not arrive: what it lost is unknown")
+            problem = "its last health message did not arrive: what it lost is unknown"
         elif self._is_started and not slot.was_ready:
+            problem = "was never ready: it has received nothing"
+        if problem:
             self.outcome.failed.append(slot.row.label)
-            self._say(f"{slot.row.label}: was never ready: it has received nothing")
+            self._say(f"{slot.row.label}: {problem}")
         slot.child = None
 
     def _has_reported(self, slot: _Slot) -> bool:
@@ -388,10 +377,6 @@ class Launcher:
             if time.monotonic() >= until_s:
                 return False
             time.sleep(_POLL_S)
-
-
-def _reason(error: OSError) -> str:
-    return error.strerror or str(error)
 
 
 def _listens_only(row: StageProcess) -> bool:

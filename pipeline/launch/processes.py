@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import errno
+import math
 import os
 import secrets
 import signal
@@ -13,9 +14,9 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
+from typing import Protocol, TypeVar
 
 from fantwin.pipeline.config.shards import StageProcess
 from fantwin.pipeline.runtime.service_manager import VARIABLE as NOTIFY_VARIABLE
@@ -26,63 +27,50 @@ _AT_WORK_S = 2.0
 _OWN_PAUSE_S = 1.0  # the launcher itself did not run: the machine was suspended or very busy
 
 
-@dataclass(slots=True)
-class _Heard:
-    at_s: float
-    is_ready: bool = False
+class Heard(Protocol):
+    """A process that says when its main loop runs. Times: monotonic clock, s."""
+
+    heard_s: float
+    """when it ran last, or when the process was started"""
+
+    @property
+    def is_ready(self) -> bool:
+        """Whether it has said that it is ready."""
+        ...
+
+
+_Process = TypeVar("_Process", bound=Heard)
 
 
 class HangDetector:
-    """Notes when each stage was last at work, and names the one that hangs. Times: monotonic clock, s.
+    """Names the process that hangs.
 
-    A stage that publishes to a hung stage is soon blocked itself. So only the stage that has been silent longest is
+    A stage that publishes to a hung stage is soon blocked itself. So only the process that has been silent longest is
     named. All others get a new period, because they go on once it is gone.
     """
 
     def __init__(self, limit_s: float) -> None:
-        """limit_s: how long a stage may be silent."""
+        """limit_s: how long a process may be silent."""
         self._limit_s = limit_s
-        self._heard: dict[str, _Heard] = {}
-        self._checked_s: float | None = None
+        self._checked_s = math.inf
 
-    def started(self, name: str, now_s: float) -> None:
-        """A stage has been started."""
-        self._heard[name] = _Heard(now_s)
+    def hung(self, running: Sequence[_Process], now_s: float) -> _Process | None:
+        """The process that hangs; None if none does.
 
-    def heard(self, name: str, now_s: float, *, is_ready: bool) -> None:
-        """The main loop of a stage has run."""
-        self._heard[name] = _Heard(now_s, is_ready)
-
-    def is_at_work(self, name: str, now_s: float) -> bool:
-        """Whether the main loop of a stage ran a moment ago."""
-        return name in self._heard and now_s - self._heard[name].at_s < _AT_WORK_S
-
-    def ended(self, name: str) -> None:
-        """A stage has ended."""
-        self._heard.pop(name, None)
-
-    def hung(self, now_s: float) -> tuple[str, float] | None:
-        """The stage that hangs, and for how many seconds; None if none does.
-
-        Call it at least once a second: a longer pause is taken to be one of the caller itself, and no stage is blamed
-        for it. The stage that is returned is forgotten; the caller must kill it.
+        Call it at least once a second: a longer pause is taken to be one of the caller itself, and no process is blamed
+        for it.
         """
-        pause_s = 0.0 if self._checked_s is None else now_s - self._checked_s
-        self._checked_s = now_s
+        pause_s, self._checked_s = now_s - self._checked_s, now_s
         if pause_s > _OWN_PAUSE_S:
-            for heard in self._heard.values():
-                heard.at_s = min(now_s, heard.at_s + pause_s)
-        silent = {name: now_s - heard.at_s for name, heard in self._heard.items() if self._is_overdue(heard, now_s)}
-        if not silent:
-            return None
-        name = max(silent, key=lambda each: silent[each])
-        del self._heard[name]
-        for heard in self._heard.values():
-            heard.at_s = now_s
-        return name, silent[name]
-
-    def _is_overdue(self, heard: _Heard, now_s: float) -> bool:
-        return now_s - heard.at_s > (self._limit_s if heard.is_ready else max(self._limit_s, START_LIMIT_S))
+            for each in running:
+                each.heard_s = min(now_s, each.heard_s + pause_s)
+        limits_s = {True: self._limit_s, False: max(self._limit_s, START_LIMIT_S)}
+        overdue = [each for each in running if now_s - each.heard_s > limits_s[each.is_ready]]
+        found = min(overdue, key=lambda each: each.heard_s, default=None)
+        for each in running if found else ():
+            if each is not found:
+                each.heard_s = now_s
+        return found
 
 
 _MAX_BYTES = 4096
@@ -148,23 +136,11 @@ class Child:
         Raises:
             OSError: the system has no room for another process; nothing is left of it.
         """
-        command = [
-            sys.executable,
-            "-P",
-            "-m",
-            "fantwin",
-            "up",
-            "--only",
-            row.stage,
-            "-c",
-            str(config_path),
-            *row.shard.words,
-        ]
-        for override in overrides:
-            command += ["--set", override]
+        command = [*(sys.executable, "-P", "-m", "fantwin", "up", "--only", row.stage, "-c", str(config_path))]
+        command += [*row.shard.words, *(word for override in overrides for word in ("--set", override))]
         self.row = row
         self._is_asked_to_end = False
-        self.started_s = time.monotonic()
+        self.started_s = self.heard_s = time.monotonic()
         self.last_line = ""
         self._on_line = on_line
         self.notices = Notices()
@@ -193,17 +169,27 @@ class Child:
             text=True,
             errors="replace",
             start_new_session=True,
-            env={
-                **os.environ,
-                NOTIFY_VARIABLE: self.notices.address,
-                CLOCK_VARIABLE: str(clock_offset_ns),
-            },
+            env={**os.environ, NOTIFY_VARIABLE: self.notices.address, CLOCK_VARIABLE: str(clock_offset_ns)},
         )
 
     @property
     def process_id(self) -> int:
         """Its process id."""
         return self._process.pid
+
+    @property
+    def is_ready(self) -> bool:
+        """Whether it has said that it is ready."""
+        return self.notices.is_ready
+
+    def hear(self, now_s: float) -> None:
+        """Take what it has said."""
+        if self.notices.read():
+            self.heard_s = now_s
+
+    def is_at_work(self, now_s: float) -> bool:
+        """Whether its main loop ran a moment ago."""
+        return now_s - self.heard_s < _AT_WORK_S
 
     def exit_status(self) -> int | None:
         """None while it runs; negative: ended by that signal."""

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import errno
 import json
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -46,11 +46,7 @@ def load_for_this_host(path: Path, overrides: Sequence[str] = (), stages: Sequen
     Raises:
         ConfigError: see `load_config`.
     """
-    config = load_config(path, overrides, stages)
-    missing = {name: _missing(name) for name in _with_extra(config)}
-    lines = tuple(filter(None, missing.values()))
-    left_out = [name for name, line in missing.items() if line]
-    return ThisHost(*_without(config, left_out, overrides, stages), lines)
+    return _loaded(path, overrides, stages, missing_extra)
 
 
 def load_for_any_host(path: Path, overrides: Sequence[str] = (), stages: Sequence[str] | None = None) -> Config:
@@ -61,29 +57,21 @@ def load_for_any_host(path: Path, overrides: Sequence[str] = (), stages: Sequenc
     Raises:
         ConfigError: see `load_config`.
     """
+    return _loaded(path, overrides, stages, lambda what, _extra: what).config
+
+
+def _loaded(
+    path: Path, overrides: Sequence[str], stages: Sequence[str] | None, why_not: Callable[[str, str], str]
+) -> ThisHost:
+    """why_not: says why a stage that needs an extra is left out; empty if it is not."""
     config = load_config(path, overrides, stages)
-    return _without(config, _with_extra(config), overrides, stages)[0]
-
-
-def _with_extra(config: Config) -> list[str]:
-    if config.launcher.stages is not None:
-        return []
-    return [name for name in config.stages if STAGES[name].extra]
-
-
-def _without(
-    config: Config, left_out: Sequence[str], overrides: Sequence[str], stages: Sequence[str] | None
-) -> tuple[Config, tuple[str, ...]]:
-    """The configuration without some stages, and the overrides that say so."""
-    if not left_out:
-        return config, tuple(overrides)
-    chosen = (*overrides, f"launcher.without={json.dumps([*config.launcher.without, *left_out])}")
-    return load_config(config.path, chosen, stages), chosen
-
-
-def _missing(stage: str) -> str:
-    extra = STAGES[stage].extra
-    return missing_extra(f"stage {stage} is left out: it", extra) if extra else ""
+    optional = [name for name in config.stages if STAGES[name].extra and config.launcher.stages is None]
+    found = {name: why_not(f"stage {name} is left out: it", STAGES[name].extra) for name in optional}
+    left_out = {name: line for name, line in found.items() if line}
+    if left_out:
+        overrides = (*overrides, f"launcher.without={json.dumps([*config.launcher.without, *left_out])}")
+        config = load_config(path, overrides, stages)
+    return ThisHost(config, tuple(overrides), tuple(left_out.values()))
 
 
 def with_free_port(host: ThisHost, trays: Collection[str] | None) -> ThisHost:

@@ -7,8 +7,9 @@ import os
 import sys
 import threading
 from contextlib import suppress
+from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -19,9 +20,6 @@ from fantwin.pipeline.config.registry import STAGES
 from fantwin.pipeline.config.shards import chosen_shard, chosen_trays
 from fantwin.pipeline.errors import UsageError, UserError
 from fantwin.pipeline.runtime.signals import ignore_hangup, set_when_stdin_closes, stop_on_signals
-
-if TYPE_CHECKING:
-    from fantwin.pipeline.launch.launcher import Outcome
 
 
 def up(
@@ -116,15 +114,8 @@ def _run_all(
         raise
     finally:
         log.close()
-    if json_output:
-        _print_json(outcome)
+    if json_output:  # the exit code stands whether or not somebody reads it
+        with suppress(OSError):
+            os.write(sys.stdout.fileno(), f"{json.dumps(asdict(outcome))}\n".encode())
     if outcome.exit_code:
         raise typer.Exit(outcome.exit_code)
-
-
-def _print_json(outcome: Outcome) -> None:
-    """To standard output, where somebody may read it; the exit code stands whether or not it can be written."""
-    names = ("run_folder", "recordings", "restarts", "killed", "failed", "lost", "refused", "notes", "unusable")
-    found = {name: getattr(outcome, name) for name in names}
-    with suppress(OSError):
-        os.write(sys.stdout.fileno(), f"{json.dumps(found)}\n".encode())

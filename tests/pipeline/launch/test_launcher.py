@@ -252,7 +252,7 @@ def test_a_stage_that_was_restarted_just_before_the_end_is_waited_for(monkeypatc
 class EndedChild:
     """The process of a stage that ends in order."""
 
-    process_id = 7
+    process_id, heard_s, is_ready = 7, float("inf"), True
     last_line = ""
 
     def exit_status(self) -> int:
