@@ -8,7 +8,6 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
 import typer
@@ -47,14 +46,13 @@ class Reporter:
     Elsewhere a line comes when something else is done than before, and every LINE_PERIOD_S. A context manager.
     """
 
-    def __init__(self, quietly: str = "", *, has_lines: bool = True) -> None:
-        """quietly: what begins without a line. has_lines: whether there are lines where there is no terminal."""
+    def __init__(self, quietly: str = "") -> None:
+        """quietly: what begins without a line."""
         self.console = console = Console(stderr=True, highlight=False)
         """what is printed with it stands above the bar"""
-        self._has_lines = has_lines and not console.is_terminal
+        self._has_lines = not console.is_terminal
         columns = (TextColumn("{task.description}", markup=False), BarColumn(), TextColumn("{task.fields[count]}"))
-        is_disabled = not console.is_terminal
-        self._bars = Progress(*columns, TimeElapsedColumn(), console=console, transient=True, disable=is_disabled)
+        self._bars = Progress(*columns, TimeElapsedColumn(), console=console, transient=True, disable=self._has_lines)
         self._bar: TaskID | None = None
         self._doing = quietly
         self.restart()
@@ -84,7 +82,7 @@ class Reporter:
         self._bars.start()
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+    def __exit__(self, *_error: object) -> None:
         self._bars.stop()
 
 

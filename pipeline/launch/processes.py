@@ -15,6 +15,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Protocol, TypeVar
 
@@ -144,33 +145,28 @@ class Child:
         self.last_line = ""
         self._on_line = on_line
         self.notices = Notices()
-        try:
-            self._process = self._started([*command, "--until-stdin-closes"], clock_offset_ns)
-        except OSError:
-            self.notices.close()
-            raise
         self._reader = threading.Thread(target=self._read, daemon=True)
-        try:
-            self._reader.start()
-        except RuntimeError as error:  # the limit of threads, which is that of processes
-            self._process.kill()
-            self._process.wait()
-            self.notices.close()
-            raise OSError(errno.EAGAIN, os.strerror(errno.EAGAIN)) from error
-
-    def _started(self, command: list[str], clock_offset_ns: int) -> subprocess.Popen[str]:
-        # a process group of its own, so that Ctrl-C in the terminal reaches only the launcher, which stops all;
-        # the launcher holds standard input open: when the launcher ends, however it ends, the child stops too
-        return subprocess.Popen(
-            command,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.PIPE,
-            text=True,
-            errors="replace",
-            start_new_session=True,
-            env={**os.environ, NOTIFY_VARIABLE: self.notices.address, CLOCK_VARIABLE: str(clock_offset_ns)},
-        )
+        with ExitStack() as undo:
+            undo.callback(self.notices.close)
+            # a process group of its own, so that Ctrl-C in the terminal reaches only the launcher, which stops all;
+            # the launcher holds standard input open: when the launcher ends, however it ends, the child stops too
+            self._process = subprocess.Popen(
+                [*command, "--until-stdin-closes"],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.PIPE,
+                text=True,
+                errors="replace",
+                start_new_session=True,
+                env={**os.environ, NOTIFY_VARIABLE: self.notices.address, CLOCK_VARIABLE: str(clock_offset_ns)},
+            )
+            undo.callback(self._process.wait)
+            undo.callback(self._process.kill)
+            try:
+                self._reader.start()
+            except RuntimeError as error:  # the limit of threads, which is that of processes
+                raise OSError(errno.EAGAIN, os.strerror(errno.EAGAIN)) from error
+            undo.pop_all()
 
     @property
     def process_id(self) -> int:

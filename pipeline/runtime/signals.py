@@ -7,6 +7,7 @@ import signal
 import socket
 import sys
 import threading
+from collections.abc import Callable
 
 
 def stop_on_signals() -> threading.Event:
@@ -25,15 +26,15 @@ def stop_on_signals() -> threading.Event:
     return stop
 
 
-def set_when_stdin_closes(event: threading.Event) -> None:
-    """Set `event` when standard input ends: the process that started this one holds it open for as long as it lives."""
-    threading.Thread(target=_wait_for_stdin, args=(event,), name="stdin", daemon=True).start()
+def when_stdin_closes(act: Callable[[], None]) -> None:
+    """Act when standard input ends: the process that started this one holds it open for as long as it lives."""
 
+    def wait() -> None:
+        while os.read(sys.stdin.fileno(), 1024):  # sys.stdin.read() would hold its lock at the interpreter's end
+            pass
+        act()
 
-def _wait_for_stdin(event: threading.Event) -> None:
-    while os.read(sys.stdin.fileno(), 1024):  # not sys.stdin.read(): its lock would be held at the interpreter's end
-        pass
-    event.set()
+    threading.Thread(target=wait, name="stdin", daemon=True).start()
 
 
 def ignore_hangup() -> None:

@@ -128,7 +128,7 @@ def replay(
         missing = _left_out(playback.files, chosen, is_asked_for=bool(topics or from_topic))
         replay_config = resolve_config(playback.files[0], playback.first, config, overrides or ())
         stop = stop_on_signals()
-        reporter, end_s = Reporter(has_lines=False), playback.end_s()
+        reporter, end_s = Reporter(), playback.end_s()
         console = reporter.console
         if missing:
             console.print(missing, markup=False, soft_wrap=True)

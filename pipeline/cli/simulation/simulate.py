@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import time as clock
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -15,7 +16,7 @@ import typer
 from fantwin.pipeline.cli.options import JsonOption, SetOption
 from fantwin.pipeline.cli.printing import show
 from fantwin.pipeline.cli.progress import Reporter
-from fantwin.pipeline.cli.simulation.scenario import Scenario, read_scenario
+from fantwin.pipeline.cli.simulation.scenario import read_scenario
 from fantwin.pipeline.errors import UsageError, UserError
 from fantwin.pipeline.files import write_whole
 from fantwin.pipeline.recordings.raw_recordings import record
@@ -102,12 +103,14 @@ def simulate(
             raise UsageError("--recording excludes --link and --wait-for-reader")
         if recording.exists():
             raise UserError(f"{recording}: exists; name another file with --recording, or delete it")
+        if wanted.duration_s is None:
+            raise UsageError("a recording needs its length in seconds: --duration S")
         epoch_ns = clock.time_ns() if wanted.epoch_ns is None else wanted.epoch_ns
-        length_s, doing = _length_s(wanted), "simulating, s"
+        length_s, doing = int(wanted.duration_s), "simulating, s"
         with Reporter(quietly=doing) as reporter:
             played = record(
                 *(device, recording, epoch_ns, wanted.speed_unit, tachos),
-                lambda t_s: reporter.show(doing, int(t_s), int(length_s)),
+                lambda t_s: reporter.show(doing, int(t_s), length_s),
             )
     else:
 
@@ -122,12 +125,6 @@ def simulate(
     show(summary, count_text(played), json_output=json_output)
 
 
-def _length_s(wanted: Scenario) -> float:
-    if wanted.duration_s is None:
-        raise UsageError("a recording needs its length in seconds: --duration S")
-    return wanted.duration_s
-
-
 def serve_line(
     device: SimulatedTray | TableDevice,
     link: Path | None,
@@ -140,28 +137,21 @@ def serve_line(
 ) -> PlaybackCounts:
     """Play the device on a pseudo-terminal. wait: for a reader. err: say on stderr where it is."""
     stop = stop_on_signals()
-    line = PseudoTerminal(link)
-    try:
+    with closing(PseudoTerminal(link)) as line:
         fans_on = "1 fan on" if device.fans == 1 else f"{device.fans} fans on"
         typer.echo(f"{fans_on} {link or line.port}: {protocol}, speeds in {speed_unit}", err=err)
         if wait:
             wait_for_reader(line, protocol, stop)
         return play(device, line, protocol, RAD_S_PER_UNIT[speed_unit], stop, on_start)
-    finally:
-        line.close()
 
 
 def serve_hwmon(tray: SimulatedTray, root: Path, chip: str, *, err: bool) -> PlaybackCounts:
     """Run the tray behind a tree of files until Ctrl-C. err: say where on stderr."""
     stop = stop_on_signals()
-    tree = HwmonTree(root, chip, tray.fans)
-    try:
-        typer.echo(
-            f"{tray.fans} fans of {chip} in {root}; faults: echo tacho-stuck:fan=0 > {root / FAULT_FILE}", err=err
-        )
+    with closing(HwmonTree(root, chip, tray.fans)) as tree:
+        faults = f"echo tacho-stuck:fan=0 > {root / FAULT_FILE}"
+        typer.echo(f"{tray.fans} fans of {chip} in {root}; faults: {faults}", err=err)
         return play_hwmon(tray, tree, stop, InjectedFaults(tray, root).follow)
-    finally:
-        tree.close()
 
 
 RATE_HZ = 20.0
@@ -232,29 +222,17 @@ class InjectedFaults:
 Summary = dict[str, Any]
 
 
-def _counts(played: PlaybackCounts) -> Summary:
-    counts = asdict(played)
-    del counts["start_ns"]
-    return counts
-
-
 def summary_of_tray(tray: SimulatedTray, played: PlaybackCounts, *, complete: bool) -> Summary:
     """The ground truth of a simulated tray, and how many of its samples were sent, dropped and lost."""
     from fantwin.simulation.truth import truth  # noqa: PLC0415
 
-    return truth(tray, played.start_ns, complete=complete, counts=_counts(played))
+    counts = {name: count for name, count in asdict(played).items() if name != "start_ns"}
+    return truth(tray, played.start_ns, complete=complete, counts=counts)
 
 
 def summary_of_file(path: Path, table: TableDevice, played: PlaybackCounts, *, complete: bool) -> Summary:
     """The same for a played file, whose faults are not known."""
-    return {
-        "complete": complete,
-        "start_ns": played.start_ns,
-        **_counts(played),
-        "faults": [],
-        "fans": table.fans,
-        "file": str(path),
-    }
+    return {"complete": complete, **asdict(played), "faults": [], "fans": table.fans, "file": str(path)}
 
 
 def save(path: Path | None, summary: Summary) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -15,13 +16,12 @@ from rich.console import Console
 from fantwin.pipeline.cli.in_parallel import JobsOption, RecordingsInParallel, SkipBadOption
 from fantwin.pipeline.cli.options import JsonOption, SetOption
 from fantwin.pipeline.cli.progress import interruptible, show_part
-from fantwin.pipeline.cli.twins.data_options import FromOption, ToOption
+from fantwin.pipeline.cli.twins.data_options import FromOption, ToOption, recordings_argument, recordings_option
 from fantwin.pipeline.errors import UsageError, UserError
 from fantwin.pipeline.files import write_whole
 from fantwin.pipeline.learning.drops_found import drops_found
 from fantwin.pipeline.learning.fitting import calibrated_on, with_calibration
 from fantwin.pipeline.learning.healthy_evidence import Check, check_declared_rate, marked_running, outlier_warnings
-from fantwin.pipeline.recordings.remote import matching, recording_path
 from fantwin.pipeline.replay.offline.calibration_of_twin import (
     LARGEST_PER_DAY,
     number_text,
@@ -45,9 +45,7 @@ def calibrate(
     twin: Annotated[Path, typer.Argument(metavar="TWIN.onnx", help="Twin whose alarms are calibrated.")],
     healthy: Annotated[
         list[Path] | None,
-        typer.Argument(
-            parser=recording_path,
-            callback=matching,
+        recordings_argument(
             metavar="HEALTHY.mcap...",
             help="Healthy recordings, preferably not those that the twin was trained on.",
         ),
@@ -64,9 +62,7 @@ def calibrate(
     ] = None,
     verify: Annotated[
         list[Path] | None,
-        typer.Option(
-            parser=recording_path,
-            callback=matching,
+        recordings_option(
             metavar="OTHER.mcap...",
             help="Other healthy recordings, to test the declared rate: all arguments up to the next option, so name "
             "TWIN.onnx and HEALTHY.mcap... before it.",
@@ -74,9 +70,7 @@ def calibrate(
     ] = None,
     feedback: Annotated[
         list[Path] | None,
-        typer.Option(
-            parser=recording_path,
-            callback=matching,
+        recordings_option(
             metavar="FILE...",
             help="Other recordings, or the alarms.sqlite of a gateway, in which operators marked alarms of these "
             "recordings as true or false: all arguments up to the next option.",
@@ -122,10 +116,13 @@ def calibrate(
     Example: fantwin calibrate TWIN.onnx --verify healthy-3.mcap healthy-4.mcap
     """
     _refuse_wrong_arguments(twin, healthy or [], verify or [], overrides or [])
-    if not healthy:
-        finding = {"--false-alarms-per-day": false_alarms_per_day, "--extrapolate": extrapolate, "--output": output}
-        finding |= {"--alarms-left-out": alarms_left_out, "--from": from_s > 0.0, "--to": to_s < math.inf}
-        _refuse_without_healthy([name for name, value in finding.items() if value])
+    finding = {"--false-alarms-per-day": false_alarms_per_day, "--extrapolate": extrapolate, "--output": output}
+    finding |= {"--alarms-left-out": alarms_left_out, "--from": from_s > 0.0, "--to": to_s < math.inf}
+    if not healthy and (given := [name for name, value in finding.items() if value]):
+        raise UsageError(
+            f"{given[0]} needs recordings to calibrate on, and there are none: those after --verify only test; "
+            "name HEALTHY.mcap... before it"
+        )
     if output and (output.is_dir() or not output.parent.is_dir()):  # before an hour of scoring
         raise UserError(f"{output}: cannot write the twin: name a file in an existing folder")
     result: dict[str, Any] = {}
@@ -139,15 +136,8 @@ def calibrate(
             for line in marked.lines:
                 typer.echo(line, err=True)
             part = HealthyPart(twin, tuple(overrides or ()), from_s, to_s, tray, marked.left_out)
-            found = calibrated_on(
-                healthy,
-                part,
-                false_alarms_per_day,
-                pool.map,
-                extrapolate=extrapolate,
-                alarms_left_out=alarms_left_out,
-                progress=show_part,
-            )
+            how = {"extrapolate": extrapolate, "alarms_left_out": alarms_left_out, "progress": show_part}
+            found = calibrated_on(healthy, part, false_alarms_per_day, pool.map, **how)
             calibration, speed_unit = found.calibration, found.learned[0].tray.speed_unit
             output = output or twin
             write_whole(output, with_calibration(twin, calibration))
@@ -185,28 +175,12 @@ def _refuse_wrong_arguments(twin: Path, healthy: list[Path], verify: list[Path],
         )
     for path in (path for path in verify if path.suffix == ".onnx"):
         raise UsageError(f"{path}: --verify takes recordings, and all arguments after it: name TWIN.onnx before it")
-    _named_once([*healthy, *verify])
+    counts = Counter(path.resolve() for path in (*healthy, *verify))
+    for path in (path for path in (*healthy, *verify) if counts[path.resolve()] > 1):
+        raise UsageError(f"{path}: named twice: every recording counts once, and --verify takes others")
     for key in (override.partition("=")[0].strip() for override in overrides if healthy):
         if key.startswith("scorer."):
             raise UsageError(f"--set {key}: [scorer] does not affect calibration: leave it out, or use --verify alone")
-
-
-def _refuse_without_healthy(names: list[str]) -> None:
-    """names: options that were given and are for calibrating."""
-    if names:
-        raise UsageError(
-            f"{names[0]} needs recordings to calibrate on, and there are none: those after --verify only test; "
-            "name HEALTHY.mcap... before it"
-        )
-
-
-def _named_once(recordings: list[Path]) -> None:
-    """Refuse a recording that is named twice: it would count its time twice, and it cannot test its own calibration."""
-    seen: set[Path] = set()
-    for path in recordings:
-        if path.resolve() in seen:
-            raise UsageError(f"{path}: named twice: every recording counts once, and --verify takes others")
-        seen.add(path.resolve())
 
 
 def _print(output: Path, calibration: Calibration, drops: Sequence[str]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Annotated, TypeAlias
 
@@ -14,11 +15,11 @@ from fantwin.pipeline.learning.training_data import TrainingData
 from fantwin.pipeline.recordings.remote import matching, recording_path
 from fantwin.schemas.reference_conditions import HOLD_S
 
+recordings_option = partial(typer.Option, parser=recording_path, callback=matching)
+recordings_argument = partial(typer.Argument, parser=recording_path, callback=matching)
 RecordingsArgument: TypeAlias = Annotated[
     list[Path],
-    typer.Argument(
-        parser=recording_path,
-        callback=matching,
+    recordings_argument(
         metavar="REC.mcap...",
         help="Recordings, also at URLs; each counts its seconds from its own start.",
     ),
@@ -47,9 +48,7 @@ IgnoreOption: TypeAlias = Annotated[
 ]
 ValidateOption: TypeAlias = Annotated[
     list[Path] | None,
-    typer.Option(
-        parser=recording_path,
-        callback=matching,
+    recordings_option(
         metavar="REC.mcap...",
         help="Held-out healthy recordings: evaluated, not fitted. Of one that is also trained on, what --to, or else "
         "--from, leaves out.",
@@ -57,9 +56,7 @@ ValidateOption: TypeAlias = Annotated[
 ]
 TestOption: TypeAlias = Annotated[
     list[Path] | None,
-    typer.Option(
-        parser=recording_path,
-        callback=matching,
+    recordings_option(
         metavar="REC.mcap...",
         help="Several models: healthy recordings that decide which is the best, and take no part in training.",
     ),

@@ -23,6 +23,7 @@ from fantwin.pipeline.cli.twins.data_options import (
     WindowOption,
     check_writable,
     ignored_columns,
+    recordings_argument,
     report_damage,
     show_hints,
 )
@@ -32,7 +33,6 @@ from fantwin.pipeline.extras import require
 from fantwin.pipeline.files import write_whole
 from fantwin.pipeline.learning.drops_found import drops_found
 from fantwin.pipeline.learning.training_data import Part, TrainingData, data_cards, read_training_data, twin_errors
-from fantwin.pipeline.recordings.remote import matching, recording_path
 
 if TYPE_CHECKING:
     from fantwin.twin.fitting.identification import Identification
@@ -42,9 +42,7 @@ if TYPE_CHECKING:
 def report(
     files: Annotated[
         list[Path],
-        typer.Argument(
-            parser=recording_path,
-            callback=matching,
+        recordings_argument(
             metavar="[TWIN.onnx] REC.mcap...",
             help="A twin, as `fantwin train` makes it, and recordings; or recordings alone.",
         ),

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import os
 import signal
-import sys
-import threading
 from collections.abc import Iterable, Sequence
 from datetime import datetime
 from enum import StrEnum
+from functools import partial
 from typing import Annotated, Any
 
 import typer
@@ -30,6 +29,7 @@ from fantwin.pipeline.learning.versions import (
     learning_folder,
 )
 from fantwin.pipeline.recordings.dates import format_local
+from fantwin.pipeline.runtime.signals import when_stdin_closes
 from fantwin.schemas.units import NS_PER_S
 
 CONSEQUENCE = "alarms are discarded and what was learned of the fans begins again, unless only the calibration differs"
@@ -88,7 +88,7 @@ def twins(
         )
     if VARIABLE in os.environ:
         os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))  # it runs while no stage does
-        threading.Thread(target=_end_with_parent, daemon=True).start()
+        when_stdin_closes(partial(os.kill, os.getpid(), signal.SIGTERM))  # the stage that started it holds it open
     settings = load_config(config, overrides or (), stages=("learner",))
     of = learning_tray(settings, tray)
     if asked in (VersionAction.LEARN, VersionAction.CHECK):
@@ -144,12 +144,8 @@ def _faulty(versions: TwinVersions, ends: Sequence[str]) -> list[str]:
     if not was:
         return []
     replaced = f"{was} was learned from that time span; in force now: {now}; on a running site {CONSEQUENCE}"
-    return [replaced if now else _no_other(was)]
-
-
-def _no_other(name: str) -> str:
-    stays = f"{name} was learned from that time span and stays in force: no version can replace it"
-    return f"{stays}; the next will not use that time span"
+    stays = f"{was} was learned from that time span and stays in force: no version can replace it"
+    return [replaced if now else f"{stays}; the next will not use that time span"]
 
 
 def _t_ns(text: str) -> int:
@@ -174,13 +170,6 @@ def learning_tray(settings: Config, name: str | None) -> TrayConfig:
         which = f"tray {chosen[0].name} names" if chosen else "every tray names"
         raise UserError(f"{settings.path}: {which} a twin: remove `twin` from [[tray]] to learn one")
     return chosen[0]
-
-
-def _end_with_parent() -> None:
-    """The stage that started this process holds its standard input open."""
-    while os.read(sys.stdin.fileno(), 1):
-        pass
-    os.kill(os.getpid(), signal.SIGTERM)
 
 
 NO_REFERENCE = (
@@ -223,9 +212,11 @@ def check_line(check: Check) -> str:
     """What the last check of the fans found."""
     if not check.reference:
         return NO_REFERENCE
-    changes = _percents(check.change)
-    missing = _not_compared(check.change, check.reference)
-    return f"checked up to {format_local(check.t_ns)}: speed of the fans since {check.reference}: {changes}{missing}"
+    fans = [fan for fan, each in enumerate(check.change) if each is None]
+    named = f"; fan{'s' * (len(fans) > 1)} {', '.join(map(str, fans))}"
+    missing = f"{named}: too few readings at commands that {check.reference} was trained on" if fans else ""
+    changes = f"speed of the fans since {check.reference}: {_percents(check.change)}{missing}"
+    return f"checked up to {format_local(check.t_ns)}: {changes}"
 
 
 def version_lines(version: Version, listed: VersionList) -> list[str]:
@@ -235,16 +226,13 @@ def version_lines(version: Version, listed: VersionList) -> list[str]:
     state = "IN FORCE" if version.name == listed.in_force else not_used
     unit = version.speed_unit
     return [
-        f"{version.name}: {state}: {version.how}; {_limits_from(version)}",
+        f"{version.name}: {state}: {version.how}; "
+        f"limits from {version.hours:.3g} h up to {format_local(version.made_t_ns)}",
         f"  why: {version.why}",
         f"  error {version.error:.3g} {unit}; {version.rate_text}",
         *(f"  {drop.line(unit)}" for drop in version.drops),
         f"  speed of the fans relative to the prediction of {version.reference}: {_percents(version.change)}",
     ]
-
-
-def _limits_from(version: Version) -> str:
-    return f"limits from {version.hours:.3g} h up to {format_local(version.made_t_ns)}"
 
 
 def offer_lines(listed: VersionList) -> list[str]:
@@ -275,12 +263,3 @@ def _drop_of(drop: Drop, unit: str) -> str:
 
 def _percents(change: Iterable[float | None]) -> str:
     return ", ".join("not comparable" if each is None else f"{100 * each:+.1f} %" for each in change)
-
-
-def _not_compared(change: Sequence[float | None], reference: str) -> str:
-    """Which fans a check says nothing about, and why; empty if none."""
-    fans = [fan for fan, each in enumerate(change) if each is None]
-    if not fans:
-        return ""
-    named = f"fan{'s' * (len(fans) > 1)} {', '.join(map(str, fans))}"
-    return f"; {named}: too few readings at commands that {reference} was trained on"

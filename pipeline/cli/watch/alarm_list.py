@@ -4,7 +4,6 @@ the rate of false alarms.
 
 from __future__ import annotations
 
-import math
 import queue
 import threading
 import time
@@ -271,7 +270,8 @@ def _add_score(score: Score, trays: defaultdict[str, _Tray], newest: dict[tuple[
     tray, stream = trays[score.header.tray], (score.header.producer, score.header.tray)
     if score.header.sequence > newest.get(stream, -1) and len(score.t_ns):
         newest[stream] = score.header.sequence
-        tray.since_t_ns = min(tray.since_t_ns or math.inf, int(score.t_ns[0]))
+        first_t_ns = int(score.t_ns[0])
+        tray.since_t_ns = min(tray.since_t_ns or first_t_ns, first_t_ns)
         tray.judged_ns += score.period_ns * int(np.count_nonzero(score.valid))
 
 

@@ -111,20 +111,13 @@ def doctor(
     elif task is Task.NOTIFY:
         send_test_messages(config or DEFAULT_CONFIG, overrides or (), targets or (), json_output=json_output)
     else:
-        _check(config, overrides, listen_s, trays, json_output=json_output)
-
-
-def _check(
-    config: Path | None, overrides: list[str] | None, listen_s: float, trays: list[str] | None, *, json_output: bool
-) -> None:
-    problems, good = [], []
-    for ok, line in _findings(config, overrides, listen_s, trays or []):
-        (good if ok else problems).append(line)
-    marked = [(("ok  ", "green"), line) for line in good] + [(("FIX ", "bold red"), line) for line in problems]
-    lines = (Text.assemble(mark, f" {line}") for mark, line in marked)
-    show({"ok": not problems, "problems": problems, "good": good}, *lines, json_output=json_output)
-    if problems:
-        raise typer.Exit(1)
+        found = list(_findings(config, overrides, listen_s, trays or []))
+        good, problems = ([line for ok, line in found if ok is wanted] for wanted in (True, False))
+        lines = [Text.assemble(("ok  ", "green"), f" {line}") for line in good]
+        lines += [Text.assemble(("FIX ", "bold red"), f" {line}") for line in problems]
+        show({"ok": not problems, "problems": problems, "good": good}, *lines, json_output=json_output)
+        if problems:
+            raise typer.Exit(1)
 
 
 def _findings(

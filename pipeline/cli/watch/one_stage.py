@@ -19,7 +19,7 @@ from fantwin.pipeline.launch.processes import EXIT_CANNOT_START
 from fantwin.pipeline.runtime.figures import without_figures
 from fantwin.pipeline.runtime.runner import Runner
 from fantwin.pipeline.runtime.service_manager import starting
-from fantwin.pipeline.runtime.signals import set_when_stdin_closes
+from fantwin.pipeline.runtime.signals import when_stdin_closes
 from fantwin.pipeline.runtime.stage import load_stage
 from fantwin.schemas.health import Health
 from fantwin.schemas.streams import LOSS_PREFIX
@@ -43,52 +43,37 @@ def run_stage(
     Raises:
         typer.Exit: the stage could not start, failed, or lost data.
     """
-    with checked_exposure(settings.bus, _say, insecure=insecure) if not until_stdin_closes else nullcontext():
-        _run(stage, settings, chosen, stop, json_output=json_output, until_stdin_closes=until_stdin_closes)
+    name, problems = stage_label(stage, chosen.name), Problems(stage_label(stage, chosen.name))
 
-
-def _run(
-    stage: str, settings: Config, chosen: Shard, stop: threading.Event, *, json_output: bool, until_stdin_closes: bool
-) -> None:
-    name = stage_label(stage, chosen.name)
-    try:
-        with starting():
-            problems = Problems(name)
-
-            def report(health: Health) -> None:
-                if not until_stdin_closes:  # a launcher hears it itself
-                    problems.report(health.problem)
-
-            runner = Runner(load_stage(stage), settings, chosen, stop, report)
-    except NoAnswerError as error:  # the bus may answer the next time
+    def report(health: Health) -> None:
         if not until_stdin_closes:
-            raise
-        typer.echo(error, err=True)
-        raise typer.Exit(1) from error
-    except UserError as error:
-        if not until_stdin_closes:
-            raise
-        typer.echo(error, err=True)  # for the launcher, which then gives up instead of restarting it
-        raise typer.Exit(EXIT_CANNOT_START) from error
-    if until_stdin_closes:
-        set_when_stdin_closes(runner.launcher_gone)
-    try:
-        last = runner.run()
-    except (OSError, UserError) as error:
-        _say(f"fantwin: {name}: {error}" if isinstance(error, OSError) else f"fantwin: {error}")
-        if runner.is_hung:
-            os._exit(1)  # the end of the interpreter would wait for what hangs
-        raise typer.Exit(1) from error
+            problems.report(health.problem)
+
+    with nullcontext() if until_stdin_closes else checked_exposure(settings.bus, _say, insecure=insecure):
+        try:
+            with starting():
+                runner = Runner(load_stage(stage), settings, chosen, stop, report)
+        except UserError as error:
+            if not until_stdin_closes:
+                raise
+            typer.echo(error, err=True)  # for the launcher, which gives up unless the bus may answer the next time
+            raise typer.Exit(1 if isinstance(error, NoAnswerError) else EXIT_CANNOT_START) from error
+        if until_stdin_closes:
+            when_stdin_closes(runner.launcher_gone.set)
+        try:
+            last = runner.run()
+        except (OSError, UserError) as error:
+            _say(f"fantwin: {name}: {error}" if isinstance(error, OSError) else f"fantwin: {error}")
+            if runner.is_hung:
+                os._exit(1)  # the end of the interpreter would wait for what hangs
+            raise typer.Exit(1) from error
+    counters = {counter.name: counter.value for counter in last.counters}
     if json_output:
-        typer.echo(
-            json.dumps({"stage": stage, "lost": last.lost, "counters": {c.name: c.value for c in last.counters}})
-        )
+        typer.echo(json.dumps({"stage": stage, "lost": last.lost, "counters": counters}))
+    if last.lost and not until_stdin_closes:
+        counts = ", ".join(f"{key} {value}" for key, value in counters.items() if key.startswith(LOSS_PREFIX) and value)
+        _say(f"{name}: {last.lost} lost" + (f" ({counts})" if counts else ""))
     if last.lost:
-        if not until_stdin_closes:
-            counts = ", ".join(
-                f"{c.name} {c.value}" for c in last.counters if c.name.startswith(LOSS_PREFIX) and c.value
-            )
-            _say(f"{name}: {last.lost} lost" + (f" ({counts})" if counts else ""))
         raise typer.Exit(3)
 
 

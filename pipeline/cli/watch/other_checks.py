@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from itertools import chain
 from pathlib import Path
-from typing import Any
 
 import typer
 from rich.console import Console
@@ -56,8 +54,7 @@ def _written(path: Path, found: Sequence[Found]) -> list[str]:
     """Write the hwmon chips into a new file. Returns lines that say what was done and what was left out.
 
     Raises:
-        UserError: there is no chip to watch, or the file cannot be written, or it exists and lacks a chip or is no
-            configuration.
+        UserError: there is no chip to watch, or the file exists or cannot be written.
     """
     chips = [each for each in found if each.kind == "hwmon" and each.tray]
     if not chips:
@@ -65,46 +62,16 @@ def _written(path: Path, found: Sequence[Found]) -> list[str]:
     try:
         with path.open("x", encoding="utf-8") as file:
             file.write("\n".join(['site = "site"\n', *(each.toml for each in chips)]))
-    except FileExistsError:
-        known = _chips_in(path)
-        if lacking := [str(each.tray["name"]) for each in chips if _chip(each.tray) not in known]:
-            raise UserError(
-                f"{path}: exists and was not changed; it lacks {', '.join(lacking)}: paste the [[tray]] that is shown, "
-                "or name a new file"
-            ) from None
-        return [f"{path}: exists, has all hwmon chips with fans, and was not changed"]
+    except FileExistsError as error:
+        raise UserError(
+            f"{path}: exists and was not changed: paste the [[tray]] that it lacks, or name a new file"
+        ) from error
     except OSError as error:
         raise UserError(f"{path}: cannot be written: {error.strerror}; name another file") from error
-    left_out = [f"left out: {each.title}: {_why_left_out(each)}" for each in found if each not in chips]
+    guessed = "the device there is only guessed; paste its [[tray]] to watch it"
+    why = [guessed if each.tray else next(iter(each.missing), "it cannot be watched") for each in found]
+    left_out = [f"left out: {each.title}: {line}" for each, line in zip(found, why, strict=True) if each not in chips]
     return [*left_out, f"written: {path}; next: fantwin doctor -c {path}"]
-
-
-def _why_left_out(found: Found) -> str:
-    if found.tray:
-        return "the device there is only guessed; paste its [[tray]] to watch it"
-    return found.missing[0] if found.missing else "it cannot be watched"
-
-
-def _chip(tray: Mapping[str, Any]) -> tuple[str, ...]:
-    """The chip of a [[tray]]: its name, its device where several chips have this name, and its root; empty if none."""
-    source = tray.get("source")
-    return tuple(str(source.get(key, "")) for key in ("chip", "device", "root")) if isinstance(source, Mapping) else ()
-
-
-def _chips_in(path: Path) -> set[tuple[str, ...]]:
-    """The chips of the trays in a configuration file.
-
-    Raises:
-        UserError: it cannot be read as one.
-    """
-    try:
-        trays = tomllib.loads(path.read_text(encoding="utf-8")).get("tray", [])
-    except (OSError, ValueError) as error:
-        reason = error.strerror if isinstance(error, OSError) else error
-        raise UserError(
-            f"{path}: exists, cannot be read as a configuration ({reason}), and was not changed: name a new file"
-        ) from error
-    return {_chip(tray) for tray in trays if isinstance(tray, Mapping)} if isinstance(trays, list) else set()
 
 
 def send_test_messages(config: Path, overrides: Sequence[str], targets: Sequence[str], *, json_output: bool) -> None:
@@ -122,14 +89,11 @@ def send_test_messages(config: Path, overrides: Sequence[str], targets: Sequence
     if unknown := [name for name in targets if name not in known]:
         raise UsageError(f"{config}: no target {', '.join(unknown)}: there is {', '.join(known)}")
 
-    def resolve(path: Path) -> Path:
-        return path if path.is_absolute() else settings.folder / path
-
     place = Place(settings.site, section.page)
     failed: list[str] = []
     for name in targets or known:
         try:
-            failure = send_test(known[name], resolve, place)
+            failure = send_test(known[name], settings.folder.joinpath, place)
             reason = failure.reason if failure else ""
         except UserError as error:
             reason = str(error)

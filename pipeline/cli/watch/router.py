@@ -15,7 +15,7 @@ from fantwin.pipeline.cli.options import DEFAULT_CONFIG, JsonOption, SetOption
 from fantwin.pipeline.cli.printing import show
 from fantwin.pipeline.config.loading import load_config
 from fantwin.pipeline.config.roles import ROUTER
-from fantwin.pipeline.config.settings import BusConfig, Config
+from fantwin.pipeline.config.settings import BusConfig
 from fantwin.pipeline.errors import UsageError
 from fantwin.pipeline.runtime.signals import stop_on_signals
 
@@ -60,7 +60,10 @@ def router(
     if overrides and config is None:
         raise UsageError(f"--set needs a configuration: give one with -c FILE, there is no {DEFAULT_CONFIG} here")
     settings = load_config(config, overrides or (), stages=()) if config else None
-    bus = _bus(settings, listen)
+    if settings and listen is None and len(settings.bus.endpoints) > 1:
+        raise UsageError("bus.endpoint names several routers: say with --listen which one this is")
+    configured = settings.bus if settings else BusConfig(endpoint=_LOOPBACK)
+    bus = configured.model_copy(update={"endpoint": listen}) if listen else configured
     credentials = credentials_of(bus, (ROUTER,))
     site = SiteRoles.of(settings) if settings and credentials else None
     stop = stop_on_signals()
@@ -75,11 +78,3 @@ def router(
                 typer.echo(warning, err=True)
             if stop.wait(_WARN_AGAIN_S):
                 return
-
-
-def _bus(settings: Config | None, listen: str | None) -> BusConfig:
-    if settings is None:
-        return BusConfig(endpoint=listen or _LOOPBACK)
-    if listen is None and len(settings.bus.endpoints) > 1:
-        raise UsageError("bus.endpoint names several routers: say with --listen which one this is")
-    return settings.bus.model_copy(update={"endpoint": listen}) if listen else settings.bus

@@ -16,6 +16,7 @@ from rich.text import Text
 from fantwin.pipeline.bus.session import Bus, join_bus
 from fantwin.pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
 from fantwin.pipeline.cli.printing import duration_text, show, table_of
+from fantwin.pipeline.cli.watch.alarm_list import STYLES
 from fantwin.pipeline.config.registry import STAGES
 from fantwin.pipeline.config.roles import READERS, role_names, roles_of
 from fantwin.pipeline.config.settings import Config
@@ -29,7 +30,6 @@ from fantwin.pipeline.site.loss_accounting import refused_lines
 from fantwin.pipeline.site.site_model import SiteModel
 from fantwin.pipeline.site.site_watcher import SiteWatcher
 from fantwin.pipeline.site.stage_states import AT_WORK, StageState, StageView, Word, note_lines, notes_as_json
-from fantwin.schemas.enums import Severity
 from fantwin.schemas.streams import LOSS_PREFIX
 from fantwin.schemas.topics import ALL_TRAYS
 from fantwin.schemas.units import NS_PER_S
@@ -37,7 +37,6 @@ from fantwin.scoring.alarms.alarm_state import is_listed, is_presented
 from fantwin.scoring.alarms.current_alarms import CurrentAlarm, clock
 from fantwin.scoring.diagnosis.causes import most_probable
 
-_STYLES = {Severity.NONE: "", Severity.WARNING: "yellow", Severity.ALARM: "bold red"}
 _LISTEN_S = 2.5  # two health messages of every stage, which give rates
 _LISTEN_MAX_S = 6.0
 _POLL_S = 0.2
@@ -76,7 +75,10 @@ def status(
     settings = load_for_any_host(config, overrides or (), stages=())
     stop = stop_on_signals()
     if stage is not None:
-        _probe(settings, _process(settings, stage, trays, shard), stop, json_output=json_output)
+        if stage not in STAGES:
+            raise UsageError(f"--stage {stage}: no such stage; known: {', '.join(STAGES)}")
+        process = StageProcess(stage, chosen_shard(stage, settings, trays, shard))
+        _probe(settings, process, stop, json_output=json_output)
         return
     if trays or shard:
         raise UsageError("--trays and --shard need --stage: which process?")
@@ -100,12 +102,6 @@ def status(
             raise typer.Exit(1)
         if any(watcher.losses().values()):
             raise typer.Exit(3)
-
-
-def _process(config: Config, stage: str, trays: str | None, shard: str | None) -> StageProcess:
-    if stage not in STAGES:
-        raise UsageError(f"--stage {stage}: no such stage; known: {', '.join(STAGES)}")
-    return StageProcess(stage, chosen_shard(stage, config, trays, shard))
 
 
 def _probe(config: Config, process: StageProcess, stop: threading.Event, *, json_output: bool) -> None:
@@ -229,7 +225,7 @@ def _figures(view: StageView | None, lost: int) -> list[str | Text]:
 
 def _alarm_line(current: CurrentAlarm, now: str) -> Text:
     alarm = current.newest
-    style = _STYLES.get(alarm.severity, "bold red") if alarm.active else "green"
+    style = STYLES.get(alarm.severity, "bold red") if alarm.active else "green"
     text = Text.assemble(
         (f"{clock(alarm.t_ns)}  {alarm.severity.name:7}", style if is_presented(alarm) else "dim"),
         f"  {alarm.header.tray}  fan {alarm.fan}: {', '.join(current.states())}",

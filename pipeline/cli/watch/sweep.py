@@ -18,6 +18,7 @@ from fantwin.pipeline.acquisition.command_sender import (
 )
 from fantwin.pipeline.acquisition.raw_samples import RawSamples
 from fantwin.pipeline.bus.session import Bus, join_bus
+from fantwin.pipeline.cli.options import fan_numbers
 from fantwin.pipeline.cli.printing import show
 from fantwin.pipeline.config.roles import OPERATOR
 from fantwin.pipeline.config.settings import Config, TrayConfig
@@ -55,7 +56,9 @@ def sweep(
         typer.Exit: the user stopped it.
     """
     require_commandable(chosen, "run `fantwin up` while the fans' own controller varies their commands; it is recorded")
-    numbers = _fans(fans, chosen)
+    numbers = fan_numbers(None if fans == "all" else fans) or list(range(chosen.fans))
+    if not all(0 <= number < chosen.fans for number in numbers):
+        raise UsageError(f"--fans {fans}: tray {chosen.name} has fans 0 to {chosen.fans - 1}")
     lowest, highest = range_within(chosen, low, high, safe)
     stop = stop_on_signals()
     steps: list[str] = []
@@ -107,7 +110,9 @@ def range_within(tray: TrayConfig, low: float | None, high: float | None, safe: 
         UsageError: one of them, or the safe command, is outside those limits; or --high alone is given, not above the
             lowest: the user must say how low commands may go.
     """
-    lowest, highest = lowest_turning(tray) if low is None else low, tray.command_max if high is None else high
+    share = 0.0 if tray.command_min < 0.0 else LEAST_SHARE
+    turning = tray.command_min + share * (tray.command_max - tray.command_min)
+    lowest, highest = turning if low is None else low, tray.command_max if high is None else high
     if not tray.command_min <= lowest < highest <= tray.command_max:
         raise UsageError(_wrong_range(tray, low, high, lowest))
     if safe is not None:
@@ -127,12 +132,6 @@ def _wrong_range(tray: TrayConfig, low: float | None, high: float | None, lowest
     return f"{given}: name a range within {limits} of tray {tray.name}"
 
 
-def lowest_turning(tray: TrayConfig) -> float:
-    """The lowest command at which fans are expected to turn; command_min for a tray that turns them both ways."""
-    both_ways = tray.command_min < 0.0
-    return tray.command_min if both_ways else tray.command_min + LEAST_SHARE * (tray.command_max - tray.command_min)
-
-
 def _range_in_words(tray: TrayConfig, lowest: float, highest: float) -> str:
     """With the shares of the tray's range: a --low of 0.2 is next to nothing where commands go to 255."""
     low, high = ((each - tray.command_min) / (tray.command_max - tray.command_min) for each in (lowest, highest))
@@ -147,14 +146,17 @@ def _leave(line: _BusLine, at_end: Mapping[int, float], ended: str) -> None:
         UserError: some were not sent; it names these.
     """
     line.stop = threading.Event()
+    failed: dict[int, str] = {}
     try:
         line.send(at_end)
     except NotReceivedError as error:
         failed = dict.fromkeys(at_end, str(error))
     except UserError:  # a device may have refused one fan and ignored those after it
-        failed = _failed_one_by_one(line, at_end)
-    else:
-        return
+        for fan, value in at_end.items():
+            try:
+                line.send({fan: value})
+            except UserError as error:
+                failed[fan] = str(error)
     if failed:
         by_hand = _in_words({fan: at_end[fan] for fan in failed})
         reasons = "; ".join(dict.fromkeys(failed.values()))
@@ -162,31 +164,8 @@ def _leave(line: _BusLine, at_end: Mapping[int, float], ended: str) -> None:
         raise UserError("; ".join(filter(None, (kept, ended))))
 
 
-def _failed_one_by_one(line: _BusLine, at_end: Mapping[int, float]) -> dict[int, str]:
-    """Send the command of each fan by itself; returns why it failed, by fan."""
-    failed: dict[int, str] = {}
-    for fan, value in at_end.items():
-        try:
-            line.send({fan: value})
-        except UserError as error:
-            failed[fan] = str(error)
-    return failed
-
-
 def _in_words(commands: Mapping[int, float]) -> str:
     return ", ".join(f"fan {fan} {value:g}" for fan, value in commands.items())
-
-
-def _fans(words: str, tray: TrayConfig) -> list[int]:
-    if words == "all":
-        return list(range(tray.fans))
-    try:
-        numbers = sorted({int(word) for word in words.split(",")})
-    except ValueError as error:
-        raise UsageError(f"--fans {words}: write all, or numbers with commas: --fans 0,2") from error
-    if not all(0 <= number < tray.fans for number in numbers):
-        raise UsageError(f"--fans {words}: tray {tray.name} has fans 0 to {tray.fans - 1}")
-    return numbers
 
 
 class _BusLine:

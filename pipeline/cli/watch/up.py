@@ -5,10 +5,8 @@ from __future__ import annotations
 import json
 import os
 import sys
-import threading
 from contextlib import suppress
 from dataclasses import asdict
-from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -19,7 +17,7 @@ from fantwin.pipeline.config.loading import load_config
 from fantwin.pipeline.config.registry import STAGES
 from fantwin.pipeline.config.shards import chosen_shard, chosen_trays
 from fantwin.pipeline.errors import UsageError, UserError
-from fantwin.pipeline.runtime.signals import ignore_hangup, set_when_stdin_closes, stop_on_signals
+from fantwin.pipeline.runtime.signals import ignore_hangup, stop_on_signals, when_stdin_closes
 
 
 def up(
@@ -59,39 +57,26 @@ def up(
     Example: fantwin up --only scorer --shard 2/8
     """
     stop = stop_on_signals()  # first: what follows takes a second or two
-    if only is None:
-        ignore_hangup()
-        if until_stdin_closes:
-            set_when_stdin_closes(stop)
-        _run_all(config, overrides or (), trays, shard, stop, insecure=insecure, json_output=json_output)
+    if only is not None:
+        from fantwin.pipeline.cli.watch.one_stage import run_stage  # noqa: PLC0415  loads the runtime
+
+        if only not in STAGES:
+            raise UsageError(f"no stage called {only!r}; known: {', '.join(STAGES)}")
+        settings = load_config(config, overrides or (), stages=(only,))
+        chosen = chosen_shard(only, settings, trays, shard)
+        flags = {"insecure": insecure, "json_output": json_output, "until_stdin_closes": until_stdin_closes}
+        run_stage(only, settings, chosen, stop, **flags)
         return
-    from fantwin.pipeline.cli.watch.one_stage import run_stage  # noqa: PLC0415  loads the runtime
-
-    if only not in STAGES:
-        raise UsageError(f"no stage called {only!r}; known: {', '.join(STAGES)}")
-    settings = load_config(config, overrides or (), stages=(only,))
-    chosen = chosen_shard(only, settings, trays, shard)
-    flags = {"insecure": insecure, "json_output": json_output, "until_stdin_closes": until_stdin_closes}
-    run_stage(only, settings, chosen, stop, **flags)
-
-
-def _run_all(
-    config: Path,
-    overrides: list[str] | tuple[str, ...],
-    trays: str | None,
-    shard: str | None,
-    stop: threading.Event,
-    *,
-    insecure: bool,
-    json_output: bool,
-) -> None:
+    ignore_hangup()
+    if until_stdin_closes:
+        when_stdin_closes(stop.set)
     # the process of a stage loads no launcher
     from fantwin.pipeline.launch.launcher import Launcher  # noqa: PLC0415
     from fantwin.pipeline.launch.site_report import EventLog  # noqa: PLC0415
     from fantwin.pipeline.launch.this_host import load_for_this_host, page_addresses, with_free_port  # noqa: PLC0415
     from fantwin.pipeline.site.loss_accounting import refused_lines  # noqa: PLC0415
 
-    loaded = load_for_this_host(config, overrides)
+    loaded = load_for_this_host(config, overrides or ())
     of_host = chosen_trays(loaded.config, trays, shard)
     here = with_free_port(loaded, of_host)
     settings = here.config

@@ -64,25 +64,18 @@ def wear(
             watcher = SiteWatcher(bus, settings.site, roles_of(settings))
             wait_for_stages(bus, watcher, settings, stop, what="wear")
             answers = bus.recover(tray_key(settings.site, "*", "snapshot"))
-            snapshots = [
-                snapshot
-                for key, payload in answers
-                for snapshot in _decoded(payload)
-                if watcher.counts(key, snapshot.header.producer)
-            ]
+            heard = [(key, snapshot) for key, payload in answers for snapshot in _decoded(payload)]
+            snapshots = [snapshot for key, snapshot in heard if watcher.counts(key, snapshot.header.producer)]
         nothing = "no scorer has recorded wear so far: it does so regularly; try again later"
-    found = [
-        (tray, snapshot.t_ns, wear)
-        for tray, snapshot in _latest(snapshots).items()
-        if (wear := wear_in(snapshot)) is not None
-    ]
+    latest = {each.header.tray: each for each in sorted(snapshots, key=lambda each: (each.t_ns, each.header.sequence))}
+    last = [(tray, snapshot.t_ns, wear_in(snapshot)) for tray, snapshot in sorted(latest.items())]
+    found = [(tray, t_ns, wear) for tray, t_ns, wear in last if wear is not None]
     if not found:
         raise UserError(nothing)
-    if not any(wear_rows(*each) for each in found):
-        raise UserError(
-            f"no data yet for any fan of {', '.join(tray for tray, *_ in found)}: {_NEEDED}; try again later"
-        )
     rows = [row for each in found for row in wear_rows(*each)]
+    if not rows:
+        trays = ", ".join(tray for tray, *_ in found)
+        raise UserError(f"no data yet for any fan of {trays}: {_NEEDED}; try again later")
     show({"wear": rows}, *(_table(*each) for each in found), json_output=json_output)
     for line in damage:
         typer.echo(line, err=True)
@@ -98,14 +91,6 @@ def _recorded(recordings: Iterable[Path]) -> tuple[list[ScorerSnapshot], list[st
             snapshots += [entry.message for entry in reading if isinstance(entry.message, ScorerSnapshot)]
             damage += [reading.damage] if reading.damage else []
     return snapshots, damage
-
-
-def _latest(snapshots: Iterable[ScorerSnapshot]) -> dict[str, ScorerSnapshot]:
-    """The last snapshot of each tray."""
-    latest: dict[str, ScorerSnapshot] = {}
-    for snapshot in sorted(snapshots, key=lambda snapshot: (snapshot.t_ns, snapshot.header.sequence)):
-        latest[snapshot.header.tray] = snapshot
-    return dict(sorted(latest.items()))
 
 
 def _decoded(payload: bytes) -> list[ScorerSnapshot]:

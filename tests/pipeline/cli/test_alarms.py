@@ -8,7 +8,7 @@ import subprocess
 import threading
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from datetime import datetime
 from typing import Any
 
@@ -27,16 +27,12 @@ from fantwin.scoring.alarms.alarm_state import AlarmState
 from fantwin.scoring.alarms.alarms_of_tray import AlarmsOfTray, Decided
 from fantwin.scoring.alarms.current_alarms import clock
 from tests.support.fantwin_command import error_of, fantwin
+from tests.support.made_messages import alarm
 from tests.support.running_chain import DEMO, FANTWIN, SITE, TRAY, eventually
 from tests.support.running_scorer import RunningScorer
 from tests.support.score_data import one_sample
 
 FANS = 8
-FLAGS = (
-    *("active", "severity", "onset_t_ns", "acknowledged", "shelved_until_t_ns"),
-    *("out_of_service", "feedback", "feedback_by", "feedback_reason"),
-)
-"""of a message about an alarm, and of its state in the scorer"""
 CAUSES = (
     Diagnosis(cause="drag_up", probability=0.83, evidence="drag +50 %"),
     Diagnosis(cause="friction_up", probability=0.1),
@@ -82,17 +78,10 @@ class AlarmOnRequestScorer(Core):
         ]
 
     def _alarm(self, fan: int, transition: Transition, standing: AlarmState, message: str) -> Alarm:
-        return Alarm(
-            header=Header(),
-            fan=fan,
-            t_ns=self._now_ns,
-            residual_rad_s=0.0,
-            residual_std_rad_s=1.0,
-            message=message,
-            transition=transition,
-            causes=CAUSES if transition == Transition.RAISED else (),
-            **{name: getattr(standing, name) for name in FLAGS},
-        )
+        state = {each.name: getattr(standing, each.name) for each in fields(AlarmState)}
+        state = {name: value for name, value in state.items() if name in Alarm.__dataclass_fields__}
+        causes = CAUSES if transition == Transition.RAISED else ()
+        return alarm(fan, self._now_ns, message=message, transition=transition, causes=causes, **state)
 
 
 def _in_words(fan: int, transition: Transition, why: str) -> str:

@@ -34,18 +34,15 @@ from fantwin.schemas.messages import Alarm, Diagnosis
 from fantwin.schemas.topics import BY_NAME, alive_key, health_key, tray_key
 from fantwin.schemas.units import NS_PER_S
 from fantwin.scoring.alarms.current_alarms import clock
+from tests.support import made_messages
 from tests.support.fantwin_command import error_of
 from tests.support.fantwin_command import fantwin as fantwin_here
 from tests.support.running_chain import DEMO, FANS, SITE, TRAY, RunningCommand, eventually
 from tests.support.score_data import one_sample
 
-HEALTH = Health(
-    header=Header("scorer-all-1", 0, ""),
-    stage="scorer",
-    instance="all",
-    status=StageStatus.OK,
+HEALTH = made_messages.health(
+    "scorer",
     t_ns=1_700_000_000 * NS_PER_S,
-    uptime_s=1.0,
     inputs=(Input(key="k", producer="p", received=100, missing=3, duplicated=0, next_sequence=103),),
     outputs=(Output(key="o", published=50),),
     counters=(Counter(name="lost_on_purpose", value=4),),
@@ -54,19 +51,9 @@ HEALTH = Health(
     lost=7,
     process_id=4711,
 )
-ALARM = Alarm(
-    header=Header("scorer-all-1", 0, TRAY),
-    fan=2,
-    active=True,
-    severity=Severity.ALARM,
-    t_ns=1_700_000_000 * NS_PER_S,
-    onset_t_ns=1_699_999_999 * NS_PER_S,
-    residual_rad_s=-20.0,
-    residual_std_rad_s=9.0,
-    message="fan 2 is slower than its twin",
+ALARM = made_messages.alarm(
+    2, 1_700_000_000 * NS_PER_S, producer="scorer-all-1", message="fan 2 is slower than its twin"
 )
-
-
 TRAYS = load_config(DEMO / "demo.toml").trays
 
 

@@ -9,12 +9,12 @@ import pytest
 from fantwin.pipeline.launch.site_report import RunningProcess, SiteReport
 from fantwin.pipeline.site.site_watcher import StageView
 from fantwin.pipeline.site.stage_states import StageState, Word
-from fantwin.schemas.enums import Severity, Transition
-from fantwin.schemas.header import Header
+from fantwin.schemas.enums import Transition
 from fantwin.schemas.health import Note
 from fantwin.schemas.messages import Alarm
 from fantwin.schemas.units import NS_PER_S
 from fantwin.scoring.alarms.current_alarms import clock, current_alarm
+from tests.support.made_messages import alarm
 from tests.support.stage_views import CONSUMER, view
 
 IDS = {"resampler": RunningProcess(11, is_at_work=True), "scorer": RunningProcess(12, is_at_work=True)}
@@ -143,27 +143,14 @@ def test_a_stage_that_works_off_what_was_missed_during_a_restart_is_not_late(rep
 
 
 def test_an_alarm_that_came_and_went_between_two_looks_is_said_to_have_been_raised(report, lines):
-    def alarm(onset_t_ns: int, transition: Transition, *, active: bool, message: str) -> Alarm:
-        return Alarm(
-            header=Header("scorer-1", 0, "tray1"),
-            fan=2,
-            t_ns=onset_t_ns + NS_PER_S,
-            onset_t_ns=onset_t_ns,
-            transition=transition,
-            severity=Severity.ALARM,
-            active=active,
-            message=f"fan 2: {message}",
-            residual_rad_s=1.0,
-            residual_std_rad_s=1.0,
-        )
-
     def cleared(onset_t_ns: int) -> Alarm:
-        return alarm(onset_t_ns, Transition.CLEARED, active=False, message="back to normal")
+        over = {"transition": Transition.CLEARED, "active": False, "message": "fan 2: back to normal"}
+        return alarm(2, onset_t_ns + NS_PER_S, onset_t_ns=onset_t_ns, **over)
 
     from_before, seen, missed, shelved = (CONSUMER.t_ns + seconds * NS_PER_S for seconds in (-60, 10, 20, 30))
     for newest in (
         cleared(from_before),
-        alarm(seen, Transition.RAISED, active=True, message="214 rpm below the twin"),
+        alarm(2, seen, transition=Transition.RAISED, message="fan 2: 214 rpm below the twin"),
         cleared(seen),
         cleared(missed),
         cleared(missed),
