@@ -27,7 +27,5 @@ class RawSamples:
             while True:
                 payload = self._received.get(timeout=0.0 if found else timeout_s)
                 with suppress(CodecError):
-                    sample = decode(Raw, payload)
-                    if isinstance(sample, Raw) and len(sample.host_receive_t_ns):
-                        found.append(sample)
-        return found
+                    found.append(decode(Raw, payload))
+        return [sample for sample in found if len(sample.host_receive_t_ns)]

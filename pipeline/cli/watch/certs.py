@@ -73,14 +73,10 @@ def certs(
     authority: Annotated[
         Path, typer.Option(help="Folder of the authority's certificate and key; relative to the configuration.")
     ] = Path("authority"),
-    tray: Annotated[
-        list[str] | None, typer.Option("--tray", metavar="NAME", help="Only for this tray. Repeatable.")
-    ] = None,
+    tray: Annotated[list[str] | None, typer.Option(metavar="NAME", help="Only for this tray. Repeatable.")] = None,
     host: Annotated[
         list[str] | None,
-        typer.Option(
-            "--host", metavar="NAME", help="A further name or address at which its owner listens. Repeatable."
-        ),
+        typer.Option(metavar="NAME", help="A further name or address at which its owner listens. Repeatable."),
     ] = None,
     days: Annotated[
         int | None,

@@ -51,7 +51,10 @@ def check_line(context: Context, config: Config, seconds: float, *, is_running: 
     found = [(False, f"{tray.name}: {problem}")] if problem else []
     if not samples:
         return found or [(False, f"{tray.name}: no sample in {FIRST_SAMPLE_S:g} s")]
-    twin = _twin(context)
+    twin = None
+    if tray.twin is not None:
+        with suppress(StageError):  # the twin integrator reports it
+            twin = load_tray_twin(twin_path(tray, context.folder), tray.fans)
     return [*found, *((ok, f"{tray.name}: {line}") for ok, line in _findings(samples, tray, config, twin))]
 
 
@@ -108,15 +111,6 @@ def _from_bus(config: Config, tray: TrayConfig, seconds: float) -> list[Raw]:
         return [*first, *arriving.take()]
 
 
-def _twin(context: Context) -> TrayTwin | None:
-    if context.tray.twin is None:
-        return None
-    try:
-        return load_tray_twin(twin_path(context.tray, context.folder), context.tray.fans)
-    except StageError:  # the twin integrator reports it
-        return None
-
-
 def _findings(samples: Sequence[Raw], tray: TrayConfig, config: Config, twin: TrayTwin | None) -> Iterator[Finding]:
     fitting = [sample for sample in samples if sample.fans == tray.fans]
     if not fitting:
@@ -148,10 +142,7 @@ def _rate(times: SampleTimes, config: Config, twin: TrayTwin | None) -> Finding:
     timing: GridTiming = settings.timing(settings.rate_hz or grid_rate_hz(times.sent_hz))
     if leaves_gaps(line_hz, timing):
         limit = f"resampler.gap_limit_s = {timing.gap_limit_ns / NS_PER_S:g}"
-        return (
-            False,
-            f"{apart}, too few for {limit}: leave out rate_hz and gap_limit_s, they follow from the line",
-        )
+        return False, f"{apart}, too few for {limit}: leave out rate_hz and gap_limit_s, they follow from the line"
     if twin and twin.card.fixed_rate and abs(timing.rate_hz / twin.card.rate_hz - 1) > RATE_TOLERANCE:
         return False, (
             f"{apart} give a grid of {timing.rate_hz:g} Hz, and twin {twin.card.name} is valid at "
@@ -181,9 +172,7 @@ def _ranges(command: Array, speed_rad_s: Array, tray: TrayConfig, twin: TrayTwin
         yield False, f'speeds up to {fastest_rad_s / per_unit:.0f} {tray.speed_unit}{known}: is speed_unit "{other}"?'
         return
     speeds = _speeds(speed_rad_s, tray.speed_unit)
-    if (
-        tray.speed_unit == "rad/s"
-    ):  # numbers in rpm that are taken for rad/s are plausible ones, and ten times too large
+    if tray.speed_unit == "rad/s":  # numbers in rpm that are taken for rad/s are plausible, and ten times too large
         speeds += f" ({_speeds(speed_rad_s, 'rpm')})"
     commands = f"commands {low:g} to {high:g} (of {tray.command_min:g} to {tray.command_max:g})"
     yield True, f"{commands}, speeds {speeds}: are these what the fans do?"
@@ -198,12 +187,8 @@ def _tachos(t_s: Array, speed_rad_s: Array, tray: TrayConfig) -> Iterator[Findin
     if any(seen) and not hints:
         yield True, f"tachos of {_fans(seen)}: they read as declared"
     if not all(seen) and (hints or (tray.tacho is None and not tray.stated_tachos)):
-        unseen = _fans([not one for one in seen])
-        yield (
-            True,
-            f"{unseen}: not shown whether the tacho counts; listen while the speeds change: "
-            f"--listen-s {LISTEN_FOR_TACHOS_S}",
-        )
+        unseen = f"{_fans([not one for one in seen])}: not shown whether the tacho counts"
+        yield True, f"{unseen}; listen while the speeds change: --listen-s {LISTEN_FOR_TACHOS_S}"
 
 
 def _fans(chosen: Sequence[bool]) -> str:

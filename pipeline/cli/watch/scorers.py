@@ -100,6 +100,6 @@ def ask(
             alarm = decode(Alarm, received.get(timeout=_ANSWER_POLL_S))
         except (queue.Empty, CodecError):
             continue
-        if isinstance(alarm, Alarm) and alarm.request == name and watcher.counts(key, alarm.header.producer):
+        if alarm.request == name and watcher.counts(key, alarm.header.producer):
             answers[alarm.fan] = readable_alarm(alarm)
     return [answers[fan] for fan in sorted(fans)]

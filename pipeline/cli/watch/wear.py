@@ -96,10 +96,9 @@ def _recorded(recordings: Iterable[Path]) -> tuple[list[ScorerSnapshot], list[st
 def _decoded(payload: bytes) -> list[ScorerSnapshot]:
     """Unreadable messages are skipped here; the stages count them."""
     try:
-        message = decode(ScorerSnapshot, payload)
+        return [decode(ScorerSnapshot, payload)]
     except CodecError:
         return []
-    return [message] if isinstance(message, ScorerSnapshot) else []
 
 
 def _table(tray: str, t_ns: int, state: dict[str, Any]) -> Table:

@@ -1,4 +1,4 @@
-"""`fantwin up --only` and `fantwin doctor` at a router that refuses: one line, and the exit code."""
+"""`fantwin up --only` and `fantwin doctor` at a router that refuses, and what a stage alone says of its problems."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import pytest
 
 from fantwin.pipeline.bus.rights import SiteRoles
 from fantwin.pipeline.bus.router import open_router
+from fantwin.pipeline.cli.watch import one_stage
 from tests.support.fantwin_command import as_typed
 from tests.support.fantwin_command import fantwin as called
 from tests.support.secured_site import SITE, SecuredSite, free_endpoint
@@ -87,3 +88,12 @@ def test_doctor_without_a_router_says_until_when_certificates_hold_and_where_the
     assert examined(site)[1] == [
         f"{site.certificates.folder}/{{role}}.pem: no certificate of any role here: `fantwin certs issue` makes them"
     ]
+
+
+def test_a_stage_that_runs_alone_says_a_problem_once_and_that_it_is_resolved(monkeypatch):
+    lines: list[str] = []
+    monkeypatch.setattr(one_stage, "_say", lines.append)
+    problems = one_stage.Problems("recorder")
+    for problem in ("", "12.3 MB are free", "11.9 MB are free", "", ""):
+        problems.report(problem)
+    assert lines == ["recorder: 12.3 MB are free", "recorder: the problem is resolved"]
