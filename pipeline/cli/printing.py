@@ -7,11 +7,16 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
+from fantwin.schemas.enums import Severity
+
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from rich.console import RenderableType
     from rich.table import Table
+
+STYLES = {Severity.NONE: "", Severity.WARNING: "yellow", Severity.ALARM: "bold red"}
+"""of an alarm, by its severity"""
 
 
 def show(found: Any, *lines: RenderableType, json_output: bool) -> None:

@@ -5,13 +5,12 @@ from __future__ import annotations
 import json
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
 
 from fantwin.pipeline.cli.in_parallel import JobsOption, RecordingsInParallel, SkipBadOption
 from fantwin.pipeline.cli.options import JsonOption, SetOption
@@ -153,8 +152,9 @@ def calibrate(
             }
             for warning in warnings:
                 typer.echo(warning, err=True)
-            if not json_output:
-                _print(output, calibration, [drop.line(speed_unit) for drop in drops])
+            lines = _lines(output, calibration, [drop.line(speed_unit) for drop in drops])
+            for line in () if json_output else lines:
+                typer.echo(line)
         if verify:
             true_ones = marked_running(verify, feedback or [], tray, pool.map).left_out
             check = check_declared_rate(output or twin, verify, overrides or [], pool.map, tray, true_ones)
@@ -183,33 +183,27 @@ def _refuse_wrong_arguments(twin: Path, healthy: list[Path], verify: list[Path],
             raise UsageError(f"--set {key}: [scorer] does not affect calibration: leave it out, or use --verify alone")
 
 
-def _print(output: Path, calibration: Calibration, drops: Sequence[str]) -> None:
-    console = Console(highlight=False, soft_wrap=True)
+def _lines(output: Path, calibration: Calibration, drops: Sequence[str]) -> Iterator[str]:
+    """What was learned, the false alarms that were found, what was done about them, and what may be promised."""
     runs = f"{calibration.runs} run{'s' * (calibration.runs != 1)}"
-    console.print(f"{output}: calibrated on {calibration.fan_hours:.3g} fan-hours in {runs}", markup=False)
+    yield f"{output}: calibrated on {calibration.fan_hours:.3g} fan-hours in {runs}"
     of_population = asdict(Priors())
     for name, value in changed_priors(calibration.priors).items():
-        console.print(f"learned: {MEANING.get(name, name)}: {of_population[name]:.2g} -> {value:.2g}", markup=False)
+        yield f"learned: {MEANING.get(name, name)}: {of_population[name]:.2g} -> {value:.2g}"
     if calibration.priors == Priors():
-        console.print("learned: nothing; the priors are those of a population of fans")
-    for line in (*_rate_lines(calibration), *drops):
-        console.print(line, markup=False)
-    console.print(f"test it on other healthy recordings: fantwin calibrate {output} --verify OTHER.mcap", markup=False)
-
-
-def _rate_lines(calibration: Calibration) -> list[str]:
-    """The false alarms that were found, what was done about them, and what may be promised."""
-    per_day, fan_hours, (low, high) = calibration.false_alarms_per_day, calibration.fan_hours, calibration.interval_95
-    lines = [
-        f"false alarms: {calibration.found} found, {number_text(expected_alarms(fan_hours, per_day))} expected "
-        f"({number_text(low)} to {number_text(high)} per fan and day with 95 %)",
-        f"limit: the logarithm of that by theory times {calibration.limit_factor:.3g}: without this there were more"
-        if calibration.limit_factor > 1.0
-        else "limit: by theory",
-    ]
+        yield "learned: nothing; the priors are those of a population of fans"
+    per_day, (low, high) = calibration.false_alarms_per_day, calibration.interval_95
+    expected = number_text(expected_alarms(calibration.fan_hours, per_day))
+    interval = f"{number_text(low)} to {number_text(high)} per fan and day with 95 %"
+    yield f"false alarms: {calibration.found} found, {expected} expected ({interval})"
+    factor = f"the logarithm of that by theory times {calibration.limit_factor:.3g}: without this there were more"
+    yield f"limit: {factor if calibration.limit_factor > 1.0 else 'by theory'}"
     if not calibration.is_target:
-        return [*lines, f"declared: {rate_text(per_day)}"]
-    why = f"{needed_fan_hours(per_day):.3g} fan-hours are needed to show it"
-    if calibration.is_exceeded:
+        yield f"declared: {rate_text(per_day)}"
+    elif calibration.is_exceeded:
         why = "these recordings have more, of faults or of what a twin cannot know: see the warnings"
-    return [*lines, f"target: {rate_text(per_day)}; {why}"]
+        yield f"target: {rate_text(per_day)}; {why}"
+    else:
+        yield f"target: {rate_text(per_day)}; {needed_fan_hours(per_day):.3g} fan-hours are needed to show it"
+    yield from drops
+    yield f"test it on other healthy recordings: fantwin calibrate {output} --verify OTHER.mcap"

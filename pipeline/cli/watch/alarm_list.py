@@ -19,7 +19,7 @@ import typer
 from rich.text import Text
 
 from fantwin.pipeline.bus.session import Bus
-from fantwin.pipeline.cli.printing import duration_text, show
+from fantwin.pipeline.cli.printing import STYLES, duration_text, show
 from fantwin.pipeline.cli.progress import working
 from fantwin.pipeline.cli.watch.scorers import wait_for_stages
 from fantwin.pipeline.config.roles import roles_of
@@ -52,7 +52,6 @@ _SCORES_S = 3.0  # a score of every tray arrives in this time
 _POLL_S = 0.02
 _WATCH_S = 0.2  # between two looks at the stages while no alarm comes
 NS_PER_HOUR = 3600 * NS_PER_S
-STYLES = {Severity.NONE: "", Severity.WARNING: "yellow", Severity.ALARM: "bold red"}
 
 
 def show_list(

@@ -15,8 +15,7 @@ from rich.text import Text
 
 from fantwin.pipeline.bus.session import Bus, join_bus
 from fantwin.pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
-from fantwin.pipeline.cli.printing import duration_text, show, table_of
-from fantwin.pipeline.cli.watch.alarm_list import STYLES
+from fantwin.pipeline.cli.printing import STYLES, duration_text, show, table_of
 from fantwin.pipeline.config.registry import STAGES
 from fantwin.pipeline.config.roles import READERS, role_names, roles_of
 from fantwin.pipeline.config.settings import Config

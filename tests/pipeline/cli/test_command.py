@@ -1,17 +1,28 @@
-"""`fantwin command`: what is wanted of a fan reaches its line, or one line says why not."""
+"""`fantwin command`: what is wanted of a fan reaches its line, or one line says why not; and the sweep of simulated
+fans, in simulated time.
+"""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+import threading
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
+import numpy as np
 import pytest
 from typer.testing import Result
 
 from fantwin.pipeline.acquisition import command_sender
+from fantwin.pipeline.acquisition.command_sender import NotReceivedError
+from fantwin.pipeline.cli.watch import sweep as sweep_module
+from fantwin.pipeline.cli.watch.sweep import range_within
+from fantwin.pipeline.config.settings import TrayConfig
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.sources.serial.config import SerialConfig
 from tests.support.fantwin_command import error_of, fantwin
-from tests.support.running_chain import DEADLINE_S, Chain, RunningCommand, eventually
+from tests.support.first_order_fans import FirstOrderFans
+from tests.support.running_chain import DEADLINE_S, DEMO, Chain, RunningCommand, eventually
 
 
 @pytest.fixture
@@ -47,3 +58,70 @@ def test_without_an_acquisition_the_command_is_reported_as_not_received(chain, m
     monkeypatch.setattr(command_sender, "_ANSWER_S", 0.1)
     expected = "no acquisition of tray tray1 received the command: is `fantwin up` running?"
     assert error_of(*chain.words("command"), "--fan", 3, 0.5) == expected
+
+
+@pytest.mark.parametrize(("low", "high", "expected"), [(0, 255, (51, 255)), (20, 70, (30, 70)), (-1, 1, (-1, 1))])
+def test_without_low_no_fan_is_to_stop(low: float, high: float, expected: tuple[float, float]) -> None:
+    source = SerialConfig(port="line")
+    tray = TrayConfig(name="tray1", fans=1, source=source, command_min=low, command_max=high)
+    assert range_within(tray, None, None, None) == pytest.approx(expected)
+    assert range_within(tray, low, None, None) == (low, high)
+
+
+class SweptTray(FirstOrderFans):
+    """Six fans whose device carries out the commands of a message in turn, up to the first that it refuses."""
+
+    def __init__(self, refuses: Callable[[int], str] = lambda _fan: "", swept_s: float = 20.0) -> None:
+        super().__init__([0.5] * 6)
+        self.refuses, self.swept_s = refuses, swept_s
+        self.stop = threading.Event()
+        self.is_gone = False
+
+    def connect(self) -> np.ndarray:
+        return self.command.copy()
+
+    def send(self, values: Mapping[int, float]) -> None:
+        if self.now_s > self.swept_s:
+            for fan, value in values.items():
+                if self.is_gone:
+                    raise NotReceivedError("no acquisition of tray tray1 received the command")
+                if why := self.refuses(fan):
+                    raise UserError(why)
+                super().send({fan: value})
+        else:
+            super().send(values)
+
+
+def swept_by_command(tray: SweptTray, monkeypatch: pytest.MonkeyPatch) -> str:
+    """The error of the command; the bus is left out."""
+
+    class NoBus:
+        def __enter__(self) -> NoBus:
+            return self
+
+        def __exit__(self, *_: object) -> None: ...
+
+        def alive(self, _key: str) -> set[str]:
+            return set()
+
+        def declare_alive(self, _key: str) -> None: ...
+
+    monkeypatch.setattr(sweep_module, "join_bus", lambda *_, **__: NoBus())
+    monkeypatch.setattr(sweep_module, "_BusLine", lambda *_: tray)
+    return error_of("command", "--sweep", "-c", DEMO / "demo.toml", "--fans", "0,1,2,3,4,5", "--rounds", "1")
+
+
+def test_one_fan_that_refuses_its_command_keeps_no_other_from_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    tray = SweptTray(lambda fan: "unit 1 refuses 97" if fan == 4 else "")
+    error = swept_by_command(tray, monkeypatch)
+    assert list(tray.command) == [0.4, 0.4, 0.4, 0.4, tray.command[4], 0.4]
+    assert tray.command[4] != 0.4
+    by_hand = "THESE FANS KEEP THE LAST COMMAND; send these by hand: fan 4 0.4 (unit 1 refuses 97); "
+    assert error == f"{by_hand}the sweep has ended: unit 1 refuses 97"
+
+
+def test_without_acquisition_all_fans_are_named_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    tray = SweptTray()
+    tray.is_gone = True
+    error = swept_by_command(tray, monkeypatch)
+    assert "fan 5 0.4 (no acquisition of tray tray1 received the command); the sweep has ended: no acq" in error

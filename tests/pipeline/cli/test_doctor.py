@@ -3,25 +3,23 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import socket
 import tomllib
-import tty
 from collections.abc import Iterator
+from contextlib import closing
 from importlib.metadata import PackageNotFoundError
 from pathlib import Path
 
 import pytest
-import typer
 
 from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.cli.watch import doctor as module
-from fantwin.pipeline.cli.watch.doctor import doctor
 from fantwin.pipeline.config.settings import BusConfig
 from fantwin.pipeline.config.shards import Shard
 from fantwin.pipeline.extras import how_to_install
 from fantwin.pipeline.runtime.sessions import Session
+from fantwin.pipeline.sources.simulated.device import PseudoTerminal
 from tests.support.fantwin_command import error_of, fantwin, usage_error_of
 from tests.support.message_receivers import HttpReceiver
 from tests.support.notified_alarms import secret
@@ -35,29 +33,20 @@ NEEDED = [re.split("[<>=]", requirement)[0] for requirement in PROJECT["dependen
 @pytest.fixture
 def port() -> Iterator[str]:
     """A serial port that exists."""
-    master, slave = os.openpty()
-    tty.setraw(slave)
-    yield os.ttyname(slave)
-    os.close(slave)
-    os.close(master)
+    with closing(PseudoTerminal()) as line:
+        yield line.port
 
 
-def examine(capsys: pytest.CaptureFixture[str], config: Path | None = None, *settings: str) -> tuple[int, dict]:
-    code = 0
-    try:
-        # the ports of the viewer may be taken on this computer
-        overrides = ["viewer.grpc_port=0", *settings] if config else []
-        doctor(config=config, overrides=overrides, json_output=True, listen_s=0.0)
-    except typer.Exit as end:
-        code = end.exit_code
-    return code, json.loads(capsys.readouterr().out)
+def examine(config: Path | None = None, *settings: str) -> tuple[int, dict]:
+    overrides = ["viewer.grpc_port=0", *settings] if config else []  # its ports may be taken on this computer
+    words = [*(("-c", config) if config else ()), *(word for each in overrides for word in ("--set", each))]
+    done = fantwin("doctor", "--json", "--listen-s", 0, *words)
+    return done.exit_code, json.loads(done.stdout)
 
 
-def test_an_installation_in_order_is_fine_and_each_package_that_fantwin_needs_is_looked_at(
-    capsys, tmp_path, monkeypatch
-):
+def test_an_installation_in_order_is_fine_and_each_package_that_fantwin_needs_is_looked_at(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    code, found = examine(capsys)
+    code, found = examine()
     assert code == 0
     assert "no fantwin.toml in this folder, and none given with -c: only the installation was checked" in found["good"]
     assert found["ok"] and found["problems"] == []
@@ -66,15 +55,15 @@ def test_an_installation_in_order_is_fine_and_each_package_that_fantwin_needs_is
     assert listed == set(PROJECT["optional-dependencies"]) - {"all", "dev", "bench"}
 
 
-def test_a_bus_that_others_reach_without_certificates_is_a_problem(capsys, tmp_path, port):
+def test_a_bus_that_others_reach_without_certificates_is_a_problem(tmp_path, port):
     settings = (f"tray.0.port='{port}'", f"run_folder='{tmp_path}'", "bus.endpoint='tcp/0.0.0.0:17447'")
-    code, found = examine(capsys, DEMO / "demo.toml", *settings)
+    code, found = examine(DEMO / "demo.toml", *settings)
     assert code == 1
     assert [line for line in found["problems"] if "can drive the fans" in line and "--insecure" in line]
 
 
-def test_a_configuration_in_order_can_start(capsys, tmp_path, port):
-    code, found = examine(capsys, DEMO / "demo.toml", f"tray.0.port='{port}'", f"run_folder='{tmp_path}'")
+def test_a_configuration_in_order_can_start(tmp_path, port):
+    code, found = examine(DEMO / "demo.toml", f"tray.0.port='{port}'", f"run_folder='{tmp_path}'")
     assert (code, found["problems"]) == (0, [])
     assert {"acquisition/tray1: can start", "twin_integrator: can start"} <= set(found["good"])
 
@@ -93,9 +82,9 @@ def test_a_configuration_in_order_can_start(capsys, tmp_path, port):
         ("scorer.alarm_shrae=1", ["scorer.alarm_shrae", "did you mean 'alarm_share'"]),
     ],
 )
-def test_each_problem_is_one_line_that_says_what_to_do(capsys, tmp_path, port, setting, words):
+def test_each_problem_is_one_line_that_says_what_to_do(tmp_path, port, setting, words):
     settings = [f"tray.0.port='{port}'", f"run_folder='{tmp_path}'", setting]
-    code, found = examine(capsys, DEMO / "demo.toml", *settings)
+    code, found = examine(DEMO / "demo.toml", *settings)
     assert code == 1
     (line, *again) = found["problems"]
     assert not again or setting.startswith("run_folder")  # the recorder, too, says that it cannot write there
@@ -124,12 +113,12 @@ def test_only_the_lines_of_the_named_trays_are_checked(tmp_path, port):
     assert problems("--tray", "c") == [f"{path}: no tray called 'c'; known: a, b"]
 
 
-def test_row_15_a_foreign_program_at_the_endpoint_is_a_problem(capsys, tmp_path, port, monkeypatch):
+def test_row_15_a_foreign_program_at_the_endpoint_is_a_problem(tmp_path, port, monkeypatch):
     monkeypatch.setattr("fantwin.pipeline.bus.opening.MEETING_LIMIT_S", 0.0)
     with socket.create_server(("127.0.0.1", 0)) as listening:
         endpoint = f"tcp/127.0.0.1:{listening.getsockname()[1]}"
         settings = [f"tray.0.port='{port}'", f"run_folder='{tmp_path}'", f"bus.endpoint='{endpoint}'"]
-        code, found = examine(capsys, DEMO / "demo.toml", *settings)
+        code, found = examine(DEMO / "demo.toml", *settings)
     assert code == 1
     assert found["problems"] == [
         f"bus.endpoint = '{endpoint}': the program that listens there is not fantwin, or hangs, so stages cannot "
@@ -137,7 +126,7 @@ def test_row_15_a_foreign_program_at_the_endpoint_is_a_problem(capsys, tmp_path,
     ]
 
 
-def test_the_ports_of_the_own_running_site_are_no_problem_and_those_of_a_stranger_are(capsys, tmp_path, port, endpoint):
+def test_the_ports_of_the_own_running_site_are_no_problem_and_those_of_a_stranger_are(tmp_path, port, endpoint):
     with socket.create_server(("127.0.0.1", 0)) as taken, Bus(BusConfig(endpoint=endpoint)) as bus:
         viewer_port = taken.getsockname()[1]
         settings = [f"tray.0.port='{port}'", f"run_folder='{tmp_path}'", f"bus.endpoint='{endpoint}'"]
@@ -146,14 +135,14 @@ def test_the_ports_of_the_own_running_site_are_no_problem_and_those_of_a_strange
             "viewer.web_port=0",
             "launcher.stages=['resampler', 'viewer']",
         ]
-        code, found = examine(capsys, DEMO / "demo.toml", *settings)
+        code, found = examine(DEMO / "demo.toml", *settings)
         assert code == 1
         assert f"viewer: viewer.grpc_port: port {viewer_port} on 127.0.0.1 is taken" in found["problems"][0]
         assert f"bus.endpoint {endpoint}: fantwin answers there" in found["good"]
 
         session = Session.of_this_process("viewer", Shard("all", ()), 1, "viewer-all-1")
         bus.declare_alive(session.key("demo"))
-        code, found = examine(capsys, DEMO / "demo.toml", *settings)
+        code, found = examine(DEMO / "demo.toml", *settings)
         assert (code, found["problems"]) == (0, [])
         runs = f"viewer: runs already ({session.process})"
         assert {f"bus.endpoint {endpoint}: site 'demo' runs there", runs, "resampler: can start"} <= set(found["good"])
@@ -168,47 +157,47 @@ def test_the_ports_of_the_own_running_site_are_no_problem_and_those_of_a_strange
     ],
 )
 def test_a_package_that_fantwin_needs_is_a_problem_when_it_is_missing_and_one_of_an_extra_is_none(
-    capsys, monkeypatch, missing, kind, line
+    monkeypatch, missing, kind, line
 ):
     versions = module._version
     monkeypatch.setattr(module, "_version", lambda name: "" if name == missing else versions(name))
-    code, found = examine(capsys)
+    code, found = examine()
     assert line in found[kind]
     assert (code, len(found["problems"])) == ((1, 1) if kind == "problems" else (0, 0))
 
 
-def test_running_from_files_without_an_installation_is_a_problem(capsys, monkeypatch):
+def test_running_from_files_without_an_installation_is_a_problem(monkeypatch):
     def not_installed(name: str) -> list[str]:
         raise PackageNotFoundError(name)
 
     monkeypatch.setattr(module, "requires", not_installed)
-    code, found = examine(capsys)
+    code, found = examine()
     assert code == 1
     assert found["problems"] == ["fantwin is not installed: in its checkout, pip install -e ."]
 
 
-def test_little_disk_is_a_problem(capsys, tmp_path, port, monkeypatch):
+def test_little_disk_is_a_problem(tmp_path, port, monkeypatch):
     monkeypatch.setattr(module, "_MIN_FREE_BYTES", 1 << 62)
-    _, found = examine(capsys, DEMO / "demo.toml", f"tray.0.port='{port}'", f"run_folder='{tmp_path}'")
+    _, found = examine(DEMO / "demo.toml", f"tray.0.port='{port}'", f"run_folder='{tmp_path}'")
     assert "make room" in found["problems"][0]
 
 
 def test_without_c_the_configuration_of_this_folder_is_checked_and_one_that_is_missing_is_a_problem(
-    capsys, tmp_path, monkeypatch
+    tmp_path, monkeypatch
 ):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "fantwin.toml").write_text('[[tray]]\nname = "tray1"\nfanz = 1\n')
-    code, found = examine(capsys)
+    code, found = examine()
     assert code == 1 and "fanz" in found["problems"][0]
-    code, found = examine(capsys, tmp_path / "none.toml")
+    code, found = examine(tmp_path / "none.toml")
     assert code == 1 and "cannot read the configuration" in found["problems"][0]
 
 
-def test_what_several_processes_have_wrong_is_one_line(capsys, tmp_path, endpoint):
+def test_what_several_processes_have_wrong_is_one_line(tmp_path, endpoint):
     file = tmp_path / "fantwin.toml"
     trays = "".join(f'[[tray]]\nname = "{name}"\nfans = 1\nport = "/dev/none"\n' for name in "abc")
     file.write_text(f'[bus]\nendpoint = "{endpoint}"\n[launcher]\nstages = ["acquisition", "recorder"]\n{trays}')
-    found = examine(capsys, file)[1]["problems"]
+    found = examine(file)[1]["problems"]
     assert len([line for line in found if "/dev/none" in line]) == 1
     assert found[-1].startswith("acquisition/a, acquisition/b, acquisition/c: ")
 
@@ -269,14 +258,11 @@ def test_one_that_is_away_is_named_and_the_others_get_theirs(tmp_path, receiver)
     assert "no target nobody: there is hook, other" in usage_error_of("doctor", "notify", "nobody", "-c", config)
 
 
-def test_doctor_reads_secrets_and_urls(tmp_path, receiver, capsys):
+def test_doctor_reads_secrets_and_urls(tmp_path, receiver):
     config = site(tmp_path, receiver, receiver.port)
 
     def problems() -> list[str]:
-        with pytest.raises(typer.Exit):
-            doctor(config=config, json_output=True, listen_s=0.0)
-        found = json.loads(capsys.readouterr().out)
-        return [line for line in found["problems"] if line.startswith("notifier")]
+        return [line for line in examine(config)[1]["problems"] if line.startswith("notifier")]
 
     (tmp_path / "hook.url").chmod(0o644)
     assert ["others may read it" in line for line in problems()] == [True]

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import os
 import threading
 import time
-import tty
+from contextlib import closing
 from itertools import count
 from pathlib import Path
 
@@ -17,6 +16,7 @@ from fantwin.pipeline.cli.watch.line_check import _findings, check_line, refusal
 from fantwin.pipeline.config.loading import parse_config
 from fantwin.pipeline.config.settings import Config
 from fantwin.pipeline.runtime.stage import Context
+from fantwin.pipeline.sources.simulated.device import PseudoTerminal
 from fantwin.schemas.messages import Array, Raw
 from fantwin.schemas.units import NS_PER_S
 from tests.support.running_acquisition import SITE, acquisition, push_config
@@ -110,26 +110,23 @@ def test_what_does_not_fit_is_one_line_that_says_what_to_do(line: dict, words: s
 
 
 def test_a_port_is_listened_to_as_acquisition_does() -> None:
-    master, slave = os.openpty()
-    tty.setraw(slave)
     stop = threading.Event()
+    with closing(PseudoTerminal()) as device:
 
-    def device() -> None:
-        for number in count():
-            if stop.wait(0.02):
-                return
-            os.write(master, f"S {20_000 * number} {number} 117 1200 117 1200\n".encode())
+        def send() -> None:
+            for number in count():
+                if stop.wait(0.02):
+                    return
+                device.write(f"S {20_000 * number} {number} 117 1200 117 1200\n".encode())
 
-    sender = threading.Thread(target=device)
-    sender.start()
-    try:
-        config = config_of(tray__0__port=f"'{os.ttyname(slave)}'", tray__0__speed_unit="rpm")
-        ((is_fine, line),) = check_line(context_of(config), config, 1.0, is_running=False)
-    finally:
-        stop.set()
-        sender.join()
-        os.close(slave)
-        os.close(master)
+        sender = threading.Thread(target=send)
+        sender.start()
+        try:
+            config = config_of(tray__0__port=f"'{device.port}'", tray__0__speed_unit="rpm")
+            ((is_fine, line),) = check_line(context_of(config), config, 1.0, is_running=False)
+        finally:
+            stop.set()
+            sender.join()
     assert not is_fine
     assert "command 117 is outside command_min = 0 to command_max = 1" in line
 

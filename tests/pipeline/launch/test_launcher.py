@@ -134,6 +134,8 @@ class LateBus:
         self.now_s += seconds
         return False
 
+    sleep = wait
+
     def wait_for_others(self, _stop: object) -> None:
         """One has been met."""
 
@@ -194,7 +196,6 @@ def no_room(monkeypatch: pytest.MonkeyPatch) -> NoRoom:
 def recorder_only(lines: list[str], monkeypatch: pytest.MonkeyPatch) -> tuple[Launcher, Any, Any]:
     """A launcher of one stage, its clock, and its only slot."""
     bus: Any = LateBus(SITE, 0.0)
-    bus.sleep = bus.wait
     monkeypatch.setattr("fantwin.pipeline.launch.launcher.time", bus)
     monkeypatch.setattr("fantwin.pipeline.launch.launcher.RESTART_DELAY_MAX_S", 3.0)
     launcher = Launcher(load_config(DEMO / "demo.toml", ["launcher.stages=['recorder']"]), (), lines.append)
@@ -236,48 +237,35 @@ def test_a_stage_that_was_restarted_just_before_the_end_is_waited_for(monkeypatc
 
 
 class EndedChild:
-    """The process of a stage that ends in order."""
+    """The process of a stage that ends in order. called: what is asked of it, with its name."""
 
     process_id, heard_s, is_ready = 7, float("inf"), True
     last_line = ""
+
+    def __init__(self, name: str = "", called: list[str] | None = None) -> None:
+        self.name, self.called = name, [] if called is None else called
 
     def exit_status(self) -> int:
         return 0
 
     def terminate(self) -> None:
-        pass
+        self.called.append(f"asked {self.name}")
 
     def stop(self, _timeout_s: float) -> int:
+        self.called.append(f"ended {self.name}")
         return 0
 
 
 def test_the_processes_of_a_stage_end_together_and_before_those_of_the_next(monkeypatch):
     called: list[str] = []
-
-    class Shown(EndedChild):
-        def __init__(self, name: str) -> None:
-            self.name = name
-
-        def terminate(self) -> None:
-            called.append(f"asked {self.name}")
-
-        def stop(self, _timeout_s: float) -> int:
-            called.append(f"ended {self.name}")
-            return 0
-
     launcher = Launcher(load_config(DEMO / "demo.toml"), (), lambda _line: None)
     monkeypatch.setattr(launcher, "_has_reported", lambda _slot: True)
-    rows = [
-        StageProcess(stage, Shard(f"{n}-of-2", ("tray1",), ("--shard", f"{n}/2")))
-        for stage in ("resampler", "scorer")
-        for n in (1, 2)
-    ]
-    launcher._slots = [_Slot(row, cast("Any", Shown(row.label))) for row in rows]
+    shards = [Shard(f"{n}-of-2", ("tray1",), ("--shard", f"{n}/2")) for n in (1, 2)]
+    rows = [StageProcess(stage, shard) for stage in ("resampler", "scorer") for shard in shards]
+    launcher._slots = [_Slot(row, cast("Any", EndedChild(row.label, called))) for row in rows]
     launcher._stop_all()
-    assert called == [
-        *("asked resampler/1-of-2", "asked resampler/2-of-2", "ended resampler/1-of-2", "ended resampler/2-of-2"),
-        *("asked scorer/1-of-2", "asked scorer/2-of-2", "ended scorer/1-of-2", "ended scorer/2-of-2"),
-    ]
+    in_order = [(word, stage) for stage in ("resampler", "scorer") for word in ("asked", "ended")]
+    assert called == [f"{word} {stage}/{n}-of-2" for word, stage in in_order for n in (1, 2)]
 
 
 class Heard:
@@ -294,12 +282,8 @@ class Heard:
 
 def stopped(watcher: Any, monkeypatch: pytest.MonkeyPatch, *, was_ready: bool = True) -> tuple[Outcome, list[str]]:
     """How a run ends whose only stage was the recorder."""
-    bus: Any = LateBus(SITE, 0.0)
-    bus.sleep = bus.wait
-    monkeypatch.setattr("fantwin.pipeline.launch.launcher.time", bus)
     lines: list[str] = []
-    launcher = Launcher(load_config(DEMO / "demo.toml", ["launcher.stages=['recorder']"]), (), lines.append)
-    (slot,) = launcher._slots
+    launcher, _, slot = recorder_only(lines, monkeypatch)
     slot.child, slot.was_ready, slot.sessions = cast("Any", EndedChild()), was_ready, [("recorder", 7)]
     launcher._watcher, launcher._is_started = watcher, True
     launcher._stop_all()
