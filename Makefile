@@ -80,7 +80,7 @@ rerun-bump:
 	$(MAKE) lock
 	$(MAKE) $(VENV)/.development
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(RERUN_TESTS)
-	@echo "Rerun $(VERSION) passes; look at the picture: fantwin view runs/demo/view.rrd -o view.png"
+	@echo "Rerun $(VERSION) passes; look at the view: rerun runs/demo/view.rrd"
 
 clean:
 	rm -rf $(VENV) build dist *.egg-info .pytest_cache .ruff_cache .hypothesis .import_linter_cache

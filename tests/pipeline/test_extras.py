@@ -127,7 +127,6 @@ def printed_by(command: str, capsys: pytest.CaptureFixture[str], monkeypatch: py
     [
         ("export r.mcap --to parquet", "fantwin[logs]"),
         ("import log.ulg --list", "fantwin[logs]"),
-        ("view view.rrd -o v.png", "fantwin[view]"),
         ("view r.mcap -o view.rrd", "fantwin[view]"),
         ("view r.mcap -o r.png", "fantwin[report]"),
         (f"report {DEMO / 'twin.onnx'} r.mcap", "fantwin[report]"),

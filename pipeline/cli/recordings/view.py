@@ -1,4 +1,4 @@
-"""`fantwin view`: a recording as a view file for Rerun or as a plot; a view file as a picture."""
+"""`fantwin view`: a recording as a view file for Rerun, or as a plot."""
 
 from __future__ import annotations
 
@@ -15,19 +15,16 @@ from fantwin.pipeline.cli.printing import show
 from fantwin.pipeline.cli.progress import working
 from fantwin.pipeline.errors import UsageError, UserError
 from fantwin.pipeline.extras import require
-from fantwin.pipeline.files import temporary_folder, write_whole
+from fantwin.pipeline.files import temporary_folder
 from fantwin.pipeline.recordings.left_out import RAW, left_out
 from fantwin.pipeline.recordings.run_recordings import recorded_files
 from fantwin.pipeline.replay.offline.outcome import Again, score_again
 
 PLOTS = (".png", ".svg", ".pdf")
-WINDOW_S = 30.0
 
 
 def view(
-    files: Annotated[
-        list[Path], typer.Argument(metavar="REC.mcap...", help="A recording, or its parts; or a view file (.rrd).")
-    ],
+    files: Annotated[list[Path], typer.Argument(metavar="REC.mcap...", help="A recording, or its parts.")],
     output: Annotated[
         Path,
         typer.Option("-o", "--output", help="What to write: a view file .rrd for Rerun, or a plot .png, .svg or .pdf."),
@@ -35,7 +32,7 @@ def view(
     layout: Annotated[
         ViewLayout, typer.Option(help="all: every fan; alarms: fans that were in alarm; wear: change over days.")
     ] = ViewLayout.ALL,
-    window: Annotated[float, typer.Option(min=0.1, help="Length of time shown, s.")] = WINDOW_S,
+    window: Annotated[float, typer.Option(min=0.1, help="Length of time shown, s.")] = 30.0,
     tray: Annotated[str | None, typer.Option(help="Plot: which tray, if there are several.")] = None,
     fans: Annotated[
         str | None, typer.Option(help="Plot: which fans, e.g. 2,5. Default: with alarms, and one without.")
@@ -49,8 +46,7 @@ def view(
 ) -> None:
     """Turn a recording into a view file for Rerun, or plot its speeds, predictions, bands, alarms and states.
 
-    Topics that the recorder left out (recorder.topics) are made again first. A view file becomes a picture .png with a
-    headless Rerun viewer, which needs a Vulkan driver.
+    Topics that the recorder left out (recorder.topics) are made again first.
 
     Exits with 3 if the recording could not be read in full, or if making the topics again shows that data were lost.
     The rest is shown then.
@@ -64,11 +60,6 @@ def view(
         raise UsageError(f"--unit {unit}: no such unit of speed; known: rpm, rad/s")
     if output.suffix not in (".rrd", *PLOTS):
         raise UsageError(f"{output}: name a file that ends in .rrd, {', '.join(PLOTS)} with -o")
-    if files[0].suffix == ".rrd":
-        if tray or fans or layout != ViewLayout.ALL or window != WINDOW_S:
-            raise UsageError(f"{files[0]}: its picture has its own layout: no --layout, --window, --tray or --fans")
-        _draw(files, output, json_output=json_output)
-        return
     require("a plot", "report", "matplotlib") if is_plot else require("a view", "view")
     if output.exists() and not is_plot and not force:
         raise UserError(f"{output}: exists; name another file with -o, or use --force")
@@ -94,23 +85,6 @@ def view(
         typer.echo(line, err=True)
     if damage:
         raise typer.Exit(3)
-
-
-def _draw(files: Sequence[Path], output: Path, *, json_output: bool) -> None:
-    """Draw a view file as a PNG, and say what the viewer reported."""
-    if output.suffix != ".png" or len(files) > 1:
-        raise UsageError(f"{files[0]}: a view file becomes a picture: name one, and -o NAME.png")
-    require("a picture of a view", "view")
-    from fantwin.pipeline.outputs.rerun.rerun_picture import draw_picture  # noqa: PLC0415  an extra
-
-    with working(f"drawing {output}"):
-        drawn = draw_picture(files[0])
-    write_whole(output, drawn.png)
-    shown = f"{output}: {', '.join(sorted(drawn.reports))}"
-    show({"picture": str(output), "views": drawn.reports}, shown, json_output=json_output)
-    for name, reports in drawn.reports.items():
-        for report in reports:
-            typer.echo(f"{name}: {report}", err=True)
 
 
 @dataclass

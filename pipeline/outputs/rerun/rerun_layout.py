@@ -8,7 +8,7 @@ begin with `rerun_` import rerun. Measured with Rerun 0.41; see docs/how-to/view
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -33,14 +33,12 @@ from fantwin.pipeline.outputs.rerun.rerun_styles import (
     judged_path,
     log_fan_styles,
     log_path,
-    log_state_styles,
     pages_of,
     score_style,
     speed_style,
     state_path,
     wear_path,
 )
-from fantwin.pipeline.site.trace import state_names
 from fantwin.schemas.channels import Channel
 from fantwin.schemas.units import SpeedUnit
 
@@ -90,8 +88,7 @@ FanPlot = tuple[TrayLayout, int]
 def log_styles(recording: rr.RecordingStream, tray: TrayLayout, fans: Sequence[int]) -> None:
     """Log the static names, colours and widths of every series of some fans."""
     for fan in fans:
-        log_fan_styles(recording, tray.name, fan, speed_style(tray.speed_unit, LINE_WIDTH))
-        log_state_styles(recording, state_path(tray.name, fan), state_names())
+        log_fan_styles(recording, tray.name, fan, tray.speed_unit)
     for page, of_page in enumerate(pages_of(range(tray.fans), tray.judged_together)):
         if not set(of_page).isdisjoint(fans):
             recording.log(judged_path(tray.name, BALANCE, page), balance_style(len(of_page)), static=True)
@@ -99,12 +96,23 @@ def log_styles(recording: rr.RecordingStream, tray: TrayLayout, fans: Sequence[i
 
 
 def site_blueprint(name: LayoutName, trays: Sequence[TrayLayout], window_s: float) -> rrb.Blueprint:
-    """One of the layouts."""
+    """One of the layouts; it follows the newest data. window_s: length of time shown."""
     if name == "wear":
-        return wear_blueprint([tray.name for tray in trays])
+        endless = rrb.TimeRangeBoundary.infinite()
+        return _tabbed([_wear_tab(tray.name) for tray in trays], DAYS, rr.TimeRange(start=endless, end=endless))
     if name == "alarms" or trays[0].is_of_fleet:
-        return alarms_blueprint(trays, window_s)
-    return trays_blueprint(trays, window_s)
+        pages = pages_of([(tray, fan) for tray in trays for fan in tray.alarmed], ALARMS_ON_A_PAGE)
+        tabs = [_page_tab(", ".join(f"{tray.name}/{fan}" for tray, fan in page), page) for page in pages]
+        logs = list(dict.fromkeys(tray.log for tray in trays))
+        tabs = tabs or [rrb.Horizontal(_alarms_view(), _log_view(logs), name="alarms")]
+    else:
+        of_trays = {tray.name: pages_of([(tray, fan) for fan in range(tray.fans)]) for tray in trays}
+        pages = [page for of_tray in of_trays.values() for page in of_tray]
+        tabs = [_tray_tab(tray, of_tray) for tray, of_tray in of_trays.items()]
+    margin = max((MARGIN_FOR_LEGEND[columns_of(len(page))] for page in pages), default=0.0)
+    cursor = rrb.TimeRangeBoundary.cursor_relative
+    shown = rr.TimeRange(start=cursor(seconds=-window_s), end=cursor(seconds=margin * window_s))
+    return _tabbed(tabs, TIMELINE, shown)
 
 
 class _Linked(rrb.Blueprint):
@@ -119,16 +127,6 @@ class _Linked(rrb.Blueprint):
         stream.log(f"{_SHARED_VIEW}/TimeAxis", self._axis)
 
 
-def _blueprint(tabs: Sequence[rrb.Container | rrb.View], window_s: float, margin: float) -> rrb.Blueprint:
-    """The whole layout of some tabs; it follows the newest data.
-
-    window_s: length of time shown. margin: the share of it that is kept free at the right.
-    """
-    cursor = rrb.TimeRangeBoundary.cursor_relative
-    window = rr.TimeRange(start=cursor(seconds=-window_s), end=cursor(seconds=margin * window_s))
-    return _tabbed(tabs, TIMELINE, window)
-
-
 def _tabbed(tabs: Sequence[rrb.Container | rrb.View], timeline: str, shown: rr.TimeRange) -> rrb.Blueprint:
     return _Linked(
         rrb.Tabs(*tabs, active_tab=0) if len(tabs) > 1 else tabs[0],
@@ -138,29 +136,6 @@ def _tabbed(tabs: Sequence[rrb.Container | rrb.View], timeline: str, shown: rr.T
         auto_views=False,
         collapse_panels=True,
     )
-
-
-def trays_blueprint(trays: Sequence[TrayLayout], window_s: float) -> rrb.Blueprint:
-    """The layout `all` of some trays."""
-    margin = max(MARGIN_FOR_LEGEND[columns_of(len(page))] for tray in trays for page in pages_of(range(tray.fans)))
-    return _blueprint([_tray_tab(tray) for tray in trays], window_s, margin)
-
-
-def alarms_blueprint(trays: Sequence[TrayLayout], window_s: float) -> rrb.Blueprint:
-    """The layout `alarms` of some trays: the fans that are in alarm or were, four on a page."""
-    plots = [(tray, fan) for tray in trays for fan in tray.alarmed]
-    pages = [plots[start : start + ALARMS_ON_A_PAGE] for start in range(0, len(plots), ALARMS_ON_A_PAGE)]
-    tabs = [_page_tab(_names(page), page) for page in pages]
-    logs = list(dict.fromkeys(tray.log for tray in trays))
-    lists = rrb.Horizontal(_alarms_view(), _log_view(logs), name="alarms")
-    margin = max((MARGIN_FOR_LEGEND[columns_of(len(page))] for page in pages), default=0.0)
-    return _blueprint(tabs or [lists], window_s, margin)
-
-
-def wear_blueprint(trays: Sequence[str]) -> rrb.Blueprint:
-    """The layout `wear`: a tab for each of these trays."""
-    everything = rr.TimeRange(start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.infinite())
-    return _tabbed([_wear_tab(tray) for tray in trays], DAYS, everything)
 
 
 def _wear_tab(tray: str) -> rrb.Container:
@@ -178,17 +153,11 @@ def columns_of(plots: int) -> int:
     return 1 if plots <= 2 else 2 if plots <= 4 else 4
 
 
-def _tray_tab(tray: TrayLayout) -> rrb.Container:
-    pages = [_page_tab(_page_name(tray, fans), [(tray, fan) for fan in fans]) for fans in pages_of(range(tray.fans))]
-    return rrb.Tabs(*pages, active_tab=0, name=tray.name) if len(pages) > 1 else pages[0]
-
-
-def _page_name(tray: TrayLayout, fans: Sequence[int]) -> str:
-    return tray.name if len(fans) == tray.fans else f"{tray.name} / fans {fans[0]} to {fans[-1]}"
-
-
-def _names(plots: Iterable[FanPlot]) -> str:
-    return ", ".join(f"{tray.name}/{fan}" for tray, fan in plots)
+def _tray_tab(tray: str, pages: Sequence[Sequence[FanPlot]]) -> rrb.Container:
+    if len(pages) == 1:
+        return _page_tab(tray, pages[0])
+    tabs = [_page_tab(f"{tray} / fans {page[0][1]} to {page[-1][1]}", page) for page in pages]
+    return rrb.Tabs(*tabs, active_tab=0, name=tray)
 
 
 def _page_tab(name: str, plots: Sequence[FanPlot]) -> rrb.Container:
@@ -203,7 +172,15 @@ def _page_tab(name: str, plots: Sequence[FanPlot]) -> rrb.Container:
     lane_share = max(MIN_LANE_SHARE, (1.6 + len(plots)) / 25)
     above: rrb.Container = rrb.Grid(*(_fan_rows(*plot, columns) for plot in plots), grid_columns=columns)
     if auxiliary := list(dict.fromkeys(column for tray, _ in plots for column in tray.auxiliary)):
-        beside = [_auxiliary_view(plots, column) for column in auxiliary]
+        beside = [
+            rrb.TimeSeriesView(
+                origin="/",
+                contents=[f"/{auxiliary_path(tray.name, column.name, fan)}" for tray, fan in plots],
+                name=f"{column.title} ({column.unit})",
+                axis_x=LINKED,
+            )
+            for column in auxiliary
+        ]
         above = rrb.Vertical(above, rrb.Horizontal(*beside), row_shares=[4, 1])
     logs = list(dict.fromkeys(tray.log for tray, _ in plots))
     return rrb.Vertical(
@@ -211,16 +188,6 @@ def _page_tab(name: str, plots: Sequence[FanPlot]) -> rrb.Container:
         rrb.Horizontal(lanes, _alarms_view(), _log_view(logs), column_shares=[4, 4, 3]),
         row_shares=[1 - lane_share, lane_share],
         name=name,
-    )
-
-
-def _auxiliary_view(plots: Sequence[FanPlot], column: Channel) -> rrb.TimeSeriesView:
-    """What is measured of some fans beside command and speed: one line for each."""
-    return rrb.TimeSeriesView(
-        origin="/",
-        contents=[f"/{auxiliary_path(tray.name, column.name, fan)}" for tray, fan in plots],
-        name=f"{column.title} ({column.unit})",
-        axis_x=LINKED,
     )
 
 
@@ -237,39 +204,28 @@ def _fan_rows(tray: TrayLayout, fan: int, columns: int) -> rrb.Container:
     )
     page, number = divmod(fan, tray.judged_together)
     on_page = min(tray.judged_together, tray.fans - page * tray.judged_together)
-    names = (f"{tray.name} / fan {fan} torque balance", f"{tray.name} / fan {fan} score")
+    names = {BALANCE: f"{tray.name} / fan {fan} torque balance", SCORE: f"{tray.name} / fan {fan} score"}
     if columns == 4:  # narrow: a longer name is cut off
-        names = (f"balance {fan}", f"score {fan}")
+        names = {BALANCE: f"balance {fan}", SCORE: f"score {fan}"}
     styles = {BALANCE: balance_style(on_page, number), SCORE: score_style(on_page, number)}
-    kinds = [
-        _judged_view(judged_path(tray.name, kind, page), name, style)
-        for (kind, style), name in zip(styles.items(), names, strict=True)
+    judged = [
+        rrb.TimeSeriesView(
+            origin=f"/{judged_path(tray.name, kind, page)}",
+            name=name,
+            axis_x=LINKED,
+            plot_legend=rrb.PlotLegend(visible=False),
+            overrides={judged_path(tray.name, kind, page): styles[kind].visualizer()},  # the series of this fan alone
+        )
+        for kind, name in names.items()
     ]
-    return rrb.Vertical(speed, rrb.Horizontal(*kinds), row_shares=[5, 3])
-
-
-def _judged_view(path: str, name: str, style: rr.SeriesLines) -> rrb.TimeSeriesView:
-    """The view of a fan's torque balance beside what is expected, or of its score beside the limit.
-
-    style: shows the series of this fan alone.
-    """
-    return rrb.TimeSeriesView(
-        origin=f"/{path}",
-        contents=[f"/{path}"],
-        name=name,
-        axis_x=LINKED,
-        plot_legend=rrb.PlotLegend(visible=False),
-        overrides={path: style.visualizer()},
-    )
+    return rrb.Vertical(speed, rrb.Horizontal(*judged), row_shares=[5, 3])
 
 
 def _alarms_view() -> rrb.TextDocumentView:
-    """The view of the table of alarms."""
     return rrb.TextDocumentView(origin=f"/{ALARMS_PATH}", name="alarms")
 
 
 def _log_view(paths: Sequence[str]) -> rrb.TextLogView:
-    """The view of one or more logs."""
     return rrb.TextLogView(
         origin="/",
         contents=[f"/{path}" for path in paths],

@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib.util
 import math
 import os
-import queue
 import select
 import subprocess
 import sys
@@ -37,8 +36,6 @@ from fantwin.pipeline.site.trace import Trace
 from fantwin.schemas.channels import CHANNELS
 from fantwin.schemas.messages import Array
 
-HELD_BYTES = 64 << 20
-"""At most so much waits in memory for a slow disk."""
 CLOSE_LIMIT_S = 5.0
 FLUSH_LIMIT_S = 0.5
 _PIECE_BYTES = 1 << 16
@@ -48,10 +45,8 @@ class ViewFile:
     """Copies what is written to `pipe` into a file until the other end is closed.
 
     Rerun writes into the pipe and this class writes to the disk: Rerun's own file sink stops for ever when the disk
-    refuses a write, and every later flush then waits without end.
-
-    When the disk refuses, or falls too far behind, the file ends there and everything later is discarded: a gap would
-    make it unreadable. Whoever writes into the pipe never waits for the disk.
+    refuses a write, and every later flush then waits without end. When the disk refuses, the file ends there and
+    everything later is discarded: a gap would make it unreadable.
     """
 
     def __init__(self, path: Path, limit_bytes: float = math.inf) -> None:
@@ -69,11 +64,9 @@ class ViewFile:
         self.pipe = Path(f"/dev/fd/{self._write_end}")
         """open it for writing, then call `release_pipe`"""
         self._between = threading.Lock()
-        """held while a piece is neither in the pipe nor in the queue"""
-        self._waiting: queue.Queue[bytes] = queue.Queue(HELD_BYTES // _PIECE_BYTES)
-        self._threads = [threading.Thread(target=work, daemon=True) for work in (self._read, self._write)]
-        for thread in self._threads:
-            thread.start()
+        """held while a piece is neither in the pipe nor in the file"""
+        self._thread = threading.Thread(target=self._copy, daemon=True)
+        self._thread.start()
 
     def release_pipe(self) -> None:
         """The pipe has been opened by its writer: the file ends when the writer closes it."""
@@ -82,48 +75,41 @@ class ViewFile:
     def flush(self) -> None:
         """Wait until the system has what is in the pipe, at most FLUSH_LIMIT_S."""
         until_s = time.monotonic() + FLUSH_LIMIT_S
-        while time.monotonic() < until_s and not self.problem:
-            with self._between:
+        while time.monotonic() < until_s:
+            if self._between.acquire(timeout=FLUSH_LIMIT_S):
                 left = int.from_bytes(ioctl(self._read_end, FIONREAD, bytes(4)), sys.byteorder)
-                if not left and not self._waiting.unfinished_tasks:
+                self._between.release()
+                if not left:
                     return
             time.sleep(0.001)
 
     def close(self) -> None:
         """Wait until everything is written, at most CLOSE_LIMIT_S."""
-        for thread in self._threads:
-            thread.join(CLOSE_LIMIT_S / 2)
-            if thread.is_alive():
-                self._stop(f"not finished after {CLOSE_LIMIT_S:g} s")
-                return
-        os.close(self._read_end)
+        self._thread.join(CLOSE_LIMIT_S)
+        if self._thread.is_alive():
+            self._stop(f"not finished after {CLOSE_LIMIT_S:g} s")
+        else:
+            os.close(self._read_end)
 
-    def _read(self) -> None:
+    def _copy(self) -> None:
         piece = b"\0"
-        while piece:
-            select.select([self._read_end], [], [])
-            with self._between:
-                piece = os.read(self._read_end, _PIECE_BYTES)
-                try:
-                    if piece and not self.problem:
-                        self._waiting.put_nowait(piece)
-                except queue.Full:
-                    self._stop("the disk is too slow")
-        self._waiting.put(b"")
-
-    def _write(self) -> None:
         with self._file:
-            while piece := self._waiting.get():
-                rest = memoryview(piece)
-                self._room_bytes -= len(piece)
-                if self._room_bytes < 0:
-                    self._stop("it has the largest size of a view", "`fantwin view` shows a recording")
-                while rest and not self.problem:
-                    try:
-                        rest = rest[self._file.write(rest) :]
-                    except OSError as error:
-                        self._stop(error.strerror or str(error))
-                self._waiting.task_done()
+            while piece:
+                select.select([self._read_end], [], [])
+                with self._between:
+                    piece = os.read(self._read_end, _PIECE_BYTES)
+                    self._write(piece)
+
+    def _write(self, piece: bytes) -> None:
+        self._room_bytes -= len(piece)
+        if self._room_bytes < 0:
+            self._stop("it has the largest size of a view", "`fantwin view` shows a recording")
+        rest = memoryview(piece)
+        while rest and not self.problem:
+            try:
+                rest = rest[self._file.write(rest) :]
+            except OSError as error:
+                self._stop(error.strerror or str(error))
 
     def _stop(self, reason: str, todo: str = "make room and restart the viewer") -> None:
         self.problem = self.problem or (
@@ -168,29 +154,21 @@ def rerun_program() -> Path:
 
 
 def _open_view(file: Path, limit_bytes: float) -> ViewFile:
-    path = unused_path(file)
+    """Begin the file, or the first of file-2, file-3 ... that does not exist.
+
+    Raises:
+        StageError: it cannot be written.
+    """
+    path, number = file, 1
     try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        while path.exists():
+            number += 1
+            path = file.with_stem(f"{file.stem}-{number}")
+        path.open("xb").close()
         return ViewFile(path, limit_bytes)
     except OSError as error:
         raise StageError(f"{path}: cannot write the view: {error.strerror}; change viewer.file") from error
-
-
-def unused_path(path: Path) -> Path:
-    """Create and return `path`, or the first of path-2, path-3 ... that does not exist.
-
-    Raises:
-        StageError: the file cannot be created.
-    """
-    candidate, number = path, 1
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        while candidate.exists():
-            number += 1
-            candidate = path.with_stem(f"{path.stem}-{number}")
-        candidate.open("xb").close()
-    except OSError as error:
-        raise StageError(f"{candidate}: cannot write the view: {error.strerror}; change viewer.file") from error
-    return candidate
 
 
 class RerunSink:

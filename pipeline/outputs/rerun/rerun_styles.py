@@ -6,10 +6,11 @@ The colours are legible on Rerun's dark and on its light background.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TypeVar
 
 import rerun as rr
 
-from fantwin.pipeline.site.trace import SILENT
+from fantwin.pipeline.site.trace import SILENT, state_names
 from fantwin.schemas.units import SpeedUnit
 
 TIMELINE = "time"
@@ -33,8 +34,11 @@ def fan_path(tray: str, fan: int, part: str) -> str:
     return f"{tray}/fan_{fan}/{part}"
 
 
-def pages_of(fans: Sequence[int], size: int = FANS_ON_A_PAGE) -> list[Sequence[int]]:
-    """The fans of a tray, a page at a time."""
+Shown = TypeVar("Shown")
+
+
+def pages_of(fans: Sequence[Shown], size: int = FANS_ON_A_PAGE) -> list[Sequence[Shown]]:
+    """Fans, a page at a time."""
     return [fans[start : start + size] for start in range(0, len(fans), size)]
 
 
@@ -49,9 +53,9 @@ def state_path(tray: str, fan: int) -> str:
     return f"{tray}/state/fan_{fan}"
 
 
-def auxiliary_path(tray: str, column: str, fan: int | None = None) -> str:
-    """Entity of what a fan's source measures beside command and speed; without a fan, that of all fans."""
-    return f"{tray}/{column}" if fan is None else f"{tray}/{column}/fan_{fan}"
+def auxiliary_path(tray: str, column: str, fan: int) -> str:
+    """Entity of what a fan's source measures beside command and speed."""
+    return f"{tray}/{column}/fan_{fan}"
 
 
 def log_path(tray: str) -> str:
@@ -127,18 +131,17 @@ def score_style(fans: int, shown: int | None = None) -> rr.SeriesLines:
     )
 
 
-def log_fan_styles(recording: rr.RecordingStream, tray: str, fan: int, speed: rr.Measurements) -> None:
-    """Log the static names, colours and widths of the series of a fan; `speed`: see `speed_style`."""
-    deviation = rr.Measurements.from_fields(names="area in alarm", colors=RED, widths=0.0)
-    recording.log(fan_path(tray, fan, "speed"), speed, static=True)
-    recording.log(fan_path(tray, fan, "deviation"), deviation, static=True)
-    outside = rr.SeriesPoints(names="dots outside band", colors=RED, marker_sizes=2.0)
-    recording.log(fan_path(tray, fan, "outside"), outside, static=True)
-    not_scored = rr.SeriesLines(names="not scored", colors=GREY, widths=LINE_WIDTH)
-    recording.log(fan_path(tray, fan, "not_scored"), not_scored, static=True)
-
-
-def log_state_styles(recording: rr.RecordingStream, path: str, names: Sequence[str]) -> None:
-    """Log the static colours of a lane that shows these states."""
-    colors = [STATE_COLORS.get(name, UNKNOWN_COLOR) for name in names]
-    recording.log(path, rr.StateConfiguration(values=list(names), colors=colors), static=True)
+def log_fan_styles(recording: rr.RecordingStream, tray: str, fan: int, unit: SpeedUnit) -> None:
+    """Log the static names, colours and widths of the series and the lane of a fan."""
+    names = state_names()
+    styles = {
+        fan_path(tray, fan, "speed"): speed_style(unit, LINE_WIDTH),
+        fan_path(tray, fan, "deviation"): rr.Measurements.from_fields(names="area in alarm", colors=RED, widths=0.0),
+        fan_path(tray, fan, "outside"): rr.SeriesPoints(names="dots outside band", colors=RED, marker_sizes=2.0),
+        fan_path(tray, fan, "not_scored"): rr.SeriesLines(names="not scored", colors=GREY, widths=LINE_WIDTH),
+        state_path(tray, fan): rr.StateConfiguration(
+            values=names, colors=[STATE_COLORS.get(name, UNKNOWN_COLOR) for name in names]
+        ),
+    }
+    for path, style in styles.items():
+        recording.log(path, style, static=True)

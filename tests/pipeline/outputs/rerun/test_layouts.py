@@ -13,15 +13,11 @@ from fantwin.stages.viewer import build
 from tests.support.drawn_fleets import context as fleet_context
 from tests.support.drawn_fleets import messages_of, play
 from tests.support.drawn_views import LATER_NS, context, sent
+from tests.support.headless_viewer import headless_viewer, needs_a_driver
 from tests.support.ports import free_port
 from tests.support.recorded_views import live_view, recorded_view
 from tests.support.running_chain import eventually
 from tests.support.score_data import made_up_tray
-
-rerun_picture = pytest.importorskip("fantwin.pipeline.outputs.rerun.rerun_picture", exc_type=ModuleNotFoundError)
-needs_a_driver = pytest.mark.skipif(
-    not rerun_picture.has_vulkan_driver(), reason="no Vulkan driver here: apt-get install mesa-vulkan-drivers"
-)
 
 
 def plots(*fans: str) -> set[str]:
@@ -52,17 +48,18 @@ def is_drawn(viewer: Any) -> bool:
 
 @pytest.mark.slow
 @needs_a_driver
-def test_each_other_layout_of_a_live_view_a_recording_and_a_fleet_opens_without_a_report(
+def test_each_layout_of_a_live_view_a_recording_and_a_fleet_opens_without_a_report(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made = {
+        live_view(tmp_path / "all"): plots("tray1/0", "tray1/1", "tray1/2") | {"temperature (°C)"},
         live_view(tmp_path / "wear", "wear"): {"tray1 / speed since commissioning (%)"},
         recorded_view(tmp_path, "alarms"): plots("tray1/2") | {"temperature (°C)"},
     }
     monkeypatch.setattr("fantwin.pipeline.outputs.rerun.fleet_view.FLEET_ABOVE", 3)
     made[fleet_view(tmp_path / "fleet")] = plots("tray1/0", "tray2/2")
     for path, names in made.items():
-        with rerun_picture.headless_viewer() as viewer:
+        with headless_viewer() as viewer:
             viewer.open(str(path))
             eventually(lambda: reports(viewer).keys() == names, f"the views of {path}")  # noqa: B023  at once
             axes = [part["TimeAxis"] for part in viewer.get_blueprint().blueprint.values() if "TimeAxis" in part]
@@ -78,7 +75,7 @@ def test_a_live_viewer_follows_an_old_recording(tmp_path: Path) -> None:
     scores, _ = made_up_tray(seconds=5)
     port = free_port()
     core = build(context(tmp_path, grpc_port=port, web_port=0)).core
-    with rerun_picture.headless_viewer() as viewer:
+    with headless_viewer() as viewer:
         viewer.open(f"rerun+http://127.0.0.1:{port}/proxy")
         for number, item in enumerate(scores):
             core.step(sent(item))

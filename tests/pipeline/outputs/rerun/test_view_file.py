@@ -1,15 +1,13 @@
-"""The file of a view never keeps the viewer waiting: a disk that is full or hangs is reported."""
+"""The file of a view ends where the disk is full, and the viewer goes on."""
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from fantwin.pipeline.config.settings import TrayConfig
-from fantwin.pipeline.outputs.rerun import rerun_sink
 from fantwin.pipeline.outputs.rerun.rerun_sink import RerunSink, ViewFile, ViewOptions
 from fantwin.pipeline.outputs.rerun.viewer_core import ViewerCore
 from fantwin.schemas.units import NS_PER_S
@@ -61,19 +59,3 @@ def test_the_file_ends_before_it_exceeds_its_limit(tmp_path: Path) -> None:
     file.close()
     assert 100_000 < path.stat().st_size <= 200_000
     assert "it has the largest size of a view" in file.problem
-
-
-def test_row_09_a_disk_that_hangs_keeps_nobody_waiting(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rerun_sink, "HELD_BYTES", 1 << 20)
-    monkeypatch.setattr(rerun_sink, "CLOSE_LIMIT_S", 0.2)
-    path = tmp_path / "view.rrd"
-    os.mkfifo(path)  # nobody reads from it: a write of more than it holds never returns
-    reader = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
-    file = ViewFile(path)
-    with file.pipe.open("wb", buffering=0) as pipe:
-        file.release_pipe()
-        for _ in range(50):
-            pipe.write(bytes(100_000))
-        assert "view.rrd: the view is not written any more: the disk is too slow" in file.problem
-    file.close()
-    os.close(reader)
