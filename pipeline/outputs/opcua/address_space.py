@@ -13,7 +13,15 @@ from asyncua import Node, Server, ua
 from asyncua.server.address_space import AddressSpace
 
 from fantwin.pipeline.config.settings import TrayConfig
-from fantwin.pipeline.outputs.opcua.encoding import COMMISSION, FAN_ALARM_TYPE, FAN_TYPE, SITE_FOLDER, STATUS, standard
+from fantwin.pipeline.outputs.opcua.encoding import (
+    ALARM,
+    COMMISSION,
+    FAN_ALARM_TYPE,
+    FAN_TYPE,
+    SITE_FOLDER,
+    STATUS,
+    standard,
+)
 from fantwin.pipeline.outputs.opcua.events import OWN_FIELDS, condition_fields
 from fantwin.pipeline.outputs.opcua.fan_values import VARIABLES
 from fantwin.pipeline.outputs.opcua.requests import FAN_METHODS
@@ -100,7 +108,7 @@ async def build_address_space(
 ) -> SiteNodes:
     """Add all that the server has of its own; returns the nodes of the site. nodes: those of the server."""
     namespace = nodes.namespace
-    await _add_types(server, namespace)
+    own = await _add_types(server, namespace)
     folder = await server.nodes.objects.add_folder(ua.NodeId(SITE_FOLDER, namespace), _name(site, namespace))
     await folder.set_event_notifier(_NOTIFIES)
     await server.nodes.server.set_event_notifier(_NOTIFIES)
@@ -108,38 +116,39 @@ async def build_address_space(
     history = server.get_node(ua.NodeId(ua.ObjectIds.HistoryServerCapabilities_AccessHistoryEventsCapability))
     await history.write_value(True)
 
-    def name_of(node: ua.NodeId) -> ua.QualifiedName:
-        found = nodes.read_attribute_value(node, ua.AttributeIds.BrowseName).Value
-        return found.Value if found is not None else ua.QualifiedName()
-
-    nodes.site = SiteNodes(name_of, namespace, site, trays, value_of)
+    nodes.site = SiteNodes(nodes, own, namespace, site, trays, value_of)
     nodes[folder.nodeid].references.extend(nodes.site.trays_in_folder())
     return nodes.site
 
 
-async def _add_types(server: Server, namespace: int) -> None:
-    """FanType, and FanAlarmType with the fields that the standard does not have."""
+async def _add_types(server: Server, namespace: int) -> dict[str, ua.NodeId]:
+    """FanType, and FanAlarmType with the fields that the standard does not have; returns their declarations, by path
+    below a fan."""
     alarm_type = await server.get_node(standard("AlarmConditionType")).add_object_type(
         ua.NodeId(FAN_ALARM_TYPE, namespace), _name("FanAlarmType", namespace)
     )
-    number = _FIRST_DECLARATION
-    fields = condition_fields(Fan("", 0), None, 0, namespace)
-    for name in OWN_FIELDS:
-        declared = await alarm_type.add_property(ua.NodeId(number, namespace), _name(name, namespace), fields[name])
-        await declared.set_modelling_rule(True)
-        number += 1
     fan_type = await server.nodes.base_object_type.add_object_type(
         ua.NodeId(FAN_TYPE, namespace), _name("FanType", namespace)
     )
+    numbers = count(_FIRST_DECLARATION)
+    declared: dict[str, Node] = {}
+    fields = condition_fields(Fan("", 0), None, 0, namespace)
+    for name in OWN_FIELDS:
+        node = ua.NodeId(next(numbers), namespace)
+        declared[f"{ALARM}/{name}"] = await alarm_type.add_property(node, _name(name, namespace), fields[name])
     for variable in VARIABLES:
-        empty = {"String": "", "Boolean": False}.get(variable.type, 0.0)
-        value = ua.Variant(empty, ua.VariantType[variable.type])
-        declared = await fan_type.add_variable(ua.NodeId(number, namespace), _name(variable.name, namespace), value)
-        await declared.set_modelling_rule(True)
-        number += 1
+        value = ua.Variant({"String": "", "Boolean": False}.get(variable.type, 0.0), ua.VariantType[variable.type])
+        node = ua.NodeId(next(numbers), namespace)
+        found = declared[variable.name] = await fan_type.add_variable(node, _name(variable.name, namespace), value)
+        about = ua.Variant(ua.LocalizedText(variable.about))
+        await found.write_attribute(ua.AttributeIds.Description, ua.DataValue(about))
+    declared[ALARM] = await fan_type.add_object(ua.NodeId(next(numbers), namespace), _name(ALARM, namespace))
+    for node in declared.values():
+        await node.set_modelling_rule(True)
     (commission,) = FAN_METHODS
     await _add_method(fan_type, ua.NodeId(COMMISSION, namespace), _name(commission.name, namespace))
     await fan_type.add_reference(alarm_type, ua.ObjectIds.GeneratesEvent)
+    return {path: node.nodeid for path, node in declared.items()}
 
 
 async def _add_method(fan_type: Node, node: ua.NodeId, name: ua.QualifiedName) -> None:

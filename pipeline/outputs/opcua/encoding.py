@@ -13,7 +13,7 @@ from asyncua import ua
 from fantwin.pipeline.site.fleet import Fan
 
 NAMESPACE = "urn:fantwin:fans"
-SITE_FOLDER, FAN_TYPE, FAN_ALARM_TYPE, COMMISSION, COMMISSION_ARGUMENTS = 1, 2, 3, 4, 5
+SITE_FOLDER, FAN_TYPE, FAN_ALARM_TYPE, COMMISSION = 1, 2, 3, 4
 ALARM, SHELVING_STATE = "Alarm", "Alarm/ShelvingState"
 
 

@@ -28,8 +28,7 @@ from fantwin.pipeline.outputs.opcua.requests import (
     status_of,
 )
 from fantwin.pipeline.outputs.opcua.sessions import CURRENT_SESSION
-from fantwin.pipeline.outputs.opcua.site_nodes import SiteNodes
-from fantwin.pipeline.outputs.opcua.templates import method_nodes
+from fantwin.pipeline.outputs.opcua.site_nodes import SiteNodes, method_nodes
 from fantwin.pipeline.site.fleet import Fan
 from fantwin.pipeline.site.one_line import one_line
 from fantwin.pipeline.site.request_desk import LONGEST_COMMENT, LONGEST_SHELVING_S, RequestDesk

@@ -13,7 +13,6 @@ from asyncua import ua
 from fantwin.pipeline.outputs.opcua.encoding import ALARM, SharedValue, data_value, value_of
 from fantwin.pipeline.outputs.opcua.events import condition_fields
 from fantwin.pipeline.outputs.opcua.fan_values import GOOD, VARIABLE, FanValues
-from fantwin.pipeline.outputs.opcua.templates import UNIT_RPM
 from fantwin.pipeline.site.fleet import Fan
 from fantwin.pipeline.site.site_model import SiteModel
 from fantwin.schemas.messages import ModelCard
@@ -21,6 +20,12 @@ from fantwin.schemas.twin_card import CardError, TwinCard
 from fantwin.schemas.units import RAD_S_PER_UNIT
 from fantwin.scoring.alarms.current_alarms import CurrentAlarm
 
+UNIT_RPM = ua.EUInformation(
+    NamespaceUri="http://www.opcfoundation.org/UA/units/un/cefact",
+    UnitId=ua.Int32(5394509),  # "RPM" of UN/CEFACT
+    DisplayName=ua.LocalizedText("r/min"),
+    Description=ua.LocalizedText("revolutions per minute"),
+)
 _CACHED = 1024
 _UNSHELVE_TIME = "ShelvingState/UnshelveTime"
 
