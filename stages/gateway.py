@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
 from functools import partial
-from pathlib import Path
+from typing import TYPE_CHECKING
 
 from fantwin.pipeline.config.registry import RECORDER
 from fantwin.pipeline.errors import refusals
@@ -23,7 +23,7 @@ from fantwin.pipeline.runtime.stage import BuiltStage, Context, Stage
 from fantwin.pipeline.site.alarm_history import FILE, AlarmHistory
 from fantwin.pipeline.site.fan_history import curves_of
 from fantwin.pipeline.site.fleet import Fan
-from fantwin.pipeline.site.other_stages import VIEWER, configured, recordings_of, viewer_urls
+from fantwin.pipeline.site.other_stages import VIEWER, configured, expected_stages, recordings_of, viewer_urls
 from fantwin.pipeline.site.request_desk import RequestDesk
 from fantwin.pipeline.site.site_core import SiteCore
 from fantwin.pipeline.site.site_json import alarm_json, curves_json, fleet_json, stages_json
@@ -32,6 +32,10 @@ from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.messages import Alarm, Message
 from fantwin.schemas.units import NS_PER_S
 
+if TYPE_CHECKING:
+    from fantwin.pipeline.certificates import Certificate
+    from fantwin.pipeline.outputs.web.access import Access
+
 FLEET_PERIOD_NS = NS_PER_S
 STAGES_PERIOD_NS = 2 * NS_PER_S
 
@@ -39,13 +43,19 @@ STAGES_PERIOD_NS = 2 * NS_PER_S
 class GatewayCore(SiteCore):
     """Collects what the server shows, and sends what operators ask."""
 
-    def __init__(self, model: SiteModel, feed: LiveFeed, desk: RequestDesk, serve: Server) -> None:
-        super().__init__(model)
-        self._desk = desk
-        self._feed = feed
-        self._server = serve
+    def __init__(
+        self,
+        model: SiteModel,
+        feed: LiveFeed,
+        desk: RequestDesk,
+        server: HttpServer,
+        access: Access,
+        certificate: Certificate | None,
+    ) -> None:
+        """certificate: with which the server shows who it is; None: it serves http."""
+        super().__init__(model, desk)
+        self._feed, self._server, self._access, self._certificate = feed, server, access, certificate
         self._fleet_ns = self._stages_ns = 0
-        self._requests = 0
 
     def add_score(self, envelope: Envelope) -> None:
         """Keep it, and send it to the pages that show one of its fans."""
@@ -60,7 +70,6 @@ class GatewayCore(SiteCore):
     def add_alarm(self, alarm: Alarm) -> None:
         """Keep it, and send a transition to all pages."""
         is_new = self._model.add_alarm(alarm)
-        self._desk.add(alarm)
         fan = Fan(alarm.header.tray, alarm.fan)
         current = self._model.current_alarm(fan)
         if is_new and current is not None and self._feed.readers:
@@ -68,86 +77,37 @@ class GatewayCore(SiteCore):
 
     def tick(self, now_ns: int) -> Sequence[Message]:
         """Send the pages the state of the fleet, and the scorers what operators ask."""
+        requests = super().tick(now_ns)
         if abs(now_ns - self._fleet_ns) >= FLEET_PERIOD_NS:
             self._fleet_ns = now_ns
-            self._model.notice_silence()
             if self._feed.readers:
                 self._feed.publish("fleet", fleet_json(self._model))
         if abs(now_ns - self._stages_ns) >= STAGES_PERIOD_NS:
             self._stages_ns = now_ns
             if self._feed.readers:
                 self._feed.publish("stages", {"stages": stages_json(self._model.stages())})
-        requests = self._desk.take()
-        self._requests += len(requests)
         return requests
 
     def close(self) -> Sequence[Message]:
         """Stop the server, and close the history."""
         self._server.stop()
-        self._model.close()
-        return ()
-
-    def abort(self) -> None:
-        """The same after a crash."""
-        self.close()
+        return super().close()
 
     def counters(self) -> Mapping[str, int]:
         """Requests sent, pages that are open, and what could not be shown."""
-        return {
-            "requests_sent": self._requests,
-            "pages_open": self._feed.readers,
-            "refused_scores": self._model.refused_scores,
-            **self._counts,
-        }
+        return {"pages_open": self._feed.readers, **super().counters()}
 
     def needs_score(self, tray: str) -> bool:
         """Whether the score of a tray that has arrived is to be decoded: all, of a tray that somebody looks at."""
         return super().needs_score(tray) or any(name == tray for name, _ in self._feed.looked_at())
 
     def problem(self) -> str:
-        """Problem of the server, the users and the history."""
-        return "; ".join(filter(None, (self._server.problem(), self._model.problem())))
-
-
-class Server:
-    """The web server of a gateway."""
-
-    def __init__(
-        self,
-        context: Context,
-        model: SiteModel,
-        feed: LiveFeed,
-        desk: RequestDesk,
-        clip_folders: Sequence[Path],
-    ) -> None:
-        from fantwin.pipeline.certificates import read_certificate, server_context  # noqa: PLC0415  slow to import
-        from fantwin.pipeline.outputs.web.access import Access  # noqa: PLC0415
-        from fantwin.pipeline.outputs.web.api import Api  # noqa: PLC0415
-        from fantwin.pipeline.outputs.web.app import MOST_CONNECTIONS, application  # noqa: PLC0415
-        from fantwin.pipeline.site.users import Users  # noqa: PLC0415
-
-        config: GatewayConfig = context.config
-        tls = self._certificate = None
-        if config.certificate and config.key:
-            certificate = context.resolve(config.certificate)
-            tls = server_context(certificate, context.resolve(config.key))
-            self._certificate = read_certificate(certificate)
-        self._access = Access(config, Users(context.resolve(config.users)) if config.users else None)
-        listening = listen(config.host, config.port + context.shard_number - 1, "gateway")
-        site = configured(context, VIEWER)
-        app = application(Api(model, self._access, feed, desk, viewer_urls(site) if site else {}, clip_folders), config)
-        self._server = HttpServer(app, listening, tls, MOST_CONNECTIONS, feed.end)
-
-    def stop(self) -> None:
-        """End it."""
-        self._server.stop()
-
-    def problem(self) -> str:
-        """Problem of the server, its certificate and its users; empty for none."""
+        """Problem of the server, its certificate, the users and the history."""
         ended = "" if self._server.is_running else "the web server has ended"
         expired = self._certificate.time_problem(datetime.now(UTC)) if self._certificate else ""
         wrong = "; ".join(filter(None, (ended, expired)))
-        return "; ".join(filter(None, (wrong and f"{wrong}; restart the gateway", self._access.problem)))
+        to_do = wrong and f"{wrong}; restart the gateway"
+        return "; ".join(filter(None, (to_do, self._access.problem, super().problem())))
 
 
 def build(context: Context) -> BuiltStage:
@@ -156,14 +116,36 @@ def build(context: Context) -> BuiltStage:
     Raises:
         UserError: the port is taken, or a file cannot be read or written.
     """
+    from fantwin.pipeline.certificates import read_certificate, server_context  # noqa: PLC0415  slow to import
+    from fantwin.pipeline.outputs.web.access import Access  # noqa: PLC0415
+    from fantwin.pipeline.outputs.web.api import Api  # noqa: PLC0415
+    from fantwin.pipeline.outputs.web.app import MOST_CONNECTIONS, application  # noqa: PLC0415
+    from fantwin.pipeline.site.users import Users  # noqa: PLC0415
+
     alarms = AlarmHistory(context.own_file(FILE))
     if context.started_t_ns:
         alarms.begins(context.started_t_ns)
-    model = SiteModel(context.site, context.trays, alarms, keeps_curves=True, keeps_rates=True)
+    model = SiteModel(
+        context.site,
+        context.trays,
+        alarms,
+        expected=expected_stages(context),
+        keeps_curves=True,
+        keeps_rates=True,
+    )
     feed, desk = LiveFeed(), RequestDesk(context.producer)
-    site = configured(context, RECORDER)
-    clip_folders = tuple(dict.fromkeys(map(clip_folder, recordings_of(site) if site else ())))
-    return BuiltStage(GatewayCore(model, feed, desk, Server(context, model, feed, desk, clip_folders)))
+    recorders, viewers = configured(context, RECORDER), configured(context, VIEWER)
+    clip_folders = tuple(dict.fromkeys(map(clip_folder, recordings_of(recorders) if recorders else ())))
+    config: GatewayConfig = context.config
+    tls = shown = None
+    if config.certificate and config.key:
+        certificate = context.resolve(config.certificate)
+        tls, shown = server_context(certificate, context.resolve(config.key)), read_certificate(certificate)
+    access = Access(config, Users(context.resolve(config.users)) if config.users else None)
+    listening = listen(config.host, config.port + context.shard_number - 1, "gateway")
+    app = application(Api(model, access, feed, desk, viewer_urls(viewers) if viewers else {}, clip_folders), config)
+    server = HttpServer(app, listening, tls, MOST_CONNECTIONS, feed.end)
+    return BuiltStage(GatewayCore(model, feed, desk, server, access, shown))
 
 
 def check(context: Context) -> list[str]:

@@ -22,6 +22,7 @@ from fantwin.pipeline.outputs.mqtt.topics import Topics, do_overlap
 from fantwin.pipeline.runtime.stage import BuiltStage, Context, Stage, StageError
 from fantwin.pipeline.site.alarm_history import FILE, AlarmHistory
 from fantwin.pipeline.site.fleet import Fan
+from fantwin.pipeline.site.other_stages import expected_stages
 from fantwin.pipeline.site.request_desk import RequestDesk
 from fantwin.pipeline.site.site_core import SiteCore
 from fantwin.pipeline.site.site_json import stages_json, transition_json
@@ -59,8 +60,7 @@ class MqttCore(SiteCore):
         link: BrokerLink,
     ) -> None:
         config: MqttConfig = context.config
-        super().__init__(model)
-        self._desk = desk
+        super().__init__(model, desk)
         self._config, self._topics, self._link = config, topics, link
         self._states = FanStates(model)
         self._outbox = Outbox()
@@ -86,7 +86,6 @@ class MqttCore(SiteCore):
         """Keep it; a new transition waits to be published."""
         self._model.add_alarm(alarm)
         self._queue.notice_new()
-        self._desk.add(alarm)
         self._changed_alarms.add(Fan(alarm.header.tray, alarm.fan))
 
     def tick(self, now_ns: int) -> Sequence[Message]:
@@ -100,13 +99,12 @@ class MqttCore(SiteCore):
         if now_ns - self._began_ns >= SETTLED_AFTER_NS:
             self._update(now_ns, now_ns - self._began_ns >= KNOWN_AFTER_NS)
         self._send()
-        return self._desk.take()
+        return super().tick(now_ns)
 
     def close(self) -> Sequence[Message]:
         """Send what there is room for, leave the broker, and close the history."""
         self._send()
-        self._link.stop(Outgoing(self._topics.status, OFFLINE, is_retained=True))
-        self._model.close()
+        self.abort()
         return ()
 
     def abort(self) -> None:
@@ -121,9 +119,8 @@ class MqttCore(SiteCore):
             "waiting_transitions": self._queue.waiting,
             "waiting_topics": len(self._outbox),
             "lost_transitions": self._queue.lost + self._history.lost,
-            "refused_scores": self._model.refused_scores,
             "dropped_requests": self._link.dropped_requests,
-            **self._counts,
+            **super().counters(),
             **self._requests.counts,
         }
 
@@ -139,7 +136,7 @@ class MqttCore(SiteCore):
         broker = self._link.problem()
         if broker and self._queue.lost:
             broker += f"; more than {MOST_WAITING} transitions of alarms wait, the oldest are lost"
-        return "; ".join(filter(None, (broker, self._model.problem())))
+        return "; ".join(filter(None, (broker, super().problem())))
 
     def _receive(self) -> None:
         for topic, payload, is_retained in self._link.received():
@@ -160,7 +157,6 @@ class MqttCore(SiteCore):
             self._outbox.retain(self._topics.alarm(fan), text, is_urgent=True)
         is_full = abs(now_ns - self._full_ns) >= PERIOD_S * NS_PER_S
         if is_full:
-            self._model.notice_silence()
             self._history.save_again()
             self._queue.notice_new()
         is_due = self._has_news and abs(now_ns - self._changes_ns) >= CHANGES_PERIOD_NS
@@ -213,7 +209,7 @@ def build(context: Context) -> BuiltStage:
         raise StageError(overlapping[0])
     topics = Topics(context.site, context.instance)
     alarms = AlarmHistory(context.own_file(FILE))
-    model = SiteModel(context.site, context.trays, alarms)
+    model = SiteModel(context.site, context.trays, alarms, expected=expected_stages(context))
     link = BrokerLink(
         config,
         context.folder,

@@ -24,12 +24,10 @@ from fantwin.pipeline.site.site_model import SiteModel
 from fantwin.schemas.enums import Transition
 from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.messages import Alarm, Message
-from fantwin.schemas.units import NS_PER_S
 
 if TYPE_CHECKING:
     from fantwin.pipeline.outputs.opcua.server import OpcuaServer
 
-SILENCE_PERIOD_NS = NS_PER_S
 CERTIFICATE, KEY = Path("opcua-certificate.der"), Path("opcua-key.pem")
 
 
@@ -37,10 +35,8 @@ class OpcuaCore(SiteCore):
     """Collects what the server shows, and sends what operators ask."""
 
     def __init__(self, model: SiteModel, desk: RequestDesk, server: OpcuaServer) -> None:
-        super().__init__(model)
-        self._desk = desk
+        super().__init__(model, desk)
         self._server = server
-        self._silence_ns = 0
 
     def add_score(self, envelope: Envelope) -> None:
         """Keep it."""
@@ -52,34 +48,19 @@ class OpcuaCore(SiteCore):
         current = self._model.current_alarm(Fan(alarm.header.tray, alarm.fan))
         if is_new and current is not None and alarm.transition != Transition.REFUSED:
             self._server.publish(current)
-        self._desk.add(alarm)
-
-    def tick(self, now_ns: int) -> Sequence[Message]:
-        """Send the scorers what operators ask."""
-        if abs(now_ns - self._silence_ns) >= SILENCE_PERIOD_NS:
-            self._silence_ns = now_ns
-            self._model.notice_silence()
-        requests = self._desk.take()
-        self._counts["requests_sent"] += len(requests)
-        return requests
 
     def close(self) -> Sequence[Message]:
         """Stop the server, and close the history."""
         self._server.stop()
-        self._model.close()
-        return ()
-
-    def abort(self) -> None:
-        """The same after a crash."""
-        self.close()
+        return super().close()
 
     def counters(self) -> Mapping[str, int]:
         """Requests and events sent, clients, and what could not be shown."""
-        return {"refused_scores": self._model.refused_scores, **self._counts, **self._server.counters()}
+        return {**super().counters(), **self._server.counters()}
 
     def problem(self) -> str:
         """Problem of the server, the users and the history."""
-        return "; ".join(filter(None, (self._server.problem, self._model.problem())))
+        return "; ".join(filter(None, (self._server.problem, super().problem())))
 
 
 def _serve(context: Context, model: SiteModel, desk: RequestDesk) -> OpcuaServer:

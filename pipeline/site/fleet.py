@@ -66,15 +66,13 @@ class FanNow:
         state: in words.
         score: 1 is at the limit; NaN if the newest sample is not scored.
         since_t_ns: time of the sample at which the state began; of an alarm, its onset.
-        is_in_alarm: an alarm is active; an operator may have silenced it.
     """
 
     fan: Fan
     state: str
+    group: FanGroup
     score: float
     since_t_ns: int
-    is_in_alarm: bool
-    is_silenced: bool = False
 
 
 _OF_STATE = {
@@ -206,12 +204,13 @@ class Fleet:
         score = np.nan_to_num(self._score, nan=0.0, posinf=_HIGHEST_SCORE, neginf=0.0).clip(0.0, _HIGHEST_SCORE)
         listed = (self._states() > FanState.UNKNOWN) | in_alarm
         order = np.lexsort((np.where(listed, -score, 0.0), -rank, ~listed)).tolist()
-        return [self._now(index, bool(in_alarm[index])) for index in order]
+        classes = self.classes().tolist()
+        return [self._now(index, bool(in_alarm[index]), classes[index]) for index in order]
 
     def fan_now(self, fan: Fan) -> FanNow:
         """One fan of the site."""
         index = self.index(fan)
-        return self._now(index, bool(self.in_alarm()[index]))
+        return self._now(index, bool(self.in_alarm()[index]), int(self.classes()[index]))
 
     def index(self, fan: Fan) -> int:
         """The index of a fan of the site."""
@@ -235,19 +234,19 @@ class Fleet:
         index = self.index(fan)
         return words_now(int(self._states()[index]), int(self._reasons[index]))
 
-    def _now(self, index: int, in_alarm: bool) -> FanNow:
+    def _now(self, index: int, in_alarm: bool, cell: int) -> FanNow:
         code, since_t_ns = int(self._codes[index]), int(self._since_t_ns[index])
         name = SILENT if code < 0 else state_name(*divmod(code, LARGEST_ENUM_VALUE + 1))
         onset_t_ns = int(self._onset_t_ns[index])
         if in_alarm and onset_t_ns != _NEVER_NS:
             since_t_ns = onset_t_ns
-        is_silenced = bool(self._silenced[index])
         if in_alarm and not name.startswith((FanState.ALARM.words, FanState.RETURNING.words)):
             words = words_now(code // (LARGEST_ENUM_VALUE + 1))
             name = f"alarm, now {words}" if words else f"alarm, {name}"
-        if in_alarm and is_silenced:
+        group = SHOWN_CLASSES[cell].group
+        if group == FanGroup.SILENCED:
             name += " (silenced)"
-        return FanNow(self.fans[index], name, float(self._score[index]), since_t_ns, in_alarm, is_silenced)
+        return FanNow(self.fans[index], name, group, float(self._score[index]), since_t_ns)
 
     def _change(self, of_tray: slice, codes: Array, t_ns: int) -> None:
         changed = self._codes[of_tray] != codes

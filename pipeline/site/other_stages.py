@@ -9,7 +9,7 @@ from urllib.parse import quote
 from fantwin.pipeline.config.loading import parse_config
 from fantwin.pipeline.config.registry import RECORDER
 from fantwin.pipeline.config.settings import Config
-from fantwin.pipeline.config.shards import own_file, shards_of
+from fantwin.pipeline.config.shards import StageProcess, own_file, process_list, shards_of
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.runtime.stage import Context
 from fantwin.pipeline.site.loopback import LOOPBACK
@@ -17,15 +17,21 @@ from fantwin.pipeline.site.loopback import LOOPBACK
 VIEWER = "viewer"
 
 
-def configured(context: Context, stage: str) -> Config | None:
-    """The configuration with the section of another stage; None: that stage is not enabled, or its section is wrong."""
+def configured(context: Context, *stages: str) -> Config | None:
+    """The configuration with the sections of other stages; None: one is not enabled, or its section is wrong."""
     if context.configuration_path is None:
         return None
     try:
-        found = parse_config(context.configuration_text, context.configuration_path, context.overrides, (stage,))
+        found = parse_config(context.configuration_text, context.configuration_path, context.overrides, stages)
     except UserError:
         return None
-    return found if stage in found.stages else None
+    return found if set(stages) <= set(found.stages) else None
+
+
+def expected_stages(context: Context) -> Sequence[StageProcess]:
+    """The processes that the configuration asks for; none if it is not known here."""
+    config = configured(context)
+    return process_list(config) if config else ()
 
 
 def recordings_of(config: Config) -> Sequence[Path]:

@@ -4,17 +4,20 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from fantwin.pipeline.runtime.stage import Core
 from fantwin.pipeline.site.one_line import readable_alarm, readable_health
+from fantwin.pipeline.site.request_desk import RequestDesk
 from fantwin.pipeline.site.site_model import SiteModel
 from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.health import Health
 from fantwin.schemas.messages import Alarm, Message, ModelCard, ScorerSnapshot
+from fantwin.schemas.units import NS_PER_S
 
 ALL_SAMPLES = 64
 """number of fans up to which all samples are kept; of a larger site, some of each tray"""
+SILENCE_PERIOD_NS = NS_PER_S
 SAMPLED_S = 1.0
 """time between two scores of a tray of a larger site that are decoded and kept"""
 
@@ -22,8 +25,10 @@ SAMPLED_S = 1.0
 class SiteCore(Core):
     """Keeps in a model what arrives. Scores arrive as envelopes."""
 
-    def __init__(self, model: SiteModel) -> None:
-        self._model = model
+    def __init__(self, model: SiteModel, desk: RequestDesk | None = None) -> None:
+        """desk: of an output by which operators act; None: of one by which nobody does."""
+        self._model, self._desk = model, desk or RequestDesk("")
+        self._silence_ns = 0
         self._counts: Counter[str] = Counter()
         self._every_s = 0.0 if sum(tray.fans for tray in model.trays) <= ALL_SAMPLES else SAMPLED_S
 
@@ -44,10 +49,38 @@ class SiteCore(Core):
             self._model.add_snapshot(item)
         elif isinstance(item, Alarm):
             if item.fan < tray.fans:
-                self.add_alarm(readable_alarm(item))
+                alarm = readable_alarm(item)
+                self.add_alarm(alarm)
+                self._desk.add(alarm)
             else:
                 self._counts["unknown_fan"] += 1
         return ()
+
+    def tick(self, now_ns: int) -> Sequence[Message]:
+        """Notice which trays are silent, and send the scorers what operators ask."""
+        if abs(now_ns - self._silence_ns) >= SILENCE_PERIOD_NS:
+            self._silence_ns = now_ns
+            self._model.notice_silence()
+        requests = self._desk.take()
+        self._counts["requests_sent"] += len(requests)
+        return requests
+
+    def close(self) -> Sequence[Message]:
+        """Close the history."""
+        self._model.close()
+        return ()
+
+    def abort(self) -> None:
+        """The same after a crash."""
+        self.close()
+
+    def counters(self) -> Mapping[str, int]:
+        """Requests sent, and what could not be shown."""
+        return {"refused_scores": self._model.refused_scores, **self._counts}
+
+    def problem(self) -> str:
+        """Problem of the history; empty if all is well."""
+        return self._model.problem()
 
     def needs_score(self, tray: str) -> bool:
         """Whether the score of a tray that has arrived is to be decoded."""
@@ -59,4 +92,4 @@ class SiteCore(Core):
 
     @abstractmethod
     def add_alarm(self, alarm: Alarm) -> None:
-        """A transition of the alarm of a known fan has arrived, which may be the answer to a request."""
+        """A transition of the alarm of a known fan has arrived."""

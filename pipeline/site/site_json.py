@@ -64,25 +64,25 @@ def site_json(model: SiteModel, viewer_urls: Mapping[str, str]) -> dict[str, Any
 
 def fleet_json(model: SiteModel) -> dict[str, Any]:
     """All fans at a glance: class and level of each cell, a byte each, in base64."""
-    now = model.fans_now()
-    level = np.where(np.isnan(now.score), NO_LEVEL, (np.nan_to_num(now.score, posinf=9.0) * 100).clip(0, LEVELS))
+    classes, score = model.fans_now()
+    level = np.where(np.isnan(score), NO_LEVEL, (np.nan_to_num(score, posinf=9.0) * 100).clip(0, LEVELS))
     return {
-        "classes": _packed(now.classes),
+        "classes": _packed(classes),
         "levels": _packed(level.astype(np.uint8)),
         "counts": model.counts(),
     }
 
 
-def fan_json(now: FanNow, group: FanGroup) -> dict[str, Any]:
+def fan_json(now: FanNow) -> dict[str, Any]:
     """One fan in a list."""
     return {
         "tray": now.fan.tray,
         "fan": now.fan.number,
         "state": now.state,
-        "group": str(group),
+        "group": str(now.group),
         "score": None if math.isnan(now.score) else round(now.score, 4),
         "since_t_ns": now.since_t_ns,
-        "in_alarm": group == FanGroup.ALARM,
+        "in_alarm": now.group == FanGroup.ALARM,
     }
 
 
@@ -90,7 +90,7 @@ def fan_in_full(model: SiteModel, fan: Fan) -> dict[str, Any]:
     """One fan with its alarm and its twin."""
     alarm, twin = model.current_alarm(fan), model.twin(fan.tray)
     return {
-        **fan_json(model.fan_now(fan), model.groups()[fan]),
+        **fan_json(model.fan_now(fan)),
         "newest_t_ns": model.newest_t_ns(fan.tray),
         "alarm": alarm_json(alarm) | {"now": model.words_now([fan])[0]} if alarm else None,
         "twin": twin_json(twin, fan.number) if twin else None,

@@ -17,11 +17,12 @@ import numpy as np
 
 from fantwin.pipeline.config.registry import STAGES
 from fantwin.pipeline.config.settings import TrayConfig
+from fantwin.pipeline.config.shards import StageProcess
 from fantwin.pipeline.site.alarm_book import AlarmBook
 from fantwin.pipeline.site.alarm_history import AlarmHistory
 from fantwin.pipeline.site.alarm_rates import LEARNED, AlarmRates, JudgedTime
 from fantwin.pipeline.site.fan_history import COLUMNS, Curves, FanHistory, channels_of, values_of
-from fantwin.pipeline.site.fleet import SHOWN_CLASSES, Fan, FanGroup, FanNow, Fleet, last_sample
+from fantwin.pipeline.site.fleet import Fan, FanGroup, FanNow, Fleet, last_sample
 from fantwin.pipeline.site.stage_states import HeardHealth, StageState, stage_states
 from fantwin.schemas.codec import CodecError, decode
 from fantwin.schemas.enums import Feedback, InvalidReason, StageStatus, Transition
@@ -35,15 +36,6 @@ from fantwin.scoring.wear.recorded_wear import wear_in, wear_rows
 
 SILENT_AFTER_S = 5.0
 """a tray without a score for so long is silent; a fan is judged now if it was this recently"""
-
-
-@dataclass(frozen=True, eq=False)
-class FleetNow:
-    """Of all fans, tray after tray in the order of the configuration: the class of each fan's cell, (fans,) uint8, an
-    index into `SHOWN_CLASSES`, and its score, (fans,) float32, NaN where it is not judged."""
-
-    classes: Array
-    score: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,6 +63,7 @@ class SiteModel:
         trays: Sequence[TrayConfig],
         alarms: AlarmHistory | None = None,
         *,
+        expected: Sequence[StageProcess] = (),
         keeps_curves: bool = False,
         keeps_rates: bool = False,
         now_s: Callable[[], float] = time.monotonic,
@@ -81,6 +74,7 @@ class SiteModel:
             site: its name.
             trays: whose fans it knows.
             alarms: the history that alarms are added to, for `past_alarms`; None: none is kept.
+            expected: the processes that the configuration asks for: `stages` shows also those that never came.
             keeps_curves: of the last hour of every fan, for `history`; of 5,000 fans they take 86 MB.
             keeps_rates: in the history, for how long fans are judged, for `observed_rates`.
             now_s: a clock that is never set.
@@ -102,6 +96,7 @@ class SiteModel:
         self._alarms = AlarmBook()
         self._history_of_alarms = alarms
         self._stages: dict[tuple[str, str], HeardHealth] = {}
+        self._expected = expected
         self._twins: dict[str, ModelCard] = {}
         self._wear: dict[str, tuple[int, Sequence[Mapping[str, Any]]]] = {}
         """by tray: the time of the snapshot, and its rows"""
@@ -219,10 +214,11 @@ class SiteModel:
         """None: there is no such tray."""
         return self._by_name.get(name)
 
-    def fans_now(self) -> FleetNow:
-        """All fans at a glance."""
+    def fans_now(self) -> tuple[Array, Array]:
+        """All fans at a glance, tray after tray: the class of each fan's cell, (fans,) uint8, an index into
+        `SHOWN_CLASSES`, and its score, (fans,) float32, NaN where it is not judged."""
         with self._lock:
-            return FleetNow(self._fleet.classes(), self._fleet.scores())
+            return self._fleet.classes(), self._fleet.scores()
 
     def every_fan(self) -> list[FanNow]:
         """All fans in words, the worst first."""
@@ -233,12 +229,6 @@ class SiteModel:
         """One of them."""
         with self._lock:
             return self._fleet.fan_now(fan)
-
-    def groups(self) -> dict[Fan, FanGroup]:
-        """The group of each fan."""
-        with self._lock:
-            classes = self._fleet.classes().tolist()
-            return {fan: SHOWN_CLASSES[each].group for fan, each in zip(self._fleet.fans, classes, strict=True)}
 
     def words_now(self, fans: Sequence[Fan]) -> list[str]:
         """Words for each: that it is stopped, starting or like a healthy fan again; empty: none of these."""
@@ -370,14 +360,14 @@ class SiteModel:
         return self._twins.get(tray)
 
     def stages(self) -> list[StageState]:
-        """The stages that have been heard. One that is silent for long may have left the bus."""
+        """The stages that are expected or have been heard. One that is silent for long may have left the bus."""
         now_s = self._now_s()
         with self._lock:
             heard = list(self._stages.values())
         views = [each.view(now_s, alive=each.health.status != StageStatus.STOPPED) for each in heard]
         alive = {(view.health.stage, view.health.instance) for view in views if view.alive}
         rank = {name: number for number, name in enumerate(STAGES)}
-        return sorted(stage_states(views, alive, ()), key=lambda state: rank.get(state.stage, len(rank)))
+        return sorted(stage_states(views, alive, self._expected), key=lambda state: rank.get(state.stage, len(rank)))
 
     def problem(self) -> str:
         """What is wrong with the history of alarms; empty if nothing is."""

@@ -85,7 +85,7 @@ def test_every_answer_has_the_type_that_the_description_declares_and_leaves_noth
     model, tray = gateway.core._model, gateway.core._model.trays[0]
     made = {
         "/site": site_json(model, {}),
-        "/fans": {"fans": [fan_json(each, model.groups()[each.fan]) for each in model.every_fan()]},
+        "/fans": {"fans": [fan_json(each) for each in model.every_fan()]},
         f"/fans/{TRAY}/2": fan_in_full(model, Fan(TRAY, 2)),
         f"/fans/{TRAY}/2/curves": curves_json(model.history(Fan(TRAY, 2), 0), tray),
         "/alarms": alarms_json(model, everything=False),
@@ -324,3 +324,10 @@ def test_clips_of_alarms_are_listed_and_downloaded_and_nothing_else_of_the_disk_
     assert headers["content-length"] == str(size)
     for name in ("gone.mcap", "recording.json", "..%2Fsecret.json", "../secret.json", "%2Fetc%2Fpasswd", "x%00"):
         assert client.ask("GET", f"/api/v1/clips/{name}", headers=viewer)[0] == 404
+
+
+def test_a_stage_that_the_configuration_asks_for_and_that_never_came_is_shown_as_missing(opened, tmp_path):
+    gateway = opened(tmp_path, configuration=CONFIGURATION)
+    found = {each["name"]: each["state"] for each in Client(gateway).ask("GET", "/api/v1/stages")[1]["stages"]}
+    assert (found["scorer"], found[f"acquisition/{TRAY}"]) == ("missing", "missing")
+    assert 'fantwin_stage_up{site="hall",stage="scorer"} 0.0' in Client(gateway).ask("GET", "/metrics")[1]

@@ -209,14 +209,13 @@ def _fan_table(tray: TrayConfig, model: SiteModel) -> Table:
     """Every fan beside its twin."""
     columns = ("command", "measured", "twin", "residual")
     table = table_of(["fan"], columns, ["state"], title=f"{tray.name}, speeds in {tray.speed_unit}")
-    groups = model.groups()
     for now in model.trays_now():
         for fan, values in enumerate(now.values):
             measured, twin, *_, command = values[: len(CURVES)]
             speeds = (measured / RAD_S_PER_UNIT[tray.speed_unit], twin / RAD_S_PER_UNIT[tray.speed_unit])
-            state, group = model.fan_now(Fan(tray.name, fan)).state, groups[Fan(tray.name, fan)]
+            shown = model.fan_now(Fan(tray.name, fan))
             cells = (f"{command:.2f}", *(f"{speed:.0f}" for speed in speeds), f"{speeds[0] - speeds[1]:+.0f}")
-            table.add_row(str(fan), *cells, Text(state, style=_STYLES.get(group, "bold red")))
+            table.add_row(str(fan), *cells, Text(shown.state, style=_STYLES.get(shown.group, "bold red")))
     return table
 
 

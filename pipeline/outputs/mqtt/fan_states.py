@@ -6,7 +6,7 @@ import math
 from typing import Any
 
 from fantwin.pipeline.recordings.dates import format_utc
-from fantwin.pipeline.site.fleet import Fan, FanNow
+from fantwin.pipeline.site.fleet import Fan, FanGroup, FanNow
 from fantwin.pipeline.site.site_json import alarm_json
 from fantwin.pipeline.site.site_model import SiteModel, TrayNow
 from fantwin.schemas.units import RAD_S_PER_UNIT
@@ -33,7 +33,7 @@ class FanStates:
         found: dict[Fan, dict[str, Any]] = {}
         for now in self._model.every_fan():
             tray = trays.get(now.fan.tray)
-            if tray is None and not with_silent and not now.is_in_alarm:
+            if tray is None and not with_silent and now.group not in (FanGroup.ALARM, FanGroup.SILENCED):
                 continue
             state, before = self._state(now, tray), self._published.get(now.fan)
             if before is None or any(state[name] != before[name] for name in (state if is_full else AT_ONCE)):
@@ -52,7 +52,7 @@ class FanStates:
         unit = RAD_S_PER_UNIT[tray.speed_unit]
         return {
             "state": now.state,
-            "in_alarm": now.is_in_alarm and not now.is_silenced,
+            "in_alarm": now.group == FanGroup.ALARM,
             "judged": judged,
             "score": _number(now.score),
             "speed": _number(measured / unit),

@@ -133,11 +133,7 @@ class ViewerCore(SiteCore):
 
     def counters(self) -> Mapping[str, int]:
         """Samples drawn, scores that do not fit, and messages of trays and fans that are not configured."""
-        return {
-            "samples_drawn": self._samples_drawn,
-            "refused_scores": self._model.refused_scores,
-            **self._counts,
-        }
+        return {"samples_drawn": self._samples_drawn, **super().counters()}
 
     def problem(self) -> str:
         """Scores with another number of fans than configured, or what the sink reports; empty if there is nothing."""

@@ -108,13 +108,12 @@ class Api:
         """All fans, the worst first."""
         if tray:
             self._tray(tray)
-        groups = self.model.groups()
         found = [
-            (each, groups[each.fan])
+            fan_json(each)
             for each in self.model.every_fan()
-            if tray in ("", each.fan.tray) and state in (None, groups[each.fan])
+            if tray in ("", each.fan.tray) and state in (None, each.group)
         ]
-        return {"fans": [fan_json(each, of) for each, of in found[:limit]]}
+        return {"fans": found[:limit]}
 
     async def fan(self, tray: str, fan: int) -> JSON:
         """One fan with its alarm, its twin and its wear."""

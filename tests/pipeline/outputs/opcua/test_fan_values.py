@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from fantwin.pipeline.outputs.opcua.fan_values import NONE_YET, SILENT_TRAY, FanValues
-from fantwin.pipeline.site.fleet import Fan, FanNow
+from fantwin.pipeline.site.fleet import Fan, FanGroup, FanNow
 from fantwin.pipeline.site.site_model import TrayNow
 from fantwin.schemas.enums import InvalidReason
 
@@ -18,7 +18,7 @@ NUMBERS = ("Speed", "PredictedSpeed", "BandHalfWidth", "Score")
 def test_every_number_of_a_silent_tray_is_uncertain_and_there_is_none_before_the_first_sample():
     curves, reason = np.array([[100.0, 101.0, 2.0, 0.01, 0.5]], np.float32), np.zeros(1, np.uint8)
     heard = TrayNow("tray1", 1_000, curves, np.array([True]), reason, True)
-    states = [FanNow(FAN, "normal", 0.5, 900, False)]
+    states = [FanNow(FAN, "normal", FanGroup.NORMAL, 0.5, 900)]
     now = FanValues([replace(heard, is_heard=False)], states)
     assert {now.of(FAN, name).status for name in NUMBERS} == {SILENT_TRAY}
     assert now.of(FAN, "Judged").value is False
