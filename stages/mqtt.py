@@ -16,10 +16,10 @@ from fantwin.pipeline.outputs.mqtt.config import MqttConfig
 from fantwin.pipeline.outputs.mqtt.fan_states import FanStates, shown_alarm
 from fantwin.pipeline.outputs.mqtt.home_assistant import OFFLINE, ONLINE, HomeAssistant
 from fantwin.pipeline.outputs.mqtt.link import BrokerLink
-from fantwin.pipeline.outputs.mqtt.outbox import REMOVED, Outbox, Outgoing, TransitionQueue, text_of
+from fantwin.pipeline.outputs.mqtt.outbox import Outbox, Outgoing, TransitionQueue, text_of
 from fantwin.pipeline.outputs.mqtt.requests import Requests
-from fantwin.pipeline.outputs.mqtt.topics import Topics, do_overlap
-from fantwin.pipeline.runtime.stage import BuiltStage, Context, Stage, StageError
+from fantwin.pipeline.outputs.mqtt.topics import Topics
+from fantwin.pipeline.runtime.stage import BuiltStage, Context, Stage
 from fantwin.pipeline.site.alarm_history import FILE, AlarmHistory
 from fantwin.pipeline.site.fleet import Fan
 from fantwin.pipeline.site.other_stages import expected_stages
@@ -28,8 +28,6 @@ from fantwin.pipeline.site.site_core import SiteCore
 from fantwin.pipeline.site.site_json import stages_json, transition_json
 from fantwin.pipeline.site.site_model import SiteModel
 from fantwin.pipeline.sources.mqtt.client import connection_problems, new_client
-from fantwin.pipeline.sources.mqtt.config import FAN
-from fantwin.pipeline.sources.mqtt.config import MqttConfig as MqttSourceConfig
 from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.messages import Alarm, Message
 from fantwin.schemas.topics import ALL_TRAYS
@@ -176,9 +174,8 @@ class MqttCore(SiteCore):
         self._outbox.retain(self._topics.stages, text_of(stages_json(self._model.stages())))
         if not self._has_devices:
             self._has_devices = True
-            is_removing = self._config.home_assistant == "remove"
             for topic, text in self._devices.items():
-                self._outbox.retain(topic, REMOVED if is_removing else text)
+                self._outbox.retain(topic, text)
             self._outbox.retain(self._topics.status, ONLINE, is_urgent=True)
 
     def _send(self) -> None:
@@ -201,12 +198,10 @@ def build(context: Context) -> BuiltStage:
     """Open the history, and begin to connect.
 
     Raises:
-        StageError: the extra is not installed, a file cannot be read or written, or topics overlap.
+        StageError: the extra is not installed, or a file cannot be read or written.
     """
     config: MqttConfig = context.config
     require("stage mqtt", "outputs", "paho")
-    if overlapping := overlaps(context):
-        raise StageError(overlapping[0])
     topics = Topics(context.site, context.instance)
     alarms = AlarmHistory(context.own_file(FILE))
     model = SiteModel(context.site, context.trays, alarms, expected=expected_stages(context))
@@ -222,26 +217,8 @@ def build(context: Context) -> BuiltStage:
     return BuiltStage(core)
 
 
-def overlaps(context: Context) -> list[str]:
-    """Sources of samples that would take what is published here for samples, or the other way; one line each."""
-    config: MqttConfig = context.config
-    own = f"{Topics(context.site).root}/#"
-    found: list[str] = []
-    for tray in context.trays:
-        source = tray.source
-        if isinstance(source, MqttSourceConfig) and (source.host, source.port) == (config.host, config.port):
-            for topic in filter(None, (*source.patterns, source.send_topic)):
-                unshared = topic.split("/", 2)[-1] if topic.startswith("$share/") else topic
-                if do_overlap(unshared.replace(FAN, "+"), own):
-                    found.append(
-                        f"[mqtt] publishes to {own}, which topic {topic} of tray {tray.name} has part of"
-                        ": change that topic, or the name of the site"
-                    )
-    return found
-
-
 def check(context: Context) -> list[str]:
-    """Report a missing extra, overlapping topics, files that cannot be read, and a broker that does not answer."""
+    """Report a missing extra, files that cannot be read, and a broker that does not answer."""
     config: MqttConfig = context.config
     try:
         require("stage mqtt", "outputs", "paho")
@@ -250,7 +227,6 @@ def check(context: Context) -> list[str]:
         return [str(error)]
     unknown = sorted(set(config.home_assistant_trays) - {tray.name for tray in context.trays})
     return [
-        *overlaps(context),
         *(f"[mqtt] home_assistant_trays: there is no tray {name}" for name in unknown if context.instance == ALL_TRAYS),
         *connection_problems(client, config, f"broker {config.host}:{config.port}"),
     ]

@@ -93,8 +93,6 @@ class TransitionQueue:
 
 MOST_ANSWERS = 256
 """that wait; of more, the oldest are dropped: whoever asked has long given up"""
-REMOVED = ""
-"""a retained topic with this text is deleted by the broker"""
 
 
 class Outgoing(NamedTuple):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections import Counter
 from collections.abc import Sequence
@@ -10,7 +9,7 @@ from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
-from pydantic import Field, ValidationError
+from pydantic import BaseModel, Field, ValidationError
 
 from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.outputs.mqtt.outbox import text_of
@@ -22,6 +21,10 @@ from fantwin.schemas.messages import Alarm, Request
 OPERATOR_NAME = "mqtt"
 """who is recorded with each request: a broker does not say who sent a message"""
 LARGEST_REQUEST_BYTES, LONGEST_ID = 4096, 64
+
+
+class _Named(BaseModel):
+    id: Annotated[str, Field(max_length=LONGEST_ID)] = ""
 
 
 class MqttRequestForm(RequestForm):
@@ -129,13 +132,9 @@ def _answer(topic: str, name: str, body: dict[str, Any]) -> tuple[str, str]:
 def _id_of(payload: bytes) -> str:
     """Of a request that is none; empty if it has none that could be repeated."""
     try:
-        found = json.loads(payload) if len(payload) <= LARGEST_REQUEST_BYTES else None
-    except (ValueError, RecursionError):
+        return _Named.model_validate_json(payload[:LARGEST_REQUEST_BYTES]).id
+    except ValueError:
         return ""
-    name = found.get("id") if isinstance(found, dict) else None
-    if not isinstance(name, str) or len(name) > LONGEST_ID or not name.isprintable():  # JSON may have half characters
-        return ""
-    return name
 
 
 def _why(error: ValueError) -> str:

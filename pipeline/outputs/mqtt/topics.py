@@ -80,18 +80,3 @@ class Topics:
 
     def _own(self, name: str) -> str:
         return f"{self.root}/{name}" if self.instance == ALL_TRAYS else f"{self.root}/{name}/{self.instance}"
-
-
-def do_overlap(first: str, second: str) -> bool:
-    """Whether there is a topic that both patterns match; `+` and `#` as in subscriptions."""
-    ours, theirs = first.split("/"), second.split("/")
-    for number in range(max(len(ours), len(theirs))):
-        one = ours[number] if number < len(ours) else ""
-        other = theirs[number] if number < len(theirs) else ""
-        if "#" in (one, other):
-            return True
-        if number >= min(len(ours), len(theirs)):
-            return False
-        if one != other and "+" not in (one, other):
-            return False
-    return True

@@ -18,7 +18,7 @@ from typing import Any
 from urllib.parse import unquote, urlsplit, urlunsplit
 
 from fantwin.pipeline.errors import UserError
-from fantwin.pipeline.outputs.notify.outbox import FiringKey, Outbox
+from fantwin.pipeline.outputs.notify.outbox import Outbox
 from fantwin.pipeline.outputs.notify.sending import Failure, TargetThread
 from fantwin.pipeline.outputs.notify.wording import Place, describe
 from fantwin.schemas.units import NS_PER_S
@@ -27,6 +27,8 @@ from fantwin.scoring.alarms.current_alarms import CurrentAlarm
 RESEND_S = 60.0
 EXPIRES_S = 5 * RESEND_S
 TIMEOUT_S = 10.0
+FiringKey = tuple[str, int, str, int]
+"""tray, fan, severity in words, onset: of an alert that an Alertmanager has"""
 MOST_AT_ONCE = 500
 """alerts in a request"""
 ALERT_NAME, TEST_ALERT_NAME = "FantwinFanAlarm", "FantwinTest"
@@ -107,6 +109,8 @@ class AlertSender(TargetThread):
         self._place = place
         self._wanted: Sequence[CurrentAlarm] | None = None
         """None: it is not known yet"""
+        self._firing: list[FiringKey] = []
+        """what this process has sent; what another one has sent before expires there"""
 
     def want(self, alarms: Sequence[CurrentAlarm]) -> None:
         """Set the alarms that Alertmanager is to have now, and no others."""
@@ -121,15 +125,14 @@ class AlertSender(TargetThread):
             return None
         keys = [_key(each) for each in wanted]
         still = {key[:3] for key in keys}
-        over = sorted(key for key in self._outbox.firing(self._target) if key[:3] not in still)
+        over = [key for key in self._firing if key[:3] not in still]
         alerts = [alert(self._place, each, now_ns) for each in wanted]
         alerts += [resolved(self._place, key, now_ns) for key in over]
         self.attempts += 1
         if alerts and (failure := self._manager.post(alerts)) is not None:
             return failure
         self.sent += len(alerts)
-        if alerts:
-            self._outbox.set_firing(self._target, keys)
+        self._firing = keys
         return None
 
 

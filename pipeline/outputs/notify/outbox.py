@@ -37,12 +37,7 @@ CREATE TABLE IF NOT EXISTS message (
     under_way INTEGER NOT NULL DEFAULT 0, may_be_repeated INTEGER NOT NULL DEFAULT 0);
 CREATE INDEX IF NOT EXISTS of_target ON message (target, number);
 CREATE TABLE IF NOT EXISTS lost (target TEXT PRIMARY KEY, count INTEGER NOT NULL);
-CREATE TABLE IF NOT EXISTS firing (
-    target TEXT, tray TEXT, fan INTEGER, severity TEXT, onset_t_ns INTEGER,
-    PRIMARY KEY (target, tray, fan, severity));
 """
-FiringKey = tuple[str, int, str, int]
-"""tray, fan, severity in words, onset: of an alert that an Alertmanager has"""
 
 
 @dataclass(frozen=True)
@@ -79,7 +74,7 @@ class Outbox:
                 self._store.write("UPDATE message SET under_way = 0, may_be_repeated = 1 WHERE under_way")
                 known = ", ".join("?" * len(names))
                 self._lose(f"target NOT IN ({known})", names)
-                for table in ("gathered", "lost", "firing"):  # `announced` stays: a target may come back
+                for table in ("gathered", "lost"):  # `announced` stays: a target may come back
                     self._store.write(f"DELETE FROM {table} WHERE target NOT IN ({known})", names)
         except sqlite3.Error as error:
             raise UserError(f"{path}: messages cannot be kept there: {error}") from error
@@ -199,18 +194,6 @@ class Outbox:
             with suppress(sqlite3.Error):
                 self._waiting = self._store.write("SELECT COUNT(*) FROM message").fetchone()[0]
             return self._waiting
-
-    def firing(self, target: str) -> set[FiringKey]:
-        """The alerts that an Alertmanager was given and that have not been resolved there."""
-        with self._lock:
-            rows = self._store.write("SELECT tray, fan, severity, onset_t_ns FROM firing WHERE target = ?", (target,))
-            return set(rows.fetchall())
-
-    def set_firing(self, target: str, alerts: Sequence[FiringKey]) -> None:
-        """It now has these."""
-        with self._lock, self._store.transaction():
-            self._store.write("DELETE FROM firing WHERE target = ?", (target,))
-            self._store.write_many("INSERT INTO firing VALUES (?, ?, ?, ?, ?)", [(target, *each) for each in alerts])
 
     def close(self) -> None:
         """Leave a complete file."""

@@ -6,12 +6,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.outputs.mqtt.fan_states import FanStates
 from fantwin.pipeline.outputs.mqtt.outbox import READER, Outbox, Outgoing, TransitionQueue
-from fantwin.pipeline.outputs.mqtt.topics import do_overlap
 from fantwin.pipeline.site.alarm_history import AlarmHistory
 from fantwin.pipeline.site.site_model import SiteModel
 from fantwin.schemas.enums import FanState
@@ -47,24 +45,6 @@ def test_after_a_new_connection_all_that_is_retained_is_sent_again():
     outbox.take(100)
     outbox.renew()
     assert outbox.take(100) == [Outgoing("a", "1", is_retained=True)]
-
-
-@pytest.mark.parametrize(
-    ("first", "second", "expected"),
-    [
-        ("fantwin/hall/#", "fantwin/hall/tray1/0/state", True),
-        ("fantwin/hall/#", "fantwin/hall", True),
-        ("fantwin/hall/#", "#", True),
-        ("fantwin/hall/#", "+/+/tray1", True),
-        ("fantwin/hall/#", "fantwin/+/tray1/+/rpm", True),
-        ("fantwin/hall/#", "fantwin/hall2/tray1", False),
-        ("fantwin/hall/#", "fantwin", False),
-        ("fantwin/hall/#", "plant/#", False),
-        ("a/b", "a/b/c", False),
-    ],
-)
-def test_whether_patterns_have_a_topic_in_common(first, second, expected):
-    assert do_overlap(first, second) == do_overlap(second, first) == expected
 
 
 def test_the_state_of_a_fan_is_published_again_only_when_it_has_changed(tmp_path):
