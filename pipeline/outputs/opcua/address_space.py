@@ -136,10 +136,10 @@ async def _add_types(server: Server, namespace: int) -> dict[str, ua.NodeId]:
     for name in OWN_FIELDS:
         node = ua.NodeId(next(numbers), namespace)
         declared[f"{ALARM}/{name}"] = await alarm_type.add_property(node, _name(name, namespace), fields[name])
-    for variable in VARIABLES:
-        value = ua.Variant({"String": "", "Boolean": False}.get(variable.type, 0.0), ua.VariantType[variable.type])
+    for name, variable in VARIABLES.items():
         node = ua.NodeId(next(numbers), namespace)
-        found = declared[variable.name] = await fan_type.add_variable(node, _name(variable.name, namespace), value)
+        found = await fan_type.add_variable(node, _name(name, namespace), ua.Variant(variable.empty))
+        declared[name] = found
         about = ua.Variant(ua.LocalizedText(variable.about))
         await found.write_attribute(ua.AttributeIds.Description, ua.DataValue(about))
     declared[ALARM] = await fan_type.add_object(ua.NodeId(next(numbers), namespace), _name(ALARM, namespace))

@@ -35,45 +35,31 @@ class FanVariable:
     """A variable of every fan.
 
     Attributes:
-        name: browse name, and the last part of the node's identifier.
-        type: built-in type.
-        curve: of `CURVES`; empty: none.
-        scale: by which the curve is divided.
-        unit: "rpm" for speeds; empty: none.
+        empty: a value of its built-in type.
         about: for people.
+        curve: of `CURVES`; empty: none.
+        is_speed: in rpm.
     """
 
-    name: str
-    type: str
+    empty: float | str | bool
     about: str
     curve: str = ""
-    scale: float = 1.0
-    unit: str = ""
+    is_speed: bool = False
 
 
-_RPM = RAD_S_PER_UNIT["rpm"]
-VARIABLES = (
-    FanVariable("Speed", "Double", "measured speed", "measured_speed_rad_s", _RPM, "rpm"),
-    FanVariable(
-        "PredictedSpeed", "Double", "speed of the twin at the same commands", "predicted_speed_rad_s", _RPM, "rpm"
-    ),
-    FanVariable(
-        "BandHalfWidth",
-        "Double",
-        "half width of the band around the speed of the twin",
-        "band_half_width_rad_s",
-        _RPM,
-        "rpm",
-    ),
-    FanVariable("Score", "Double", "how near the fan is to its limit: 1 is at the limit", "score"),
-    FanVariable("State", "String", "state of the fan, in words"),
-    FanVariable(
-        "Judged",
-        "Boolean",
-        "whether the newest sample is judged, or the fan stands or starts as commanded: if not, no alarm can be raised",
-    ),
+_JUDGED = (
+    "whether the newest sample is judged, or the fan stands or starts as commanded: if not, no alarm can be raised"
 )
-VARIABLE = {each.name: each for each in VARIABLES}
+_BAND = "half width of the band around the speed of the twin"
+VARIABLES = {
+    "Speed": FanVariable(0.0, "measured speed", "measured_speed_rad_s", True),
+    "PredictedSpeed": FanVariable(0.0, "speed of the twin at the same commands", "predicted_speed_rad_s", True),
+    "BandHalfWidth": FanVariable(0.0, _BAND, "band_half_width_rad_s", True),
+    "Score": FanVariable(0.0, "how near the fan is to its limit: 1 is at the limit", "score"),
+    "State": FanVariable("", "state of the fan, in words"),
+    "Judged": FanVariable(False, _JUDGED),
+}
+"""by browse name, which is the last part of the node's identifier"""
 
 
 class FanValues:
@@ -95,8 +81,9 @@ class FanValues:
             state = self._states.get(fan)
             is_judged = tray.is_heard and bool(tray.is_judged[fan.number])
             return Value(is_judged, GOOD, state.since_t_ns if state else tray.t_ns)
-        variable = VARIABLE[name]
-        value = float(tray.values[fan.number, CURVES.index(variable.curve)]) / variable.scale
+        variable = VARIABLES[name]
+        value = float(tray.values[fan.number, CURVES.index(variable.curve)])
+        value /= RAD_S_PER_UNIT["rpm"] if variable.is_speed else 1.0
         if math.isnan(value):
             return Value(None, NO_VALUE, tray.t_ns)
         if not tray.is_heard:

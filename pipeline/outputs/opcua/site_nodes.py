@@ -27,7 +27,7 @@ from fantwin.pipeline.outputs.opcua.encoding import (
     standard,
 )
 from fantwin.pipeline.outputs.opcua.events import OWN_FIELDS, condition_fields
-from fantwin.pipeline.outputs.opcua.fan_values import VARIABLE
+from fantwin.pipeline.outputs.opcua.fan_values import VARIABLES
 from fantwin.pipeline.outputs.opcua.requests import METHODS, SHELVING_METHODS, ConditionMethod
 from fantwin.pipeline.site.fleet import Fan
 
@@ -71,9 +71,9 @@ def method_nodes(method: ConditionMethod) -> list[ua.NodeId]:
 def _declarations(own: dict[str, ua.NodeId], namespace: int) -> dict[str, ua.NodeId]:
     """The declaration of each node below a fan, by path, parents first. own: those of `FanType` and `FanAlarmType`."""
     found: dict[str, ua.NodeId] = {}
-    for name, variable in VARIABLE.items():
+    for name, variable in VARIABLES.items():
         found[name] = own[name]
-        if variable.unit:
+        if variable.is_speed:
             found |= {f"{name}/{each}": standard(declared) for each, declared in ANALOG_PROPERTIES.items()}
     found[ALARM] = own[ALARM]
     found[SHELVING_STATE] = standard("AlarmConditionType_ShelvingState")
@@ -144,7 +144,7 @@ class SiteNodes:
         of_types = {
             "": ua.NodeId(FAN_TYPE, namespace),
             ALARM: ua.NodeId(FAN_ALARM_TYPE, namespace),
-            **{name: standard("AnalogItemType") for name, variable in VARIABLE.items() if variable.unit},
+            **{name: standard("AnalogItemType") for name, variable in VARIABLES.items() if variable.is_speed},
         }
         methods = {
             "": [ua.NodeId(COMMISSION, namespace)],

@@ -10,9 +10,9 @@ from datetime import UTC, datetime
 
 from asyncua import ua
 
-from fantwin.pipeline.outputs.opcua.encoding import ALARM, SharedValue, data_value, value_of
+from fantwin.pipeline.outputs.opcua.encoding import ALARM, SharedValue, data_value
 from fantwin.pipeline.outputs.opcua.events import condition_fields
-from fantwin.pipeline.outputs.opcua.fan_values import GOOD, VARIABLE, FanValues
+from fantwin.pipeline.outputs.opcua.fan_values import GOOD, FanValues
 from fantwin.pipeline.site.fleet import Fan
 from fantwin.pipeline.site.site_model import SiteModel
 from fantwin.schemas.messages import ModelCard
@@ -58,8 +58,7 @@ class SiteValues:
             value = ua.Variant(top if below == "EURange" else UNIT_RPM, ua.VariantType.ExtensionObject)
             return data_value(value, GOOD, 0, now)
         found = self._values.of(fan, name)
-        value = ua.Variant() if found.value is None else value_of(found.value, VARIABLE[name].type)
-        return data_value(value, found.status, found.t_ns, now)
+        return data_value(ua.Variant(found.value), found.status, found.t_ns, now)
 
     def _of_condition(self, fan: Fan, field: str, now: datetime) -> SharedValue:
         current = self._model.current_alarm(fan)
