@@ -88,7 +88,7 @@ def build(context: Context) -> BuiltStage:
     """
     require("stage viewer", "view", "rerun")
     from fantwin.pipeline.outputs.rerun.rerun_sink import ViewOptions  # noqa: PLC0415  an extra
-    from fantwin.pipeline.outputs.rerun.view_of_site import view_of_site  # noqa: PLC0415  an extra
+    from fantwin.pipeline.outputs.rerun.viewer_core import view_of_site  # noqa: PLC0415  an extra
 
     config: ViewerConfig = context.config
     options = ViewOptions(

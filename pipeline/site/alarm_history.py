@@ -70,7 +70,7 @@ WHERE each.number <= :until ORDER BY each.number
 
 
 class AlarmHistory:
-    """Not thread-safe: whoever shares it locks it."""
+    """Read in any thread, added to in one."""
 
     def __init__(self, path: Path, *, read_only: bool = False, schema: str = "", is_durable: bool = False) -> None:
         """Open the file, or make it. schema: statements for what a reader keeps beside it; others: as `Store`.

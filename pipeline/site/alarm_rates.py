@@ -104,7 +104,7 @@ SELECT feedback, COUNT(*) FROM alarm WHERE tray = :tray AND :twin = (
 
 
 class AlarmRates:
-    """Rates of alarms, from the file of a history; not thread-safe, as the history."""
+    """Rates of alarms, from the file of a history. Not thread-safe."""
 
     def __init__(self, history: AlarmHistory) -> None:
         self._history, self._store = history, history.store

@@ -29,18 +29,17 @@ class KnownSessions:
         such as a replay"""
         self._launched: set[Launched] = set()
 
-    def update(self, key: str, alive: bool) -> Session | None:
-        """The token of a session has appeared, or gone. Returns the session; None if it is no such token."""
+    def update(self, key: str, alive: bool) -> None:
+        """The token of a session has appeared, or gone."""
         session = Session.of_key(key)
         if session is None:
-            return None
+            return
         self._sessions.update(key, alive)
         self._known.setdefault(session.producer, session)
         self._stages.add((session.stage, session.instance))
         if len(self._known) > MOST_SESSIONS:
             del self._known[next(filter(self._may_be_forgotten, self._known), next(iter(self._known)))]
             self._stages = {(each.stage, each.instance) for each in self._known.values()}
-        return session
 
     def update_stage(self, key: str, alive: bool) -> None:
         """The token that says that a stage is at work has appeared, or gone."""
@@ -77,10 +76,10 @@ class KnownSessions:
         """Whether this session has shown its token."""
         return producer in self._known
 
-    def is_launched(self, health: Health) -> bool:
-        """Whether this process has started the session of a health message."""
+    def worth(self, health: Health) -> int:
+        """How long the health of a session is to be remembered: 0 without a token, 2 if this process started it."""
         session = self._known.get(health.header.producer)
-        return session is not None and (session.name, session.process_id) in self._launched
+        return 0 if session is None else 1 + ((session.name, session.process_id) in self._launched)
 
     def is_replaced(self, producer: str) -> bool:
         """Whether another session of the same stage and instance started later."""
@@ -89,10 +88,6 @@ class KnownSessions:
     def owner(self, stage: str, tray: str) -> Session | None:
         """The session of a stage that owns a tray now; None: there is none."""
         return self._sessions.owner(stage, tray)
-
-    def counts(self, key: str, producer: str) -> bool:
-        """Whether a message on this key is one of the site: its producer is a session, or none publishes there."""
-        return not self.is_stranger(key, producer)
 
     def is_stranger(self, key: str, producer: str) -> bool:
         """Whether a session publishes on this key, and this producer is none and never was."""

@@ -73,7 +73,7 @@ class SiteModel:
         Args:
             site: its name.
             trays: whose fans it knows.
-            alarms: the history that alarms are added to, for `past_alarms`; None: none is kept.
+            alarms: the history that alarms are added to, for `past`; None: none is kept.
             expected: the processes that the configuration asks for: `stages` shows also those that never came.
             keeps_curves: of the last hour of every fan, for `history`; of 5,000 fans they take 86 MB.
             keeps_rates: in the history, for how long fans are judged, for `observed_rates`.
@@ -297,27 +297,9 @@ class SiteModel:
         with self._lock:
             return self._alarms.of(fan)
 
-    def past_alarms(
-        self, most: int, *, tray: str = "", fan: int = -1, before: int | None = None
-    ) -> Sequence[tuple[int, Alarm]]:
-        """The last transitions: `AlarmHistory.newest`."""
-        with self._lock:
-            return self._past.newest(most, tray=tray, fan=fan, before=before)
-
-    def alarms_between(
-        self, begin_ns: int, end_ns: int, most: int, *, tray: str = "", fan: int = -1, is_backwards: bool = False
-    ) -> Sequence[Alarm]:
-        """The transitions of a stretch of time: `AlarmHistory.between`."""
-        with self._lock:
-            return self._past.between(begin_ns, end_ns, most, tray=tray, fan=fan, is_backwards=is_backwards)
-
-    def history_begins_t_ns(self) -> int | None:
-        """How far back the history of alarms reaches; None: nobody has said it."""
-        with self._lock:
-            return self._past.begins_t_ns()
-
     @property
-    def _past(self) -> AlarmHistory:
+    def past(self) -> AlarmHistory:
+        """The history of alarms; its file is read in any thread."""
         assert self._history_of_alarms is not None, "no history is kept"
         return self._history_of_alarms
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from itertools import chain
 
 from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.config.roles import Role, roles_of_stages
@@ -25,12 +24,10 @@ from fantwin.schemas.topics import alive_key, health_key, sessions_key, tray_key
 from fantwin.scoring.alarms.current_alarms import CurrentAlarm
 
 MOST_WATCHED_SESSIONS = 1000
-"""number of last health messages that are kept; of more, those heard longest ago are forgotten, those of launched
-sessions last"""
+"""number of last health messages that are kept; of more, those heard longest ago are forgotten: those of producers that
+have shown no token first, those of launched sessions last"""
 SAMPLED_S = 0.1
 """time between two scores of a tray that a command looks at: a fast line sends hundreds a second"""
-MOST_UNKNOWN_SESSIONS = 64
-"""producers without a token of a session whose health is kept; those heard longest ago are forgotten first"""
 
 
 class SiteWatcher:
@@ -68,9 +65,7 @@ class SiteWatcher:
         self._sessions = KnownSessions()
         self._lost = LostSessions(this_host())
         self._healths: dict[str, HeardHealth] = {}
-        """by producer, in the order heard: of the sessions that have shown their token"""
-        self._unknown: dict[str, HeardHealth] = {}
-        """the same of others: their token may still be on its way"""
+        """by producer, in the order heard, also of those whose token may still be on its way"""
         self.model = SiteModel(site, trays)
         bus.watch_alive(alive_key(site, "*", "*"), self._on_liveness)
         bus.watch_alive(sessions_key(site), self._on_session)
@@ -127,7 +122,7 @@ class SiteWatcher:
     def counts(self, key: str, producer: str) -> bool:
         """Whether a message of this producer on this key is one of the site."""
         with self._lock:
-            return self._sessions.counts(key, producer)
+            return not self._sessions.is_stranger(key, producer)
 
     def owner(self, stage: str, tray: str) -> Session | None:
         """The session of a stage that owns a tray now; None: there is none."""
@@ -169,8 +164,7 @@ class SiteWatcher:
             return unusable_lines((each.health for each in self._believed()), launched)
 
     def _believed(self) -> list[HeardHealth]:
-        every = chain(self._unknown.values(), self._healths.values())
-        return [each for each in every if self._sessions.is_health_of_stage(each.health)]
+        return [each for each in self._healths.values() if self._sessions.is_health_of_stage(each.health)]
 
     def _is_of_stranger(self, alarm: Alarm) -> bool:
         return self._sessions.is_stranger(tray_key(self._site, alarm.header.tray, "alarm"), alarm.header.producer)
@@ -182,9 +176,7 @@ class SiteWatcher:
     def _on_session(self, key: str, alive: bool) -> None:
         with self._lock:
             self._lost.update(key, alive)
-            session = self._sessions.update(key, alive)
-            if session and (heard := self._unknown.pop(session.producer, None)):
-                self._keep(heard)
+            self._sessions.update(key, alive)
 
     def _on_health(self, key: str, payload: bytes) -> None:
         health = _decoded(Health, payload)
@@ -192,22 +184,17 @@ class SiteWatcher:
             health = self._believed_health.of(readable_health(health))
             with self._lock:
                 self._sessions.add_health(health)
-                before = self._healths.get(health.header.producer) or self._unknown.get(health.header.producer)
-                self._keep(HeardHealth(health, before.health if before else None, time.monotonic()))
+                self._keep(health)
 
-    def _keep(self, heard: HeardHealth) -> None:
-        producer = heard.health.header.producer
-        if not self._sessions.is_known(producer):
-            self._unknown.pop(producer, None)
-            self._unknown[producer] = heard
-            if len(self._unknown) > MOST_UNKNOWN_SESSIONS:
-                del self._unknown[next(iter(self._unknown))]
-        elif self._sessions.is_health_of_stage(heard.health):
-            self._healths.pop(producer, None)
-            self._healths[producer] = heard
-            if len(self._healths) > MOST_WATCHED_SESSIONS:
-                others = (of for of, each in self._healths.items() if not self._sessions.is_launched(each.health))
-                del self._healths[next(others, next(iter(self._healths)))]
+    def _keep(self, health: Health) -> None:
+        producer = health.header.producer
+        if self._sessions.is_known(producer) and not self._sessions.is_health_of_stage(health):
+            return
+        before = self._healths.pop(producer, None)
+        self._healths[producer] = HeardHealth(health, before.health if before else None, time.monotonic())
+        if len(self._healths) > MOST_WATCHED_SESSIONS:
+            worth = {of: self._sessions.worth(each.health) for of, each in self._healths.items()}
+            del self._healths[min(worth, key=worth.__getitem__)]
 
     def _on_alarm(self, key: str, payload: bytes) -> None:
         """A message without a producer (empty bytes decode as one), or of another tray than its key, is ignored."""

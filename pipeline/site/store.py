@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sqlite3
+import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,7 +17,7 @@ Values = Sequence[object] | Mapping[str, object]
 
 
 class Store:
-    """One connection, for any thread; whoever shares it between threads locks it. Statements commit by themselves."""
+    """One connection, for any thread. Statements commit by themselves; a transaction is of one thread."""
 
     def __init__(
         self, path: Path, schema: str, what: str, *, read_only: bool = False, is_durable: bool = False
@@ -34,6 +35,7 @@ class Store:
             UserError: it cannot be read or written.
         """
         self.path, self._what = path, what
+        self._lock = threading.RLock()
         self.unread = ""
         """why the file cannot be read; empty if it can"""
         try:
@@ -55,7 +57,8 @@ class Store:
             UserError: the file cannot be read.
         """
         try:
-            rows = self._file.execute(query, values).fetchall()
+            with self._lock:
+                rows = self._file.execute(query, values).fetchall()
         except sqlite3.Error as error:
             self.unread = f"{self.path}: {self._what} cannot be read: {error}: move it away, and restart the stage"
             raise UserError(self.unread) from error
@@ -68,7 +71,8 @@ class Store:
         Raises:
             sqlite3.Error: nothing was changed.
         """
-        return self._file.execute(statement, values)
+        with self._lock:
+            return self._file.execute(statement, values)
 
     def write_many(self, statement: str, rows: Sequence[Sequence[object]]) -> None:
         """Execute a statement for each row, in a transaction of the caller.
@@ -85,14 +89,16 @@ class Store:
         Raises:
             sqlite3.Error: nothing was changed.
         """
-        self._file.execute("BEGIN IMMEDIATE")
-        try:
-            yield
-            self._file.execute("COMMIT")
-        finally:
-            if self._file.in_transaction:
-                self._file.execute("ROLLBACK")
+        with self._lock:
+            self._file.execute("BEGIN IMMEDIATE")
+            try:
+                yield
+                self._file.execute("COMMIT")
+            finally:
+                if self._file.in_transaction:
+                    self._file.execute("ROLLBACK")
 
     def close(self) -> None:
         """Leave a complete file."""
-        self._file.close()
+        with self._lock:
+            self._file.close()

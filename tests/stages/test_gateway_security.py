@@ -181,7 +181,7 @@ def test_what_fails_in_the_gateway_is_logged_and_says_nothing_to_whoever_asks(ga
     (event,) = said(capfd)
     assert (event["what"], event["path"], event["address"]) == ("gateway failed", "/api/v1/stages", "127.0.0.1")
     assert event["why"] == "RuntimeError: the secret"
-    monkeypatch.setattr(gateway.core._model, "past_alarms", Mock(side_effect=UserError("alarms.sqlite is damaged")))
+    monkeypatch.setattr(gateway.core._model.past, "newest", Mock(side_effect=UserError("alarms.sqlite is damaged")))
     assert Client(gateway).ask("GET", "/api/v1/alarms/history")[0] == 503
 
 

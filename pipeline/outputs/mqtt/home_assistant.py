@@ -38,6 +38,11 @@ class HomeAssistant:
     def __init__(self, config: MqttConfig, topics: Topics, trays: Sequence[TrayConfig]) -> None:
         self._topics = topics
         self._can_acknowledge = ACKNOWLEDGE in config.accept
+        self._availability = {
+            "availability_topic": topics.status,
+            "payload_available": ONLINE,
+            "payload_not_available": OFFLINE,
+        }
         node = re.sub(r"[^A-Za-z0-9_-]", "_", topics.root)
         self._node = node if topics.instance == ALL_TRAYS else f"{node}_{topics.instance}"
         self._path = f"{DISCOVERY_PREFIX}/device/{self._node}"
@@ -54,16 +59,11 @@ class HomeAssistant:
         return {f"{self._path}/{name}/config": text_of(device) for name, device in devices.items()}
 
     def _site(self) -> dict[str, Any]:
-        def count(name: str, key: str, icon: str) -> dict[str, Any]:
-            return self._of_site(key, "sensor", name) | {
-                "state_topic": self._topics.summary,
-                "value_template": f"{{{{ value_json.{key} }}}}",
-                "state_class": "measurement",
-                "icon": icon,
-                **self._availability(),
-            }
+        def count(key: str, words: str, icon: str) -> dict[str, Any]:
+            return self._value(SITE_DEVICE, self._topics.summary, key, words, icon, state_class="measurement")
 
-        running = self._of_site("running", "binary_sensor", "Running") | {
+        running = {
+            **self._entity(SITE_DEVICE, "running", "binary_sensor", "Running"),
             "device_class": "connectivity",
             "entity_category": "diagnostic",
             "state_topic": self._topics.status,
@@ -72,77 +72,58 @@ class HomeAssistant:
         }
         entities = {
             "running": running,
-            "in_alarm": count("Fans in alarm", "in_alarm", "mdi:fan-alert"),
-            "not_judged": count("Fans not judged", "not_judged", "mdi:fan-off"),
+            "in_alarm": count("in_alarm", "Fans in alarm", "mdi:fan-alert"),
+            "not_judged": count("not_judged", "Fans not judged", "mdi:fan-off"),
         }
         return self._device(SITE_DEVICE, {"name": f"Fans of {self._topics.site}", "model": "site"}, entities)
 
     def _fan(self, fan: Fan, unit: str) -> dict[str, Any]:
-        name = f"{fan.tray}-{fan.number}"
+        name, topic = f"{fan.tray}-{fan.number}", self._topics.state(fan)
 
-        def entity(key: str, platform: str, words: str, **more: Any) -> dict[str, Any]:
-            base = {"platform": platform, "unique_id": f"{self._node}-{name}-{key}", "name": words}
-            return base | self._availability() | more
+        def number(key: str, words: str, icon: str, precision: int, **more: str) -> dict[str, Any]:
+            more |= {"state_class": "measurement"}
+            return self._value(name, topic, key, words, icon, suggested_display_precision=precision, **more)
 
-        def number(key: str, words: str, precision: int, **more: Any) -> dict[str, Any]:
-            more |= {"state_class": "measurement", "suggested_display_precision": precision}
-            template = f"{{{{ value_json.{key} }}}}"
-            return entity(key, "sensor", words, state_topic=self._topics.state(fan), value_template=template, **more)
-
+        problem = {
+            **self._entity(name, "problem", "binary_sensor", "Problem"),
+            **self._availability,
+            "device_class": "problem",
+            "state_topic": topic,
+            "value_template": "{{ 'ON' if value_json.in_alarm else 'OFF' if value_json.judged else None }}",
+            "json_attributes_topic": self._topics.alarm(fan),
+            "json_attributes_template": "{{ (value_json or {}) | tojson }}",
+        }
+        in_unit = {"unit_of_measurement": unit}
         entities = {
-            "problem": entity(
-                "problem",
-                "binary_sensor",
-                "Problem",
-                device_class="problem",
-                state_topic=self._topics.state(fan),
-                value_template="{{ 'ON' if value_json.in_alarm else 'OFF' if value_json.judged else None }}",
-                json_attributes_topic=self._topics.alarm(fan),
-                json_attributes_template="{{ (value_json or {}) | tojson }}",
-            ),
-            "state": entity(
-                "state",
-                "sensor",
-                "State",
-                state_topic=self._topics.state(fan),
-                value_template="{{ value_json.state }}",
-                icon="mdi:fan",
-            ),
-            "speed": number("speed", "Speed", 0, unit_of_measurement=unit, icon="mdi:fan"),
-            "predicted_speed": number(
-                "predicted_speed", "Speed of the healthy twin", 0, unit_of_measurement=unit, icon="mdi:fan-auto"
-            ),
-            "score": number("score", "Score (1 is at the limit)", 2, icon="mdi:gauge"),
+            "problem": problem,
+            "state": self._value(name, topic, "state", "State", "mdi:fan"),
+            "speed": number("speed", "Speed", "mdi:fan", 0, **in_unit),
+            "predicted_speed": number("predicted_speed", "Speed of the healthy twin", "mdi:fan-auto", 0, **in_unit),
+            "score": number("score", "Score (1 is at the limit)", "mdi:gauge", 2),
         }
         if self._can_acknowledge:
-            entities[ACKNOWLEDGE] = entity(
-                ACKNOWLEDGE,
-                "button",
-                "Acknowledge",
-                command_topic=self._topics.request(fan.tray, fan.number),
-                payload_press=text_of({"action": ACKNOWLEDGE, "comment": "from Home Assistant"}),
-                icon="mdi:check",
-            )
-        about = {"name": f"{fan.tray} fan {fan.number}", "model": "fan", "via_device": self._identifier(SITE_DEVICE)}
+            entities[ACKNOWLEDGE] = {
+                **self._entity(name, ACKNOWLEDGE, "button", "Acknowledge"),
+                **self._availability,
+                "command_topic": self._topics.request(fan.tray, fan.number),
+                "payload_press": text_of({"action": ACKNOWLEDGE, "comment": "from Home Assistant"}),
+                "icon": "mdi:check",
+            }
+        about = {"name": f"{fan.tray} fan {fan.number}", "model": "fan", "via_device": f"{self._node}-{SITE_DEVICE}"}
         return self._device(name, about, entities)
 
     def _device(self, name: str, about: dict[str, Any], entities: dict[str, Any]) -> dict[str, Any]:
         return {
-            "device": {"identifiers": [self._identifier(name)], "manufacturer": "fantwin", **about},
+            "device": {"identifiers": [f"{self._node}-{name}"], "manufacturer": "fantwin", **about},
             "origin": {"name": "fantwin", "sw_version": version("fantwin")},
             "components": entities,
             "qos": _QOS,
         }
 
-    def _of_site(self, key: str, platform: str, name: str) -> dict[str, Any]:
-        return {"platform": platform, "unique_id": f"{self._node}-{SITE_DEVICE}-{key}", "name": name}
+    def _value(self, device: str, topic: str, key: str, words: str, icon: str, **more: Any) -> dict[str, Any]:
+        """A sensor that shows a value of a topic."""
+        shown = {"state_topic": topic, "value_template": f"{{{{ value_json.{key} }}}}", "icon": icon}
+        return self._entity(device, key, "sensor", words) | self._availability | shown | more
 
-    def _availability(self) -> dict[str, Any]:
-        return {
-            "availability_topic": self._topics.status,
-            "payload_available": ONLINE,
-            "payload_not_available": OFFLINE,
-        }
-
-    def _identifier(self, name: str) -> str:
-        return f"{self._node}-{name}"
+    def _entity(self, device: str, key: str, platform: str, words: str) -> dict[str, Any]:
+        return {"platform": platform, "unique_id": f"{self._node}-{device}-{key}", "name": words}

@@ -8,7 +8,6 @@ is sent again, and says that it may be a repetition.
 from __future__ import annotations
 
 import sqlite3
-import threading
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
@@ -52,7 +51,7 @@ class Waiting:
 
 
 class Outbox:
-    """Thread-safe."""
+    """Messages are delivered in other threads; all else is of one."""
 
     def __init__(self, path: Path, targets: Iterable[str]) -> None:
         """Open the file, or make it. Messages for targets that are no longer configured are lost.
@@ -60,7 +59,6 @@ class Outbox:
         Raises:
             UserError: it cannot be read or written.
         """
-        self._lock = threading.Lock()
         self.lost: Counter[str] = Counter()
         """messages lost since the start, by target"""
         self._waiting = 0
@@ -85,11 +83,10 @@ class Outbox:
         Raises:
             UserError: it cannot be understood.
         """
-        with self._lock:
-            announced = self._store.read("SELECT target, tray, fan, state FROM announced")
-            gathered = self._store.read("SELECT target, basket, state FROM gathered")
-            past = self._history.last_occurrences(self._position) if self._position is not None else ()
-            is_first, self._position = self._position is None, self._position or self._history.newest_number()
+        announced = self._store.read("SELECT target, tray, fan, state FROM announced")
+        gathered = self._store.read("SELECT target, basket, state FROM gathered")
+        past = self._history.last_occurrences(self._position) if self._position is not None else ()
+        is_first, self._position = self._position is None, self._position or self._history.newest_number()
         try:
             saved = Saved(
                 is_first=is_first,
@@ -105,17 +102,15 @@ class Outbox:
 
     def hear(self, alarm: Alarm) -> None:
         """A transition has arrived: into the history."""
-        with self._lock:
-            self._history.add(alarm)
+        self._history.add(alarm)
 
     def news(self, most: int) -> Sequence[Alarm]:
         """The next transitions that were not read yet, in their order; none if the file cannot be read now."""
-        with self._lock:
-            self._history.save_again()
-            with suppress(UserError):
-                found = self._history.after(self._position or 0, most)
-                self._position = found[-1][0] if found else self._position
-                return [alarm for _, alarm in found]
+        self._history.save_again()
+        with suppress(UserError):
+            found = self._history.after(self._position or 0, most)
+            self._position = found[-1][0] if found else self._position
+            return [alarm for _, alarm in found]
         return ()
 
     @property
@@ -130,7 +125,7 @@ class Outbox:
             sqlite3.Error: nothing was saved.
         """
         file = self._store
-        with self._lock, file.transaction():
+        with file.transaction():
             file.write_many(
                 "INSERT OR REPLACE INTO announced VALUES (?, ?, ?, ?)",
                 [(target, *fan, saved.announced[target, fan].to_json()) for target, fan in changes.announced],
@@ -151,55 +146,54 @@ class Outbox:
             self._lose("number <= (SELECT number FROM message ORDER BY number DESC LIMIT 1 OFFSET ?)", (MOST_MESSAGES,))
 
     def next_for(self, target: str, after: int = 0) -> Waiting | None:
-        """The oldest message of a target, or the first one after another; None: there is none."""
-        with self._lock:
-            row = self._store.write(
-                "SELECT number, made_ns, title, body, level, may_be_repeated,"
-                " coalesce((SELECT count FROM lost WHERE target = :target), 0)"
-                " FROM message WHERE target = :target AND number > :after ORDER BY number LIMIT 1",
-                {"target": target, "after": after},
-            ).fetchone()
-        if row is None:
+        """The oldest message of a target, or the first one after another; None: there is none.
+
+        Raises:
+            UserError: the file cannot be read.
+        """
+        rows = self._store.read(
+            "SELECT number, made_ns, title, body, level, may_be_repeated,"
+            " coalesce((SELECT count FROM lost WHERE target = :target), 0)"
+            " FROM message WHERE target = :target AND number > :after ORDER BY number LIMIT 1",
+            {"target": target, "after": after},
+        )
+        if not rows:
             return None
-        number, made_ns, title, body, level, may_be_repeated, lost = row
+        number, made_ns, title, body, level, may_be_repeated, lost = rows[0]
         return Waiting(number, made_ns, Text(title, body, Level(level)), bool(may_be_repeated), lost)
 
     def begin(self, waiting: Waiting) -> None:
         """Its delivery begins."""
-        with self._lock:
-            self._store.write("UPDATE message SET under_way = 1 WHERE number = ?", (waiting.number,))
+        self._store.write("UPDATE message SET under_way = 1 WHERE number = ?", (waiting.number,))
 
     def delivered(self, target: str, waiting: Waiting) -> None:
         """Its target has taken it."""
-        with self._lock, self._store.transaction():
+        with self._store.transaction():
             self._store.write("DELETE FROM message WHERE number = ?", (waiting.number,))
             self._store.write("UPDATE lost SET count = count - ? WHERE target = ?", (waiting.lost, target))
 
     def failed(self, waiting: Waiting, *, is_uncertain: bool) -> None:
         """It is to be delivered again. is_uncertain: its target may have taken it all the same."""
-        with self._lock:
-            self._store.write(
-                "UPDATE message SET under_way = 0, may_be_repeated = may_be_repeated OR ? WHERE number = ?",
-                (is_uncertain, waiting.number),
-            )
+        self._store.write(
+            "UPDATE message SET under_way = 0, may_be_repeated = may_be_repeated OR ? WHERE number = ?",
+            (is_uncertain, waiting.number),
+        )
 
     def refuse(self, target: str, waiting: Waiting) -> None:
         """Its target takes others, but not this one: it is lost."""
-        with self._lock, self._store.transaction():
+        with self._store.transaction():
             self._lose("target = ? AND number = ?", (target, waiting.number))
 
     def count(self) -> int:
         """How many messages wait; once the file is closed or cannot be read, how many did."""
-        with self._lock:
-            with suppress(sqlite3.Error):
-                self._waiting = self._store.write("SELECT COUNT(*) FROM message").fetchone()[0]
-            return self._waiting
+        with suppress(UserError):
+            ((self._waiting,),) = self._store.read("SELECT COUNT(*) FROM message")
+        return self._waiting
 
     def close(self) -> None:
         """Leave a complete file."""
         self.count()
-        with self._lock:
-            self._history.close()
+        self._history.close()
 
     def _lose(self, condition: str, values: Sequence[object]) -> None:
         """Delete the messages to which this applies, except one that is under way, and count them."""

@@ -9,6 +9,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
+from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.outputs.notify.outbox import Outbox, Waiting
 from fantwin.pipeline.outputs.notify.wording import Text
 
@@ -91,7 +92,7 @@ class TargetThread(ABC):
             self._wake.clear()
             try:
                 failure = self._deliver_all()
-            except sqlite3.Error as error:
+            except (sqlite3.Error, UserError) as error:
                 failure = Failure(f"the outbox cannot be read or written: {error}")
             if failure is None:
                 self._arrived()

@@ -63,4 +63,4 @@ class EventHistory(HistoryDict):
         if source.NamespaceIndex == self._namespace and isinstance(source.Identifier, str):
             fan = fan_of(source.Identifier)
             tray, number = fan[0] if fan else (source.Identifier, -1)
-        return self._model.alarms_between(*stretch, most, tray=tray, fan=number, is_backwards=is_backwards)
+        return self._model.past.between(*stretch, most, tray=tray, fan=number, is_backwards=is_backwards)

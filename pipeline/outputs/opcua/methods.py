@@ -109,7 +109,7 @@ class Methods:
             return False
         if wanted == event_id(current.newest):
             return True
-        past = self._model.past_alarms(_SEARCHED, tray=fan.tray, fan=fan.number)
+        past = self._model.past.newest(_SEARCHED, tray=fan.tray, fan=fan.number)
         return any(alarm.onset_t_ns == current.newest.onset_t_ns and event_id(alarm) == wanted for _, alarm in past)
 
     async def _refresh(self, parent: ua.NodeId, *arguments: ua.Variant) -> ua.StatusCode:

@@ -9,7 +9,7 @@ from pathlib import Path
 from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.outputs.rerun.rerun_sink import ViewOptions
-from fantwin.pipeline.outputs.rerun.view_of_site import view_of_site
+from fantwin.pipeline.outputs.rerun.viewer_core import view_of_site
 from fantwin.pipeline.recordings.left_out import left_out_hint
 from fantwin.pipeline.recordings.parts import in_order, read_parts
 from fantwin.pipeline.recordings.reading import RecordingMetadata

@@ -5,14 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 
 from fantwin.pipeline.config.settings import TrayConfig
+from fantwin.pipeline.outputs.rerun import fleet_view
 from fantwin.pipeline.outputs.rerun.alarm_log import LogLine, alarm_table, log_line
-from fantwin.pipeline.outputs.rerun.fleet_view import ADDED_EVERY_NS, FleetView
+from fantwin.pipeline.outputs.rerun.fleet_view import ADDED_EVERY_NS, FLEET_ABOVE, FleetView, is_fleet
+from fantwin.pipeline.outputs.rerun.rerun_sink import RerunSink, ViewOptions
 from fantwin.pipeline.outputs.rerun.rerun_wear import WearPoints, wear_points
+from fantwin.pipeline.runtime.stage import StageError
 from fantwin.pipeline.site.fleet import SILENT, Fan
 from fantwin.pipeline.site.site_core import SiteCore
 from fantwin.pipeline.site.site_model import SiteModel
@@ -20,9 +23,6 @@ from fantwin.pipeline.site.trace import MEASURED_COLUMNS, Trace, state_changes, 
 from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.messages import Alarm, Message, Score, ScorerSnapshot
 from fantwin.schemas.units import NS_PER_S
-
-if TYPE_CHECKING:
-    from fantwin.pipeline.outputs.rerun.rerun_sink import RerunSink
 
 FLUSH_PERIOD_NS = 500_000_000
 REPEAT_STATES_NS = 5_000_000_000  # a viewer that joins late finds a state at most this old
@@ -235,3 +235,22 @@ class ViewerCore(SiteCore):
         if before:
             trace = trace_of(fan.tray, before, view.config.speed_unit, (fan.number,))
             self._draw(view, with_holes(trace, NS_PER_S, drawn_t_ns), len(trace.t_ns))
+
+
+def view_of_site(
+    site: str, trays: Sequence[TrayConfig], started_t_ns: int, file: Path | None, options: ViewOptions
+) -> ViewerCore:
+    """Open the file and serve the viewers; None leaves the file out.
+
+    Raises:
+        StageError: a port is taken, the file cannot be written, or the layout is not one of a fleet.
+    """
+    fleet = None
+    if is_fleet(trays):
+        if options.layout == "wear":
+            raise StageError(
+                f'viewer.layout = "wear": not with more than {FLEET_ABOVE} fans; fantwin wear lists the changes'
+            )
+        hold_ns, window_ns = round(fleet_view.HOLD_S * NS_PER_S), round(options.window_s * NS_PER_S)
+        fleet = FleetView(trays, options.show, fleet_view.ALARM_PLOTS, hold_ns, window_ns)
+    return ViewerCore(site, trays, RerunSink(site, trays, started_t_ns, file, options), fleet)

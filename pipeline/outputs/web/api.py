@@ -133,8 +133,8 @@ class Api:
     def alarm_history(self, tray: Of = "", fan: int = -1, limit: Whole = 100, before: Whole | None = None) -> JSON:
         """The last transitions, the newest first; `before`: the number of the last one, for the next page."""
         try:
-            found = self.model.past_alarms(min(MOST_LISTED, limit), tray=tray, fan=fan, before=before)
-            begins_t_ns = self.model.history_begins_t_ns()
+            found = self.model.past.newest(min(MOST_LISTED, limit), tray=tray, fan=fan, before=before)
+            begins_t_ns = self.model.past.begins_t_ns()
             feedback = self.model.feedback_on([alarm for _, alarm in found])
         except UserError as error:
             raise HTTPException(503, "the history cannot be read: see the problem of the gateway") from error

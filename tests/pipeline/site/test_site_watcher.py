@@ -10,7 +10,7 @@ import pytest
 from fantwin.pipeline.config.roles import roles_of_stages
 from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.site.one_line import LONGEST_TEXT
-from fantwin.pipeline.site.site_watcher import MOST_UNKNOWN_SESSIONS, MOST_WATCHED_SESSIONS, SiteWatcher
+from fantwin.pipeline.site.site_watcher import MOST_WATCHED_SESSIONS, SiteWatcher
 from fantwin.schemas.codec import encode
 from fantwin.schemas.enums import StageStatus
 from fantwin.schemas.header import Header
@@ -94,9 +94,9 @@ def test_row_11_healths_of_strangers_hide_no_stage_and_few_are_kept(bus, watcher
     bus.say(replace(health(SCORER, 4 * 10**18), header=Header(STRANGER, 0, ""), process_id=77))
     assert watcher.is_ready(SCORER.process_id)
     assert [view.health.header.producer for view in watcher.stages()] == [SCORER.producer]
-    for number in range(100, 100 + 2 * MOST_UNKNOWN_SESSIONS):
+    for number in range(100, 100 + 2 * MOST_WATCHED_SESSIONS):
         bus.say(health(session("scorer", number)))
-    assert len(watcher._unknown) == MOST_UNKNOWN_SESSIONS
+    assert len(watcher._healths) == MOST_WATCHED_SESSIONS
     assert watcher.is_ready(SCORER.process_id)
 
 
