@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.extras import require
 from fantwin.pipeline.outputs.mqtt.config import MqttConfig
-from fantwin.pipeline.outputs.mqtt.fan_states import FanStates, shown_alarm
+from fantwin.pipeline.outputs.mqtt.fan_states import FanStates
 from fantwin.pipeline.outputs.mqtt.home_assistant import OFFLINE, ONLINE, HomeAssistant
 from fantwin.pipeline.outputs.mqtt.link import BrokerLink
 from fantwin.pipeline.outputs.mqtt.outbox import Outbox, Outgoing, TransitionQueue, text_of
@@ -25,13 +25,14 @@ from fantwin.pipeline.site.fleet import Fan
 from fantwin.pipeline.site.other_stages import expected_stages
 from fantwin.pipeline.site.request_desk import RequestDesk
 from fantwin.pipeline.site.site_core import SiteCore
-from fantwin.pipeline.site.site_json import stages_json, transition_json
+from fantwin.pipeline.site.site_json import alarm_json, stages_json, transition_json
 from fantwin.pipeline.site.site_model import SiteModel
 from fantwin.pipeline.sources.mqtt.client import connection_problems, new_client
 from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.messages import Alarm, Message
 from fantwin.schemas.topics import ALL_TRAYS
 from fantwin.schemas.units import NS_PER_S
+from fantwin.scoring.alarms.alarm_state import is_listed
 
 SETTLED_AFTER_NS = 2 * NS_PER_S
 """time after the start in which alarms of before are heard again, and nothing is published"""
@@ -151,7 +152,7 @@ class MqttCore(SiteCore):
             self._has_news = True
         for fan in self._changed_alarms:
             current = self._model.current_alarm(fan)
-            text = text_of(shown_alarm(current) if current else None)
+            text = text_of(alarm_json(current) if current and is_listed(current.newest) else None)
             self._outbox.retain(self._topics.alarm(fan), text, is_urgent=True)
         is_full = abs(now_ns - self._full_ns) >= PERIOD_S * NS_PER_S
         if is_full:

@@ -88,18 +88,14 @@ _BARE_ALARM = (FanState.NORMAL, FanState.SUSPECT, FanState.ALARM)
 """states that add nothing to an active alarm"""
 
 
-def class_names() -> list[str]:
-    """What the classes of cells mean: normal by its score, then the states, a state of a newer version, and silent."""
+def _shown_classes() -> tuple[ShownClass, ...]:
+    """The classes of fans, then those of fans in alarm, then those of fans whose alarm is silenced. Each: normal by its
+    score, then the states, a state of a newer version, and silent."""
     step = 1 / NORMAL_LEVELS
     normal = [f"normal, score {level * step:.1f} to {(level + 1) * step:.1f}" for level in range(NORMAL_LEVELS)]
-    return [*normal, *(state.words for state in FanState), "unknown state", SILENT]
-
-
-def _shown_classes() -> tuple[ShownClass, ...]:
-    """The classes of fans, then those of fans in alarm, then those of fans whose alarm is silenced."""
     bare: list[ShownClass] = []
     active: list[ShownClass] = []
-    for number, name in enumerate(class_names()):
+    for number, name in enumerate([*normal, *(state.words for state in FanState), "unknown state", SILENT]):
         value = number - NORMAL_LEVELS
         state = FanState.NORMAL if value < 0 else FanState(value) if value < len(FanState) else FanState.UNKNOWN
         now = words_now(state)

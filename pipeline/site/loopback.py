@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import socket
-
+from fantwin.pipeline.http_server import listening_socket
 from fantwin.pipeline.runtime.stage import StageError
 
 LOOPBACK = "127.0.0.1"
 
 
-def check_free(port: int, key: str, alternative: str = "") -> None:
+def check_free(port: int, key: str, alternative: str) -> None:
     """Check that a port can be bound, because Rerun only logs a line if it cannot.
 
     Args:
@@ -20,12 +19,8 @@ def check_free(port: int, key: str, alternative: str = "") -> None:
     Raises:
         StageError: the port is taken.
     """
-    with socket.socket() as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind((LOOPBACK, port))
-        except OSError as error:
-            or_else = f", or {alternative}" if alternative else ""
-            raise StageError(
-                f"{key}: port {port} on {LOOPBACK} is taken ({error.strerror}); set another one{or_else}"
-            ) from error
+    try:
+        listening_socket(LOOPBACK, port).close()
+    except OSError as error:
+        taken = f"{key}: port {port} on {LOOPBACK} is taken ({error.strerror})"
+        raise StageError(f"{taken}; set another one, or {alternative}") from error

@@ -7,11 +7,8 @@ from typing import Any
 
 from fantwin.pipeline.recordings.dates import format_utc
 from fantwin.pipeline.site.fleet import Fan, FanGroup, FanNow
-from fantwin.pipeline.site.site_json import alarm_json
 from fantwin.pipeline.site.site_model import SiteModel, TrayNow
 from fantwin.schemas.units import RAD_S_PER_UNIT
-from fantwin.scoring.alarms.alarm_state import is_listed
-from fantwin.scoring.alarms.current_alarms import CurrentAlarm
 
 AT_ONCE = ("state", "in_alarm", "judged")
 """what of a state is published at once when it changes"""
@@ -60,11 +57,6 @@ class FanStates:
             "speed_unit": tray.speed_unit,
             "since": format_utc(now.since_t_ns) if now.since_t_ns else None,
         }
-
-
-def shown_alarm(current: CurrentAlarm) -> dict[str, Any] | None:
-    """A current alarm; None: it is over and nothing is left to do about it."""
-    return alarm_json(current) if is_listed(current.newest) else None
 
 
 def _number(value: float) -> float | None:

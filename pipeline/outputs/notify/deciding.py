@@ -7,10 +7,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from enum import StrEnum
 from typing import Self
+
+from pydantic import TypeAdapter
 
 from fantwin.pipeline.outputs.notify.config import TargetConfig
 from fantwin.pipeline.site.fleet import Fan
@@ -156,15 +158,9 @@ class Announced:
     was_silenced: bool = False
     owes_end: bool = False
 
-    def to_json(self) -> str:
-        """For the outbox."""
-        return json.dumps(asdict(self))
 
-    @classmethod
-    def from_json(cls, text: str) -> Self:
-        """What `to_json` wrote."""
-        values = json.loads(text)
-        return cls(**values | {"told": Told(values["told"])})
+ANNOUNCED = TypeAdapter(Announced)
+"""its form in the outbox"""
 
 
 def hears_of(target: TargetConfig, alarm: Alarm) -> bool:

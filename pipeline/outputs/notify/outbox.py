@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fantwin.pipeline.errors import UserError
-from fantwin.pipeline.outputs.notify.deciding import Announced, Gathered
+from fantwin.pipeline.outputs.notify.deciding import ANNOUNCED, Gathered
 from fantwin.pipeline.outputs.notify.notification_flow import Basket, Changes, Saved
 from fantwin.pipeline.outputs.notify.wording import Level, Text
 from fantwin.pipeline.site.alarm_history import AlarmHistory
@@ -90,7 +90,9 @@ class Outbox:
         try:
             saved = Saved(
                 is_first=is_first,
-                announced={(name, Fan(tray, fan)): Announced.from_json(state) for name, tray, fan, state in announced},
+                announced={
+                    (name, Fan(tray, fan)): ANNOUNCED.validate_json(state) for name, tray, fan, state in announced
+                },
                 gathered={(name, Basket(basket)): Gathered.from_json(state) for name, basket, state in gathered},
             )
         except (ValueError, KeyError, TypeError) as error:
@@ -128,7 +130,10 @@ class Outbox:
         with file.transaction():
             file.write_many(
                 "INSERT OR REPLACE INTO announced VALUES (?, ?, ?, ?)",
-                [(target, *fan, saved.announced[target, fan].to_json()) for target, fan in changes.announced],
+                [
+                    (target, *fan, ANNOUNCED.dump_json(saved.announced[target, fan]).decode())
+                    for target, fan in changes.announced
+                ],
             )
             file.write_many(
                 "INSERT OR REPLACE INTO gathered VALUES (?, ?, ?)",
