@@ -48,8 +48,9 @@ class StageRow:
         scope: one process for the site, or one for each tray, where `launcher.shards` says nothing of it. Only stages
             with a process for each tray may have a device.
         has_common_shards: a `launcher.shards` that is one number for all stages applies to it.
-        may_drop: that of its declaration, for those who count losses and would wait long for its imports.
-        reads, writes: those of its declaration, for those who must not import it; None: its declaration is asked.
+        may_drop: it may drop messages: those that it misses do not count as losses.
+        reads: topics. The first is the main input, the only one that advances the input position of outputs.
+        writes: topics.
         keeps: topics whose last message about each of its trays it keeps for others, also when the producer has gone.
         needs_twin: it cannot start unless every tray has a twin, or learns one.
     """
@@ -61,8 +62,8 @@ class StageRow:
     scope: Literal["site", "tray"] = "site"
     has_common_shards: bool = True
     may_drop: bool = False
-    reads: tuple[str, ...] | None = None
-    writes: tuple[str, ...] | None = None
+    reads: tuple[str, ...] = ()
+    writes: tuple[str, ...] = ()
     keeps: tuple[str, ...] = ()
     needs_twin: bool = False
 
@@ -73,13 +74,6 @@ class StageRow:
             UserError: it cannot be imported.
         """
         return loaded(self.declaration)
-
-    def topics(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """What it reads and what it writes; imports the stage only if its row does not say so."""
-        if self.reads is None or self.writes is None:
-            stage = self.load()
-            return stage.reads, stage.writes
-        return self.reads, self.writes
 
 
 def loaded(import_string: str) -> Any:

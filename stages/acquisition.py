@@ -30,6 +30,7 @@ from fantwin.pipeline.acquisition.sample_blocks import (
     SampleBlocks,
     raw_message,
 )
+from fantwin.pipeline.config.registry import STAGES
 from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageConfig, StageError
@@ -296,10 +297,8 @@ def topics_read(_config: AcquisitionConfig, trays: Sequence[TrayConfig]) -> tupl
 
 
 STAGE = Stage(
-    name="acquisition",
+    row=STAGES["acquisition"],
     about="readings of a tray's source to raw samples, and commands to its device",
-    reads=("command", "reading"),
-    writes=("raw",),
     config=AcquisitionConfig,
     build=build,
     check=check,

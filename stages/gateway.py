@@ -13,7 +13,7 @@ from datetime import UTC, datetime
 from functools import partial
 from typing import TYPE_CHECKING
 
-from fantwin.pipeline.config.registry import RECORDER
+from fantwin.pipeline.config.registry import RECORDER, STAGES
 from fantwin.pipeline.errors import refusals
 from fantwin.pipeline.http_server import HttpServer, listen
 from fantwin.pipeline.outputs.web.config import GatewayConfig
@@ -166,14 +166,11 @@ def check(context: Context) -> list[str]:
 
 
 STAGE = Stage(
-    name="gateway",
+    row=STAGES["gateway"],
     about="serves the operators' page, the API, live events and metrics by HTTP",
-    reads=("score", "alarm", "twin", "snapshot", "health"),
-    writes=("request",),
     config=GatewayConfig,
     build=build,
     core_per_tray=False,
     undecoded=("score",),
-    may_drop=True,
     check=check,
 )

@@ -19,6 +19,7 @@ from functools import partial
 
 from pydantic import Field
 
+from fantwin.pipeline.config.registry import STAGES
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.learning.fan_alarms import FanAlarms
 from fantwin.pipeline.learning.healthy_history import HealthyHistory, recorded_raws
@@ -342,12 +343,9 @@ def check(context: Context) -> list[str]:
 
 
 STAGE = Stage(
-    name="learner",
+    row=STAGES["learner"],
     about="learns the twin of a tray that names none, from its healthy running",
-    reads=("raw", "score", "request"),
-    writes=("new_twin",),
     config=LearnerConfig,
     build=build,
-    may_drop=True,
     check=check,
 )

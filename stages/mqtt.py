@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+from fantwin.pipeline.config.registry import STAGES
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.extras import require
 from fantwin.pipeline.outputs.mqtt.config import MqttConfig
@@ -234,14 +235,11 @@ def check(context: Context) -> list[str]:
 
 
 STAGE = Stage(
-    name="mqtt",
+    row=STAGES["mqtt"],
     about="publishes states and alarms to an MQTT broker, also for Home Assistant, and takes requests from there",
-    reads=("score", "alarm", "health"),
-    writes=("request",),
     config=MqttConfig,
     build=build,
     core_per_tray=False,
     undecoded=("score",),
-    may_drop=True,
     check=check,
 )

@@ -11,6 +11,7 @@ import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
 
+from fantwin.pipeline.config.registry import STAGES
 from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.outputs.notify.alertmanager import AlertSender
 from fantwin.pipeline.outputs.notify.config import NotifierConfig
@@ -190,10 +191,8 @@ def check(context: Context) -> list[str]:
 
 
 STAGE = Stage(
-    name="notifier",
+    row=STAGES["notifier"],
     about="sends mails, chat messages and alerts about alarms",
-    reads=("alarm",),
-    writes=(),
     config=NotifierConfig,
     build=build,
     core_per_tray=False,

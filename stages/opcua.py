@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from fantwin.pipeline.config.registry import STAGES
 from fantwin.pipeline.errors import refusals
 from fantwin.pipeline.extras import missing_extra, require
 from fantwin.pipeline.outputs.opcua.config import OpcuaConfig
@@ -127,14 +128,11 @@ def check(context: Context) -> list[str]:
 
 
 STAGE = Stage(
-    name="opcua",
+    row=STAGES["opcua"],
     about="serves fans and alarms by OPC UA",
-    reads=("score", "alarm", "twin"),
-    writes=("request",),
     config=OpcuaConfig,
     build=build,
     core_per_tray=False,
     undecoded=("score",),
-    may_drop=True,
     check=check,
 )

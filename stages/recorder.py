@@ -28,9 +28,10 @@ from fantwin.pipeline.recordings.reading import LEFT_OUT_KEY, RecordingError
 from fantwin.pipeline.recordings.recorder import Recorder
 from fantwin.pipeline.recordings.recorder_config import CLIPS_SHARE, RecorderConfig, recorded_topics
 from fantwin.pipeline.runtime.stage import BuiltStage, Context, Stage, StageError
-from fantwin.schemas.topics import TOPICS, tray_key
+from fantwin.schemas.topics import tray_key
 
-KEEPS = STAGES[RECORDER].keeps
+_ROW = STAGES[RECORDER]
+KEEPS = _ROW.keeps
 """topics whose last messages it keeps for others, also from recordings of before its start"""
 _LOG = logging.getLogger(__name__)
 
@@ -84,10 +85,8 @@ def check(context: Context) -> list[str]:
 
 
 STAGE = Stage(
-    name="recorder",
+    row=_ROW,
     about="records what a site sends, with configuration and twin, in MCAP files",
-    reads=tuple(topic.name for topic in TOPICS if topic.recorded),
-    writes=(),
     config=RecorderConfig,
     build=build,
     core_per_tray=False,

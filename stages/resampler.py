@@ -30,6 +30,7 @@ from typing import Self
 
 from pydantic import Field, model_validator
 
+from fantwin.pipeline.config.registry import STAGES
 from fantwin.pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageConfig
 from fantwin.pipeline.timebase.grid_timing import (
     RATES_HZ,
@@ -245,10 +246,8 @@ def build(context: Context) -> BuiltStage:
 
 
 STAGE = Stage(
-    name="resampler",
+    row=STAGES["resampler"],
     about="irregular raw samples to a uniform time grid",
-    reads=("raw",),
-    writes=("grid",),
     config=ResamplerConfig,
     build=build,
 )

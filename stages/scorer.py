@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from fantwin.pipeline.config.registry import STAGES
 from fantwin.pipeline.errors import refusals
 from fantwin.pipeline.prediction.new_samples import BEGINNING_NS, NewSamples
 from fantwin.pipeline.prediction.tray_twin import TrayTwin, load_tray_twin, twin_path
@@ -381,10 +382,8 @@ def check(context: Context) -> list[str]:
 
 
 STAGE = Stage(
-    name="scorer",
+    row=STAGES["scorer"],
     about="the evidence for faults, and the fans' alarms",
-    reads=("prediction", "request", "twin"),
-    writes=("score", "alarm", "snapshot"),
     config=ScorerConfig,
     build=build,
     check=check,

@@ -31,6 +31,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+from fantwin.pipeline.config.registry import STAGES
 from fantwin.pipeline.errors import refusals
 from fantwin.pipeline.prediction.joint_tray_integrator import JointTrayIntegrator
 from fantwin.pipeline.prediction.learned_integrator import LearnedTwinIntegrator
@@ -167,10 +168,8 @@ def check(context: Context) -> list[str]:
 
 
 STAGE = Stage(
-    name="twin_integrator",
+    row=STAGES["twin_integrator"],
     about="the healthy twin on the same commands as the fans",
-    reads=("grid", "new_twin"),
-    writes=("prediction", "twin"),
     config=TwinIntegratorConfig,
     build=build,
     joint=JointIntegrators,

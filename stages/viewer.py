@@ -20,6 +20,7 @@ from typing import Literal
 
 from pydantic import Field
 
+from fantwin.pipeline.config.registry import STAGES
 from fantwin.pipeline.config.settings import TrayConfig, nearest
 from fantwin.pipeline.errors import refusals
 from fantwin.pipeline.extras import missing_extra, require
@@ -30,7 +31,6 @@ from fantwin.pipeline.site.loopback import check_free
 
 FILE_BYTES = 1_000_000_000
 """size at which the view's file ends"""
-READS = ("score", "alarm", "snapshot")
 
 
 class ViewerConfig(StageConfig):
@@ -122,19 +122,16 @@ def check(context: Context) -> list[str]:
 
 def topics_read(_config: ViewerConfig, trays: Sequence[TrayConfig]) -> tuple[str, ...]:
     """Topics of trays. Of a fleet, the wear is not drawn: the snapshots of its scorers are many megabytes a minute."""
-    return tuple(topic for topic in READS if topic != "snapshot" or not is_fleet(trays))
+    return tuple(topic for topic in STAGES["viewer"].reads if topic != "snapshot" or not is_fleet(trays))
 
 
 STAGE = Stage(
-    name="viewer",
+    row=STAGES["viewer"],
     about="shows measured speed, twin, band, alarms and states live in Rerun, and in a file if `file` names one",
-    reads=READS,
-    writes=(),
     config=ViewerConfig,
     build=build,
     core_per_tray=False,
     undecoded=("score",),
-    may_drop=True,
     check=check,
     chooses=topics_read,
 )

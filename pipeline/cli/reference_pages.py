@@ -96,9 +96,9 @@ def _topics() -> str:
     ]
     for topic in TOPICS:
         writers = ", ".join(
-            [name for name, row in STAGES.items() if topic.name in row.topics()[1]] + ["programs"] * topic.is_of_people
+            [name for name, row in STAGES.items() if topic.name in row.writes] + ["programs"] * topic.is_of_people
         )
-        readers = ", ".join(name for name, row in STAGES.items() if topic.name in row.topics()[0])
+        readers = ", ".join(name for name, row in STAGES.items() if topic.name in row.reads)
         about = topic.about if topic.recorded else f"{topic.about}; not recorded"
         rows.append(
             f"| `{topic.name}` | `{topic.message.__name__}` | {about} "

@@ -57,7 +57,6 @@ STAGES: dict[str, StageRow] = {
             "fantwin.stages.recorder:STAGE",
             enabled_by="default",
             reads=tuple(topic.name for topic in TOPICS if topic.recorded),
-            writes=(),
             keeps=("snapshot",),
         ),
         StageRow(
@@ -68,7 +67,6 @@ STAGES: dict[str, StageRow] = {
             has_common_shards=False,
             may_drop=True,
             reads=("score", "alarm", "snapshot"),
-            writes=(),
         ),
         StageRow(
             GATEWAY,
@@ -116,8 +114,8 @@ def why_no_output(name: str, row: StageRow) -> str:
         return "a stage may not have this name"
     if row.enabled_by != "section" or row.scope != "site":
         return "only a section of the configuration may enable it, once for the site"
-    if row.reads is None or row.writes is None or not known.issuperset((*row.reads, *row.writes)):
-        return f"its row does not say which topics it reads and writes, of {', '.join(sorted(known))}"
+    if not known.issuperset((*row.reads, *row.writes)):
+        return f"its row reads or writes another topic than {', '.join(sorted(known))}"
     return "" if set(row.writes) <= {"request"} else "it may write requests and nothing else"
 
 

@@ -94,7 +94,8 @@ def _limited(stage: str, config: Config) -> Iterable[Shard]:
 
 
 def _of_stage(name: str, stage: str, instances: tuple[str, ...], trays: tuple[str, ...]) -> Role:
-    reads, writes = STAGES[stage].topics()
+    row = STAGES[stage]
+    reads, writes = row.reads, row.writes
     if makes_samples_of_samples(reads, writes):
         writes = (*writes, REPORTS)
     of = f" of {', '.join(trays)}" if trays else ""
@@ -107,7 +108,7 @@ def _of_stage(name: str, stage: str, instances: tuple[str, ...], trays: tuple[st
         trays=trays,
         writes=writes,
         reads=everything if name == VIEWER else (*reads, "clock"),
-        keeps=STAGES[stage].keeps,
+        keeps=row.keeps,
     )
 
 

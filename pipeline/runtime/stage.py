@@ -15,6 +15,7 @@ from fantwin.pipeline.config.registry import STAGES
 from fantwin.pipeline.config.settings import Config, Section, TrayConfig
 from fantwin.pipeline.config.shards import own_file
 from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.plugins import StageRow
 from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.health import AcceptedSamples
 from fantwin.schemas.messages import Message, ScorerSnapshot
@@ -219,10 +220,8 @@ class Stage:
     """The declaration of a stage: what the runner and the launcher need to know, but not how it works.
 
     Attributes:
-        name: as in the registry.
+        row: that of the registry, with what is known without importing the stage.
         about: one line for people.
-        reads: topics. The first is the main input, the only one that advances the input position of outputs.
-        writes: topics.
         config: model of its section.
         build: builds the core, and its source if it has one.
         core_per_tray: a core for each tray, or one core that serves all trays of the process.
@@ -230,7 +229,6 @@ class Stage:
         undecoded: topics whose messages `step` is given as envelopes, of which only the header has been decoded: for a
             core that looks into few of them, at the next tick.
         is_patient: nobody waits for what it does with a message: messages are taken at the next tick, together.
-        may_drop: a consumer that may drop messages: its missing messages do not count as losses.
         joint: for cores that process the blocks of several trays in one pass; None: each tray alone.
         check: lists, without side effects, what would keep the stage from working (a missing port, a twin that
             does not fit); one line each. `fantwin doctor` prints them.
@@ -240,20 +238,37 @@ class Stage:
         ValueError: `reads` or `writes` names an unknown topic.
     """
 
-    name: str
+    row: StageRow
     about: str
-    reads: tuple[str, ...]
-    writes: tuple[str, ...]
     config: type[StageConfig]
     build: Callable[[Context], BuiltStage]
     core_per_tray: bool = True
     wants_envelopes: bool = False
     undecoded: tuple[str, ...] = ()
     is_patient: bool = False
-    may_drop: bool = False
     joint: Callable[[], Joint] | None = None
     check: Callable[[Context], Sequence[str]] = no_problems
     chooses: Callable[[Any, Sequence[TrayConfig]], Sequence[str]] | None = None
+
+    @property
+    def name(self) -> str:
+        """The name of its row."""
+        return self.row.name
+
+    @property
+    def reads(self) -> tuple[str, ...]:
+        """The topics that it reads; the first is the main input."""
+        return self.row.reads
+
+    @property
+    def writes(self) -> tuple[str, ...]:
+        """The topics that it writes."""
+        return self.row.writes
+
+    @property
+    def may_drop(self) -> bool:
+        """Whether messages that it misses are no losses."""
+        return self.row.may_drop
 
     def __post_init__(self) -> None:
         unknown = [name for name in (*self.reads, *self.writes) if name not in BY_NAME]
@@ -279,9 +294,6 @@ def load_stage(name: str) -> Stage:
     Raises:
         KeyError: no such stage.
     """
-    row = STAGES[name]
-    stage = row.load()
+    stage = STAGES[name].load()
     assert isinstance(stage, Stage)
-    assert stage.may_drop == row.may_drop, f"stage {name!r}: may_drop of its row is {row.may_drop}"
-    assert row.topics() == (stage.reads, stage.writes), f"stage {name!r}: its row has {row.reads} and {row.writes}"
     return stage

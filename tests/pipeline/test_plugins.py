@@ -32,7 +32,7 @@ ROWS = """
 from fantwin.pipeline.plugins import StageRow
 from fantwin.pipeline.plugins import SourceKind
 KIND = SourceKind("toy_fan_source:ToyConfig", "toy_fan_source:ToySource")
-ROW = StageRow("toy_log", "toy_fan_log:STAGE", reads=("raw",), writes=())
+ROW = StageRow("toy_log", "toy_fan_log:STAGE", reads=("raw",))
 """
 SOURCE = """
 import threading
@@ -77,6 +77,7 @@ OUTPUT = """
 import json
 from pathlib import Path
 from fantwin.pipeline.runtime.stage import BuiltStage, Core, Stage, StageConfig
+from toy_fan import ROW
 
 class ToyLogConfig(StageConfig):
     file: Path
@@ -90,7 +91,7 @@ class ToyLog(Core):
         return ()
 
 STAGE = Stage(
-    name="toy_log", about="writes the newest speeds", reads=("raw",), writes=(), config=ToyLogConfig,
+    row=ROW, about="writes the newest speeds", config=ToyLogConfig,
     build=lambda context: BuiltStage(ToyLog(context.resolve(context.config.file))), core_per_tray=False,
 )
 """
@@ -148,12 +149,11 @@ def test_no_stage_may_have_the_name_of_a_key_or_a_role():
     ("row", "why"),
     [
         (StageRow("pager", "x:STAGE", reads=("alarm",), writes=("request",)), ""),
-        (StageRow("pagr", "x:STAGE", reads=(), writes=()), "its row is called 'pagr'"),
-        (StageRow("pager", "x:STAGE"), "its row does not say which topics it reads and writes, of alarm, "),
-        (StageRow("pager", "x:STAGE", reads=("temperature",), writes=()), "its row does not say which topics"),
-        (StageRow("pager", "x:STAGE", reads=(), writes=("command",)), "it may write requests and nothing else"),
-        (StageRow("pager", "x:STAGE", enabled_by="default", reads=(), writes=()), "only a section"),
-        (StageRow("pager", "x:STAGE", scope="tray", reads=(), writes=()), "only a section"),
+        (StageRow("pagr", "x:STAGE"), "its row is called 'pagr'"),
+        (StageRow("pager", "x:STAGE", reads=("temperature",)), "its row reads or writes another topic than alarm, "),
+        (StageRow("pager", "x:STAGE", writes=("command",)), "it may write requests and nothing else"),
+        (StageRow("pager", "x:STAGE", enabled_by="default"), "only a section"),
+        (StageRow("pager", "x:STAGE", scope="tray"), "only a section"),
     ],
 )
 def test_a_row_that_would_harm_the_plant_is_refused_with_the_reason(row, why):
@@ -162,4 +162,4 @@ def test_a_row_that_would_harm_the_plant_is_refused_with_the_reason(row, why):
 
 @pytest.mark.parametrize("name", ["bus", "operator", "acquisition.bench", "Pager"])
 def test_nor_may_it_have_the_name_of_something_else(name):
-    assert why_no_output(name, StageRow(name, "x:STAGE", reads=(), writes=())) == "a stage may not have this name"
+    assert why_no_output(name, StageRow(name, "x:STAGE")) == "a stage may not have this name"

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import threading
+from dataclasses import replace
 from typing import Any
 
 from fantwin.pipeline.config.loading import load_config
+from fantwin.pipeline.config.registry import STAGES
 from fantwin.pipeline.runtime.runner import Runner
 from fantwin.pipeline.runtime.stage import BuiltStage, Core, Stage
 from fantwin.pipeline.tray_scoring.scorer_config import ScorerConfig
@@ -20,10 +22,8 @@ class RunningScorer:
         self.words = ("-c", DEMO / "demo.toml", "--set", setting)
         self.config = load_config(DEMO / "demo.toml", [setting])
         stage = Stage(
-            name="scorer",
+            row=replace(STAGES["scorer"], reads=("prediction", "request")),
             about="",
-            reads=("prediction", "request"),
-            writes=("alarm", "score", "snapshot"),
             config=ScorerConfig,
             build=lambda _context: BuiltStage(core),
         )

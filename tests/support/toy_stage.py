@@ -12,6 +12,7 @@ import numpy as np
 
 from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.config.shards import chosen_shard
+from fantwin.pipeline.plugins import StageRow
 from fantwin.pipeline.runtime.runner import Runner
 from fantwin.pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageConfig
 from fantwin.schemas.codec import decode, encode, type_name
@@ -76,8 +77,9 @@ class Burst:
 
 
 def toy(build: Callable[[Context], BuiltStage] = lambda _context: BuiltStage(Passer()), **declared: Any) -> Stage:
-    defaults = {"name": "resampler", "about": "", "reads": ("raw",), "writes": ("grid",), "config": ToyConfig}
-    return Stage(**{**defaults, **declared}, build=build)
+    row: dict[str, Any] = {"name": "resampler", "declaration": "", "reads": ("raw",), "writes": ("grid",)}
+    row |= {name: declared.pop(name) for name in ("name", "reads", "writes", "may_drop") if name in declared}
+    return Stage(row=StageRow(**row), about="", config=ToyConfig, build=build, **declared)
 
 
 def raw(t_ns: int) -> Raw:

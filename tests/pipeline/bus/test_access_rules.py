@@ -108,7 +108,7 @@ def test_who_may_publish_what(site):
     }
     assert writers["raw"] == ["acquisition", "replay"]
     assert writers["command"] == ["dcim", "operator", "replay"]
-    asking = {name for name, row in STAGES.items() if "request" in row.topics()[1]}
+    asking = {name for name, row in STAGES.items() if "request" in row.writes}
     assert writers["request"] == sorted({"dcim", "operator", "replay"} | asking)
 
 
