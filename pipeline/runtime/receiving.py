@@ -13,13 +13,12 @@ from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.config.roles import roles_of
 from fantwin.pipeline.config.settings import Config
 from fantwin.pipeline.config.shards import Shard
-from fantwin.pipeline.runtime.believed_health import BelievedHealth
+from fantwin.pipeline.runtime.believed_health import believed_health
 from fantwin.pipeline.runtime.health import HealthBuilder
 from fantwin.pipeline.runtime.inbox import DueMessages, FromBus, Inbox, Liveness, Recovered
 from fantwin.pipeline.runtime.missed_messages import Recovery
-from fantwin.pipeline.runtime.peers import Peers
 from fantwin.pipeline.runtime.sequence_tracker import Found, SequenceTracker
-from fantwin.pipeline.runtime.sessions import LostSessions, Sessions, this_host
+from fantwin.pipeline.runtime.sessions import Sessions
 from fantwin.pipeline.runtime.silences import Silences
 from fantwin.pipeline.runtime.stage import Stage
 from fantwin.pipeline.timebase.host_clock import HOST_CLOCK
@@ -68,7 +67,7 @@ class Receiver:
         what is received changes them."""
         self._stage = stage
         self._site = config.site
-        self._believed_health = BelievedHealth(roles_of(config))
+        self._roles = roles_of(config)
         self._shard = shard
         self._trays = frozenset(shard.trays)
         self._is_patient = stage.is_patient or (stage.joint is not None and len(shard.trays) >= MANY_TRAYS)
@@ -89,11 +88,9 @@ class Receiver:
         self.keys = {tray_key(config.site, tray, topic) for topic in reads if topic != "health" for tray in shard.trays}
         """all that the stage reads, health apart"""
         self._unhurried = {key for key in self.keys if topic_of(key).name in stage.undecoded}
-        self.peers = Peers(self.keys)
         self._silences = Silences(
             {tray_key(config.site, tray, topic): tray for topic in stage.reads[:1] for tray in shard.trays}, sessions
         )
-        self._lost = LostSessions(this_host())
 
     def start(self, *, follows_clock: bool) -> None:
         """Subscribe to what the stage reads, to health, to who is there and, if it follows them, to the clocks of the
@@ -104,7 +101,7 @@ class Receiver:
             for tray in self._shard.trays:
                 self._bus.subscribe(tray_key(self._site, tray, "clock"), self.on_message)
         self._bus.subscribe(health_key(self._site, "*", "*"), self._on_health)
-        self._bus.watch_alive(alive_key(self._site, "*", "*"), self._on_liveness)
+        self._bus.watch_alive(alive_key(self._site, REPLAY, ALL_TRAYS), self._on_liveness)
         self._bus.watch_alive(sessions_key(self._site), self._on_liveness)
 
     def on_message(self, key: str, payload: bytes) -> None:
@@ -133,14 +130,14 @@ class Receiver:
     @property
     def awaits_more(self) -> bool:
         """Whether something that other stages have sent, or say at their end, is still to come."""
-        return self.peers.awaits_last_health() or self.tracker.is_waiting
+        return self._sessions.awaits_last_health() or self.tracker.is_waiting
 
     def ask_again(self) -> None:
         """Repeat unanswered requests when they are due; find sessions that were killed, and those that were cut off."""
         self._recovery.send_due()
-        for producer in self._lost.take_killed():
+        for producer in self._sessions.take_killed():
             self._silences.end(producer)
-        if any(map(self._sessions.may_return, self._lost.cut_off())):
+        if self._sessions.has_cut_off():
             self._bus.meet_again()
 
     def is_complete(self, tray: str) -> bool:
@@ -157,9 +154,7 @@ class Receiver:
             case Recovered():
                 self._take_recovered(item)
             case Liveness():
-                self.peers.update(item)
                 self._sessions.update(item.key, item.alive)
-                self._lost.update(item.key, item.alive)
                 if item.key == alive_key(self._site, REPLAY, ALL_TRAYS):
                     self._clock.set_replay_alive(item.alive)
 
@@ -194,10 +189,9 @@ class Receiver:
         self._recovery.finish(item)
 
     def _take_health(self, envelope: Envelope, health: Health) -> None:
-        said, health = health, self._believed_health.of(health)
+        said, health = health, believed_health(health, self._roles)
         if health is not said:
             self.counts["refused_outputs"] += 1
-        self.peers.add_health(alive_key(self._site, health.stage, health.instance), health)
         if health.stage == REPLAY:
             self._clock.add_replay_health(health.header.producer, has_ended=health.is_last)
         self._sessions.add_health(health, self.keys)

@@ -256,7 +256,7 @@ class Runner:
                 self._notifier.at_work(self._health.summary)
 
     def _should_end(self) -> bool:
-        return self.stop.is_set() or (self.launcher_gone.is_set() and not self._receiver.peers.has_producer())
+        return self.stop.is_set() or (self.launcher_gone.is_set() and not self._sessions.has_producer())
 
     def _drain(self) -> None:
         """Process what was sent to this stage before it was asked to stop, however much more is being sent.

@@ -12,8 +12,8 @@ import os
 import re
 import socket
 import time
-from collections.abc import Callable, Collection, Iterable, Set
-from dataclasses import dataclass, field
+from collections.abc import Callable, Collection, Iterable, Iterator, Set
+from dataclasses import dataclass
 
 from fantwin.pipeline.config.shards import Shard
 from fantwin.schemas.health import Health
@@ -25,58 +25,11 @@ from fantwin.schemas.topics import (
     topic_of,
 )
 
+LAST_HEALTH_S = 1.0
+"""time after a token has disappeared in which the last health of its session may still come"""
 APART_S, APART_LIMIT_S = 2.0, 60.0
 """time after a token has disappeared in which a session whose process still runs counts as cut off: earlier, it may be
 about to end; later, its process id may be reused"""
-
-
-@dataclass
-class LostSessions:
-    """Finds sessions whose token has disappeared, and whether their process still runs. host: the name of this host, as
-    sessions show it.
-
-    The token of a session disappears when its process dies, and also when a link is cut. The two can be distinguished
-    only for processes on this host: by whether the process still runs.
-    """
-
-    host: str
-    now_s: Callable[[], float] = time.monotonic
-    _seen: dict[str, Session] = field(default_factory=dict)
-    """by token: sessions whose process was once found to run here. The number of a process in another container may not
-    exist here, or may be that of another process"""
-    _gone: dict[str, tuple[Session, float]] = field(default_factory=dict)
-    """by token: those of them whose token has disappeared, and when; the last ones"""
-
-    def update(self, key: str, alive: bool) -> None:
-        """A token has appeared or disappeared."""
-        if not alive:
-            if (session := self._seen.pop(key, None)) is not None:
-                self._gone[key] = session, self.now_s()
-                if len(self._gone) > MOST_SESSIONS:
-                    del self._gone[next(iter(self._gone))]
-            return
-        self._gone.pop(key, None)
-        session = Session.of_key(key)
-        if session is None or session.host != self.host or session.process_id == os.getpid():
-            return
-        if session.may_live(self.host) and len(self._seen) < MOST_SESSIONS:
-            self._seen[key] = session
-
-    def take_killed(self) -> list[str]:
-        """The producers of the sessions that were killed; each is returned once."""
-        killed = {key: each for key, (each, _) in self._gone.items() if not each.may_live(self.host)}
-        for key in killed:
-            del self._gone[key]
-        return [each.producer for each in killed.values()]
-
-    def cut_off(self) -> list[str]:
-        """The producers of the sessions that still run, and whose token disappeared a while ago."""
-        now_s = self.now_s()
-        return [
-            each.producer
-            for each, since_s in self._gone.values()
-            if APART_S <= now_s - since_s < APART_LIMIT_S and each.may_live(self.host)
-        ]
 
 
 MOST_SESSIONS = 4096
@@ -171,74 +124,123 @@ def this_host() -> str:
     return re.sub(r"[^A-Za-z0-9_.-]", "_", socket.gethostname()) or "unknown"
 
 
-class Sessions:
-    """The sessions on the bus, and which of them owns which trays."""
+@dataclass(slots=True)
+class _Known:
+    """What is known of a session.
 
-    def __init__(self) -> None:
-        self._alive: dict[str, Session] = {}
-        self._by_producer: dict[str, Session] = {}
-        """those that are alive"""
+    Attributes:
+        writes: the keys on which it publishes.
+        runs_here: its process was found to run here, and not yet that it was killed. The number of a process in another
+            container may not exist here, or may be that of another process.
+        left_s: when its token disappeared, monotonic; its messages may still be on the way. None: it is there.
+        has_said_last: it has sent its last health.
+    """
+
+    session: Session
+    writes: set[str]
+    runs_here: bool
+    left_s: float | None = None
+    has_said_last: bool = False
+
+
+class Sessions:
+    """The sessions on the bus, those that have left it last, and which of them owns which trays.
+
+    The token of a session disappears when its process dies, and also when a link is cut. The two can be distinguished
+    only for processes on this host: by whether the process still runs.
+    """
+
+    def __init__(self, now_s: Callable[[], float] = time.monotonic) -> None:
+        self._now_s = now_s
+        self._host = this_host()
+        self._known: dict[str, _Known] = {}
+        """by producer"""
         self._owners: dict[str, _Owners] = {}
         """by stage"""
-        self._written: dict[str, set[str]] = {}
-        """by producer of a session: the keys on which it publishes"""
-        self._ended: dict[str, Session] = {}
-        """by producer: the last sessions whose token has disappeared; their messages may still be on the way"""
-        self._said_last: dict[str, None] = {}
-        """producers of sessions that have sent their last health, the last ones"""
 
     def update(self, key: str, alive: bool) -> None:
         """A token has appeared, or gone."""
         session = Session.of_key(key)
-        if session is None or (alive and len(self._alive) >= MOST_SESSIONS):
+        if session is None:
             return
-        if self._by_producer.get(session.producer, session) != session:
-            return  # whoever signs as a session that is there does not take its place
+        known = self._known.get(session.producer)
+        if known and known.session != session:
+            if known.left_s is None:
+                return  # whoever signs as a session that is there does not take its place
+            known = None
         if alive:
-            self._alive[key] = self._by_producer[session.producer] = session
-            self._written.setdefault(session.producer, {health_key(key.split("/")[1], session.stage, session.instance)})
-        else:
-            self._alive.pop(key, None)
-            self._by_producer.pop(session.producer, None)
-            if self._written.pop(session.producer, None) is not None:
-                self._ended[session.producer] = session
-                if len(self._ended) > MOST_SESSIONS:
-                    del self._ended[next(iter(self._ended))]
-        self._owners[session.stage] = _Owners(each for each in self._alive.values() if each.stage == session.stage)
+            if known is None:
+                if len(self._known) >= MOST_SESSIONS and not self._forget_one():
+                    return
+                own_health = health_key(key.split("/")[1], session.stage, session.instance)
+                known = self._known[session.producer] = _Known(session, {own_health}, runs_here=False)
+            known.left_s = None
+            is_near = session.host == self._host and session.process_id != os.getpid()
+            known.runs_here = is_near and session.may_live(self._host)
+        elif known:
+            known.left_s = self._now_s()
+        there = (each.session for each in self._there())
+        self._owners[session.stage] = _Owners(each for each in there if each.stage == session.stage)
 
     def add_health(self, health: Health, read_keys: Set[str]) -> None:
         """A stage has said what it publishes; `read_keys`: the keys that matter here."""
-        producer = health.header.producer
-        written = self._written.get(producer)
-        if health.is_last and (written is not None or producer in self._ended):
-            self._said_last[producer] = None
-            if len(self._said_last) > MOST_SESSIONS:
-                del self._said_last[next(iter(self._said_last))]
-        if written is not None:
+        if known := self._known.get(health.header.producer):
+            known.has_said_last |= health.is_last
             outputs = (output.key for output in health.outputs if output.key in read_keys)
-            written.update(key for key in outputs if not topic_of(key).is_of_people)
+            known.writes.update(key for key in outputs if not topic_of(key).is_of_people)
 
     def is_alive(self, producer: str) -> bool:
         """Whether this producer is a session that is alive."""
-        return producer in self._written
+        known = self._known.get(producer)
+        return known is not None and known.left_s is None
+
+    def has_ended(self, producer: str) -> bool:
+        """Whether this producer is a session that has left: ended, or cut off."""
+        return producer in self._known and not self.is_alive(producer)
 
     def may_return(self, producer: str) -> bool:
         """Whether the token of this producer's session has disappeared, but it has not sent its last health, and no
         other session has taken its place: the link may only be cut."""
-        session = self._ended.get(producer)
-        if session is None or producer in self._said_last:
+        known = self._known.get(producer)
+        if known is None or known.left_s is None or known.has_said_last:
             return False
-        return self.named(session.stage, session.instance) is None
-
-    def has_ended(self, producer: str) -> bool:
-        """Whether this producer is a session that has left: ended, or cut off."""
-        return producer in self._ended and producer not in self._written
+        return self.named(known.session.stage, known.session.instance) is None
 
     def is_stranger(self, key: str, producer: str) -> bool:
         """Whether a session publishes on this key, and this producer neither is nor was one."""
-        if producer in self._written or producer in self._ended:
-            return False
-        return any(key in keys for keys in self._written.values())
+        return producer not in self._known and any(key in each.writes for each in self._there())
+
+    def has_producer(self) -> bool:
+        """Whether a session is alive that publishes what is read here."""
+        return any(len(each.writes) > 1 for each in self._there())
+
+    def awaits_last_health(self) -> bool:
+        """Whether a session has just left whose last health, and so its last messages, may still be on the way."""
+        since_s = self._now_s() - LAST_HEALTH_S
+        return any(
+            each.left_s is not None and each.left_s > since_s and not each.has_said_last
+            for each in self._known.values()
+        )
+
+    def take_killed(self) -> list[str]:
+        """The producers of the sessions that were killed here; each is returned once."""
+        gone = [each for each in self._known.values() if each.runs_here and each.left_s is not None]
+        killed = [each for each in gone if not each.session.may_live(self._host)]
+        for each in killed:
+            each.runs_here = False
+        return [each.session.producer for each in killed]
+
+    def has_cut_off(self) -> bool:
+        """Whether a session still runs here whose token disappeared a while ago."""
+        now_s = self._now_s()
+        return any(
+            each.runs_here
+            and APART_S <= now_s - each.left_s < APART_LIMIT_S
+            and self.may_return(producer)
+            and each.session.may_live(self._host)
+            for producer, each in self._known.items()
+            if each.left_s is not None
+        )
 
     def successor_of(self, session: Session) -> Session | None:
         """The first session that started later than this one, and has one of its trays in the same stage."""
@@ -251,12 +253,22 @@ class Sessions:
 
     def is_replaced(self, producer: str) -> bool:
         """Whether another session of the same stage and instance has started later than this producer's."""
-        session = self._by_producer.get(producer)
-        return session is not None and self.named(session.stage, session.instance) is not session
+        if not self.is_alive(producer):
+            return False
+        session = self._known[producer].session
+        return self.named(session.stage, session.instance) is not session
 
     def owner(self, stage: str, tray: str) -> Session | None:
         """The session of a stage that owns a tray; None: there is none."""
         return self._owners[stage].of(tray) if stage in self._owners else None
+
+    def _there(self) -> Iterator[_Known]:
+        return (each for each in self._known.values() if each.left_s is None)
+
+    def _forget_one(self) -> bool:
+        """Forget the first session that has left; False: all are there."""
+        gone = next((producer for producer, each in self._known.items() if each.left_s is not None), None)
+        return gone is not None and bool(self._known.pop(gone))
 
 
 class _Owners:

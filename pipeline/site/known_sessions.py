@@ -72,6 +72,10 @@ class KnownSessions:
         """Whether the token of this session has gone, but nothing says that it has ended."""
         return self._sessions.may_return(producer)
 
+    def has_cut_off(self) -> bool:
+        """Whether a session still runs on this host whose token disappeared a while ago."""
+        return self._sessions.has_cut_off()
+
     def is_known(self, producer: str) -> bool:
         """Whether this session has shown its token."""
         return producer in self._known

@@ -10,8 +10,8 @@ from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.config.roles import Role, roles_of_stages
 from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.config.shards import StageProcess
-from fantwin.pipeline.runtime.believed_health import BelievedHealth
-from fantwin.pipeline.runtime.sessions import LostSessions, Session, this_host
+from fantwin.pipeline.runtime.believed_health import believed_health
+from fantwin.pipeline.runtime.sessions import Session
 from fantwin.pipeline.site.known_sessions import KnownSessions
 from fantwin.pipeline.site.loss_accounting import Launched, label, losses, refused, unusable_lines
 from fantwin.pipeline.site.one_line import readable_alarm, readable_health
@@ -57,13 +57,12 @@ class SiteWatcher:
             has_scores: their scores are followed, too.
             hear_alarm: is called with each alarm message of the site.
         """
-        self._believed_health = BelievedHealth(roles_of_stages() if roles is None else roles)
+        self._roles = roles_of_stages() if roles is None else roles
         self._bus = bus
         self._site = site
         self._hear_alarm = hear_alarm
         self._lock = threading.Lock()
         self._sessions = KnownSessions()
-        self._lost = LostSessions(this_host())
         self._healths: dict[str, HeardHealth] = {}
         """by producer, in the order heard, also of those whose token may still be on its way"""
         self.model = SiteModel(site, trays)
@@ -92,7 +91,7 @@ class SiteWatcher:
         """The latest session of every stage instance, by name; one whose token is there, if there is one. A session
         whose link was cut is looked for."""
         with self._lock:
-            are_apart = any(map(self._sessions.may_return, self._lost.cut_off()))
+            are_apart = self._sessions.has_cut_off()
         if are_apart:
             self._bus.meet_again()
         with self._lock:
@@ -175,13 +174,12 @@ class SiteWatcher:
 
     def _on_session(self, key: str, alive: bool) -> None:
         with self._lock:
-            self._lost.update(key, alive)
             self._sessions.update(key, alive)
 
     def _on_health(self, key: str, payload: bytes) -> None:
         health = _decoded(Health, payload)
         if isinstance(health, Health) and key == health_key(self._site, health.stage, health.instance):
-            health = self._believed_health.of(readable_health(health))
+            health = believed_health(readable_health(health), self._roles)
             with self._lock:
                 self._sessions.add_health(health)
                 self._keep(health)

@@ -12,6 +12,7 @@ import pytest
 from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.runtime.runner import TICK_S
+from fantwin.pipeline.runtime.sessions import Session
 from fantwin.pipeline.runtime.stage import BuiltStage, Context, Core
 from fantwin.pipeline.site.loss_accounting import losses
 from fantwin.schemas.codec import encode, type_name
@@ -20,7 +21,7 @@ from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.header import Header, InputPosition
 from fantwin.schemas.health import Health, Note, Output
 from fantwin.schemas.messages import Command, Grid, Message, Raw
-from fantwin.schemas.topics import BY_NAME, alive_key, health_key, tray_key
+from fantwin.schemas.topics import BY_NAME, health_key, tray_key
 from tests.support.running_chain import eventually
 from tests.support.toy_stage import TRAY_A, TRAY_B, Bench, Passer, Silent, raw, toy
 
@@ -354,8 +355,9 @@ def test_a_stage_whose_launcher_has_gone_runs_until_its_producers_have_ended(con
     bench = Bench(toy(), config)
     with Bus(config.bus) as feeder:
         key, stage = health_key("s", "acquisition", TRAY_A), ("acquisition", TRAY_A)
+        producer = f"acquisition-{TRAY_A}-{feeder.id}"
         health = Health(
-            header=Header("feeder", 0, ""),
+            header=Header(producer, 0, ""),
             stage=stage[0],
             instance=stage[1],
             status=StageStatus.OK,
@@ -363,9 +365,9 @@ def test_a_stage_whose_launcher_has_gone_runs_until_its_producers_have_ended(con
             uptime_s=0.0,
             outputs=(Output(key=tray_key("s", TRAY_A, "raw"), published=0),),
         )
-        feeder.declare_alive(alive_key("s", *stage))
-        publisher = feeder.publisher(key, BY_NAME["health"], type_name(Health), "feeder")
-        while not bench.runner._receiver.peers.has_producer():  # until they have discovered each other
+        feeder.declare_alive(Session(*stage, 1, producer, "elsewhere", 1, (TRAY_A,)).key("s"))
+        publisher = feeder.publisher(key, BY_NAME["health"], type_name(Health), producer)
+        while not bench.runner._sessions.has_producer():  # until they have discovered each other
             publisher.put(encode(health))
             bench.next(Health)
         bench.runner.launcher_gone.set()

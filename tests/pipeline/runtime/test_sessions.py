@@ -12,7 +12,7 @@ import pytest
 from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.config.shards import Shard
 from fantwin.pipeline.runtime.runner import Runner
-from fantwin.pipeline.runtime.sessions import MOST_SESSIONS, Session, Sessions
+from fantwin.pipeline.runtime.sessions import Session, Sessions
 from fantwin.pipeline.runtime.stage import BuiltStage, StageError
 from fantwin.pipeline.tray_scoring.snapshot_store import SnapshotStore
 from fantwin.schemas.enums import StageStatus
@@ -62,7 +62,7 @@ def test_row_07_of_two_sessions_the_later_owns_the_stage_until_it_ends(order):
     assert sessions.owner("acquisition", TRAY_A) == FIRST
 
 
-def test_row_07_sessions_of_different_trays_and_stages_do_not_conflict_and_the_remembered_ones_are_bounded():
+def test_row_07_sessions_of_different_trays_and_stages_do_not_conflict_and_the_remembered_ones_are_bounded(monkeypatch):
     sessions = Sessions()
     of_b = replace(SECOND, instance="b", producer="acquisition-b-1", trays=("b",))
     scorer = replace(SECOND, stage="scorer", producer="scorer-a-1")
@@ -70,10 +70,14 @@ def test_row_07_sessions_of_different_trays_and_stages_do_not_conflict_and_the_r
         sessions.update(session.key("s"), alive=True)
         assert sessions.named(session.stage, session.instance) == session
         assert sessions.successor_of(session) is None
-    for number in range(MOST_SESSIONS + 5):
-        sessions._alive[f"key {number}"] = FIRST
+    monkeypatch.setattr("fantwin.pipeline.runtime.sessions.MOST_SESSIONS", 20)
+    for number in range(20):
+        sessions.update(replace(FIRST, producer=f"acquisition-a-{number}").key("s"), alive=True)
     sessions.update(SECOND.key("s"), alive=True)
-    assert SECOND.key("s") not in sessions._alive
+    assert not sessions.is_alive(SECOND.producer), "those that are there are not forgotten"
+    sessions.update(FIRST.key("s"), alive=False)
+    sessions.update(SECOND.key("s"), alive=True)
+    assert sessions.is_alive(SECOND.producer) and not sessions.has_ended(FIRST.producer)
 
 
 def shard(name: str, started_t_ns: int, *trays: str) -> Session:

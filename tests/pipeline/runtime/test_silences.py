@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import pytest
 
-from fantwin.pipeline.runtime.sessions import LostSessions, Session, Sessions, this_host
+from fantwin.pipeline.runtime.sessions import Session, Sessions, this_host
 from fantwin.pipeline.runtime.silences import BEGINS_NS, MOST_DELAY_S, RESTART_S, Silences
 from fantwin.schemas.enums import StageStatus
 from fantwin.schemas.header import Header
@@ -185,7 +185,7 @@ def token(process_id: int, host: str = this_host()) -> str:
 
 def test_row_11_a_session_without_a_token_was_killed_if_its_process_runs_no_more():
     now_s = 0.0
-    sessions = LostSessions(this_host(), lambda: now_s)
+    sessions = Sessions(lambda: now_s)
     process = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
     key = token(process.pid)
     try:
@@ -194,23 +194,23 @@ def test_row_11_a_session_without_a_token_was_killed_if_its_process_runs_no_more
         assert sessions.take_killed() == [], "only its link was cut"
         cut_off: list[bool] = []
         for now_s in (1.9, 2.0, 59.9, 60.0):  # noqa: B007  read by the sessions
-            cut_off.append(bool(sessions.cut_off()))
+            cut_off.append(sessions.has_cut_off())
         assert cut_off == [False, True, True, False]
         now_s = 10.0
         sessions.update(key, alive=True)
-        assert not sessions.cut_off(), "it is back"
+        assert not sessions.has_cut_off(), "it is back"
         sessions.update(key, alive=False)
     finally:
         process.kill()
         process.communicate()
     now_s = 15.0
-    assert not sessions.cut_off(), "it was killed"
+    assert not sessions.has_cut_off(), "it was killed"
     assert sessions.take_killed() == ["acquisition-a-01"]
     assert sessions.take_killed() == []
 
 
 def test_row_11_whether_a_process_elsewhere_runs_is_not_known():
-    sessions = LostSessions(this_host())
+    sessions = Sessions()
     process = subprocess.Popen([sys.executable, "-c", ""])
     process.wait()
     for key in (token(process.pid), token(1, "elsewhere")):  # the first never ran where it can be seen from here
