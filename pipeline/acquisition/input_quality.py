@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 from fantwin.pipeline.acquisition.sample_blocks import DeviceSequence
 from fantwin.pipeline.sources.source import Reading, ReadingLimits, Rejected
@@ -15,44 +15,36 @@ LONGEST_DETAIL = 120
 """characters of the fault of a refused input, which may quote it; each health contains it"""
 
 
+@dataclass
 class Plausibility:
-    """Checks the readings of one tray."""
+    """Checks the readings of one tray, and adds those that are refused to its counts, quality and sequence."""
 
-    def __init__(
-        self,
-        limits: ReadingLimits,
-        speed_unit: str,
-        counts: Counter[str],
-        quality: InputQuality,
-        sequence: DeviceSequence,
-    ) -> None:
-        """counts, quality, sequence: those of the tray; readings that are refused are added to them."""
-        self.limits = limits
-        self._speed_unit = speed_unit
-        self._counts = counts
-        self._quality = quality
-        self._sequence = sequence
-        self.measured: list[Channel] = []
-        """the channels that the source has given"""
-        self.first_refused: dict[str, str] = {}
-        """fault of the first refused input, by kind"""
+    limits: ReadingLimits
+    speed_unit: str
+    counts: Counter[str]
+    quality: InputQuality
+    sequence: DeviceSequence
+    measured: list[Channel] = field(default_factory=list)
+    """the channels that the source has given"""
+    first_refused: dict[str, str] = field(default_factory=dict)
+    """fault of the first refused input, by kind"""
 
     def plausible(self, item: Reading | Rejected) -> Reading | None:
         """The reading, without implausible speeds; None, and counted, if it cannot be used."""
         if isinstance(item, Reading) and self._is_ordinary(item):
-            self._counts["no_speed"] += 0  # shown from the first reading on
-            self._quality.add_valid()
+            self.counts["no_speed"] += 0  # shown from the first reading on
+            self.quality.add_valid()
             return item
         rejected = item if isinstance(item, Rejected) else self.limits.why_refused(item)
         if rejected is None:
             assert isinstance(item, Reading)
             return self._with_plausible_speeds(item)
-        self._counts[rejected.kind] += 1
-        self._sequence.refused += rejected.is_sample
+        self.counts[rejected.kind] += 1
+        self.sequence.refused += rejected.is_sample
         if not rejected.harmless:
-            self._counts["refused_input"] += 1
+            self.counts["refused_input"] += 1
             rejected = replace(rejected, detail=_shortened(rejected.detail))
-            self._quality.add_fault(rejected)
+            self.quality.add_fault(rejected)
             self.first_refused.setdefault(rejected.kind, rejected.detail)
         return None
 
@@ -70,19 +62,19 @@ class Plausibility:
 
     def _with_plausible_speeds(self, reading: Reading) -> Reading:
         speed_max = self.limits.speed_max
-        self._counts["no_speed"] += sum(map(math.isnan, reading.speed))
+        self.counts["no_speed"] += sum(map(math.isnan, reading.speed))
         absurd = [speed for speed in reading.speed if abs(speed) > speed_max]
         if not absurd:
-            self._quality.add_valid()
+            self.quality.add_valid()
             return reading
-        self._counts["absurd_speed"] += len(absurd)
+        self.counts["absurd_speed"] += len(absurd)
         speeds = tuple(math.nan if abs(v) > speed_max else v for v in reading.speed)
         if all(map(math.isnan, speeds)):
-            self._counts["absurd_samples"] += 1
-            detail = f"speed {absurd[0]:g} is beyond speed_max = {speed_max:g} {self._speed_unit}"
-            self._quality.add_fault(Rejected("absurd_speed", detail, setting="speed_max and speed_unit"))
+            self.counts["absurd_samples"] += 1
+            detail = f"speed {absurd[0]:g} is beyond speed_max = {speed_max:g} {self.speed_unit}"
+            self.quality.add_fault(Rejected("absurd_speed", detail, setting="speed_max and speed_unit"))
         else:
-            self._quality.add_valid()
+            self.quality.add_valid()
         return replace(reading, speed=speeds)
 
     def with_plausible_columns(self, reading: Reading) -> Reading:
@@ -106,7 +98,7 @@ class Plausibility:
             else:
                 measured[name], absurd = unknown, len(values)
             if absurd:
-                self._counts[f"absurd_{each.key}"] += absurd
+                self.counts[f"absurd_{each.key}"] += absurd
         return replace(reading, measured=measured)
 
 

@@ -7,7 +7,8 @@ import os
 import time
 from bisect import bisect_left
 from collections import deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import KW_ONLY, InitVar, dataclass
 from itertools import accumulate
 
 import numpy as np
@@ -72,29 +73,26 @@ AWAITED_AFTER_NS = 2 * NS_PER_S
 """a stage waits for a main input when it has had nothing of it to process for this long"""
 
 
+@dataclass
 class HealthBuilder:
-    """Collects what a stage receives and sends, and builds its `Health` messages."""
+    """Collects what a stage receives and sends, and builds its `Health` messages.
 
-    def __init__(
-        self,
-        stage: str,
-        instance: str,
-        started_t_ns: int,
-        *,
-        may_drop: bool,
-        main_keys: Iterable[str] = (),
-        trays: Iterable[str] = (),
-    ) -> None:
-        """main_keys: the keys of the stage's main input. trays: those of the process; none: all of the site."""
-        self._stage = stage
-        self._instance = instance
-        self._started_t_ns = started_t_ns
-        self._may_drop = may_drop
-        self._trays = ",".join(trays)
-        self.summary = "starting"
-        """the status of the last health in one line"""
+    main_keys: the keys of the stage's main input. trays: those of the process; none: all of the site.
+    """
+
+    stage: str
+    instance: str
+    started_t_ns: int
+    _: KW_ONLY
+    may_drop: bool
+    main_keys: InitVar[Iterable[str]] = ()
+    trays: Sequence[str] = ()
+    summary: str = "starting"
+    """the status of the last health in one line"""
+
+    def __post_init__(self, main_keys: Iterable[str]) -> None:
         self._latencies = Latencies()
-        self._main_input_t_ns = dict.fromkeys(main_keys, started_t_ns)
+        self._main_input_t_ns = dict.fromkeys(main_keys, self.started_t_ns)
         """by key: when its last message was processed, which a stage that is behind has had for a while"""
         self._newest_input_t_ns = self._newest_output_t_ns = 0
 
@@ -134,11 +132,11 @@ class HealthBuilder:
         p50_ms, p99_ms = self._latencies.percentiles_ms()
         self.summary = f"{status.words}: {problem}" if problem else status.words
         return Health(
-            stage=self._stage,
-            instance=self._instance,
+            stage=self.stage,
+            instance=self.instance,
             status=status,
             t_ns=now_ns,
-            uptime_s=(now_ns - self._started_t_ns) / NS_PER_S,
+            uptime_s=(now_ns - self.started_t_ns) / NS_PER_S,
             problem=problem,
             inputs=inputs,
             outputs=tuple(outputs),
@@ -147,7 +145,7 @@ class HealthBuilder:
             latency_p99_ms=p99_ms,
             latencies=self._latencies.histogram(),
             latency_sum_s=self._latencies.sum_s,
-            lost=stage_losses(inputs, counters, may_drop=self._may_drop),
+            lost=stage_losses(inputs, counters, may_drop=self.may_drop),
             process_id=os.getpid(),
             waiting_for=tuple(
                 AwaitedInput(key=key, since_t_ns=since_t_ns)
@@ -157,6 +155,6 @@ class HealthBuilder:
             newest_input_t_ns=self._newest_input_t_ns,
             newest_output_t_ns=self._newest_output_t_ns,
             notes=tuple(notes),
-            trays=self._trays,
+            trays=",".join(self.trays),
             accepts=tuple(accepts),
         )

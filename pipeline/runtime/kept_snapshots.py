@@ -9,6 +9,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass
 
 from fantwin.pipeline.bus.kept_messages import KeptQuery
 from fantwin.pipeline.bus.session import Bus
@@ -63,31 +64,27 @@ class KeptForOthers:
             query.decline()
 
 
+@dataclass
 class KeptSnapshots:
-    """Asks the stages of a site for the snapshots that they keep."""
+    """Asks the stages of a site for the snapshots that they keep.
 
-    def __init__(
-        self,
-        bus: Callable[[], Bus],
-        site: str,
-        stop: threading.Event,
-        wait_for_predecessor: Callable[[], None],
-        answer_limit_s: float,
-        *,
-        is_one_expected: bool,
-        keeper_limit_s: float = KEEPER_LIMIT_S,
-    ) -> None:
-        """bus: joins it, if it is not joined yet. wait_for_predecessor: returns when no other process has these trays,
-        so that no snapshot is still to come. answer_limit_s: how long to wait for an answer. is_one_expected: whether
-        the configuration has a stage that keeps snapshots; if so, it is waited for up to keeper_limit_s."""
-        self._bus = bus
-        self._site = site
-        self._stop = stop
-        self._wait_for_predecessor = wait_for_predecessor
-        self._answer_limit_s = answer_limit_s
-        self._is_one_expected = is_one_expected
-        self._keeper_limit_s = keeper_limit_s
-        self._began_s: float | None = None
+    Attributes:
+        bus: joins it, if it is not joined yet.
+        wait_for_predecessor: returns when no other process has these trays, so that no snapshot is still to come.
+        answer_limit_s: how long to wait for an answer.
+        is_one_expected: whether the configuration has a stage that keeps snapshots; if so, it is waited for up to
+            keeper_limit_s.
+    """
+
+    bus: Callable[[], Bus]
+    site: str
+    stop: threading.Event
+    wait_for_predecessor: Callable[[], None]
+    answer_limit_s: float
+    _: KW_ONLY
+    is_one_expected: bool
+    keeper_limit_s: float = KEEPER_LIMIT_S
+    _began_s: float | None = None
 
     def of(self, tray: str, *, is_patient: bool) -> tuple[Sequence[ScorerSnapshot], str]:
         """The last snapshot of a tray that each stage keeps, and why there may be others, for people. is_patient: wait
@@ -97,20 +94,20 @@ class KeptSnapshots:
             StageError: another process has the tray.
         """
         if self._began_s is None:
-            self._wait_for_predecessor()
+            self.wait_for_predecessor()
             self._began_s = time.monotonic()
-        is_patient = is_patient and self._is_one_expected
-        bus, key = self._bus(), tray_key(self._site, tray, SNAPSHOT)
-        limit_s = self._keeper_limit_s if is_patient else GOSSIP_S if bus.came_second else 0.0
+        is_patient = is_patient and self.is_one_expected
+        bus, key = self.bus(), tray_key(self.site, tray, SNAPSHOT)
+        limit_s = self.keeper_limit_s if is_patient else GOSSIP_S if bus.came_second else 0.0
         while True:
-            payloads, have_answered = bus.ask_for_kept(key, self._answer_limit_s)
+            payloads, have_answered = bus.ask_for_kept(key, self.answer_limit_s)
             is_over = time.monotonic() >= self._began_s + limit_s
-            if payloads or is_over or not have_answered or self._stop.wait(_POLL_S):
+            if payloads or is_over or not have_answered or self.stop.wait(_POLL_S):
                 break
         why = f"no recorder of this tray was there within {limit_s:g} s" if is_patient and not payloads else ""
         if not have_answered:
-            why = f"a recorder did not answer within {self._answer_limit_s:g} s"
-            self._answer_limit_s = min(self._answer_limit_s, IMPATIENT_S)
+            why = f"a recorder did not answer within {self.answer_limit_s:g} s"
+            self.answer_limit_s = min(self.answer_limit_s, IMPATIENT_S)
         return [snapshot for snapshot in map(_decoded, payloads) if snapshot is not None], why
 
 

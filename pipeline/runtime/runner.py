@@ -141,8 +141,8 @@ class Runner:
         self._ending = Ending(stage.name, config.launcher.watchdog_s)
         self._require_rights()
         self._steps = Steps(
-            stage,
-            self._parts,
+            stage=stage,
+            parts=self._parts,
             receiver=self._receiver,
             kept=self._kept,
             outputs=self._outputs,

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from fantwin.pipeline.runtime.health import HealthBuilder
@@ -61,43 +61,40 @@ class _Due:
     item: Any
 
 
+@dataclass(kw_only=True, eq=False)
 class Steps:
-    """Runs the steps of all cores of a process, and publishes what they make."""
+    """Runs the steps of all cores of a process, and publishes what they make.
 
-    def __init__(
-        self,
-        stage: Stage,
-        parts: Mapping[str, BuiltStage],
-        *,
-        receiver: Receiver,
-        kept: KeptForOthers,
-        outputs: Outputs,
-        health: HealthBuilder,
-        clock: StageClock,
-    ) -> None:
-        """parts: by the tray that a core serves; an empty name: all."""
-        self._stage = stage
-        self._parts = parts
-        self._joint = stage.joint() if stage.joint else None
-        self._has_source = any(part.source for part in parts.values())
-        self._receiver, self._kept = receiver, kept
-        self._outputs, self._health, self._clock = outputs, health, clock
-        self.counts: Counter[str] = Counter()
-        self.active: frozenset[str] = frozenset()
-        """the cores of which a method is being called, or has raised"""
-        self.owes_answer = False
-        """a command has arrived: the next health, which says so, is sent soon"""
+    parts: by the tray that a core serves; an empty name: all.
+    """
+
+    stage: Stage
+    parts: Mapping[str, BuiltStage]
+    receiver: Receiver
+    kept: KeptForOthers
+    outputs: Outputs
+    health: HealthBuilder
+    clock: StageClock
+    counts: Counter[str] = field(default_factory=Counter)
+    active: frozenset[str] = frozenset()
+    """the cores of which a method is being called, or has raised"""
+    owes_answer: bool = False
+    """a command has arrived: the next health, which says so, is sent soon"""
+
+    def __post_init__(self) -> None:
+        self._joint = self.stage.joint() if self.stage.joint else None
+        self._has_source = any(part.source for part in self.parts.values())
 
     def step(self, messages: Iterable[Sequence[Envelope]]) -> None:
         """Process groups of messages, each of a different tray; those of a group differ only in their samples."""
         due = [each for envelopes in messages if (each := self._accepted(envelopes))]
         if self._joint is None or len(due) < 2:
             for each in due:
-                core = self._parts[each.name].core
+                core = self.parts[each.name].core
                 self.call(each.name, lambda core=core, item=each.item: core.step(item), input_tray=each.tray)
             return
         self.active = frozenset(each.name for each in due)
-        cores = [self._parts[each.name].core for each in due]
+        cores = [self.parts[each.name].core for each in due]
         made = step_together(self._joint, cores, [each.item for each in due])
         for each, of_core in zip(due, made, strict=True):
             self._publish(each.name, of_core, each.tray)
@@ -118,25 +115,25 @@ class Steps:
         """What a core is given of messages; None: nothing."""
         first, count = envelopes[0], len(envelopes)
         header = first.header
-        name = header.tray if header.tray in self._parts else ""
-        if name not in self._parts:
+        name = header.tray if header.tray in self.parts else ""
+        if name not in self.parts:
             self.counts["unknown_tray"] += count
             return None
         if self._has_source and is_of_replay(header.producer):  # a recorded command must not drive today's fan
             self.counts["refused_of_replay"] += count
             return None
         for envelope in envelopes:
-            self._kept.add(envelope)
-        if first.topic == self._stage.reads[0] and not self._has_source:  # samples of a device depend on no input
+            self.kept.add(envelope)
+        if first.topic == self.stage.reads[0] and not self._has_source:  # samples of a device depend on no input
             for envelope in envelopes:
-                self._outputs.advance(header.tray, first.topic, envelope.header)
+                self.outputs.advance(header.tray, first.topic, envelope.header)
         self.owes_answer |= self._has_source
-        as_it_is = self._stage.wants_envelopes or self._receiver.is_undecoded(first)
+        as_it_is = self.stage.wants_envelopes or self.receiver.is_undecoded(first)
         return _Due(name, header.tray, first if as_it_is else join([envelope.message for envelope in envelopes]))
 
     def _publish(self, name: str, made: Sequence[Message], input_tray: str, *, from_timer: bool = False) -> None:
         for message in made:
             tray = name or message.header.tray or input_tray
-            stamped = self._outputs.publish(tray, message, from_timer=from_timer)
+            stamped = self.outputs.publish(tray, message, from_timer=from_timer)
             t_ns = newest_t_ns(stamped)
-            self._health.add_output(t_ns, HOST_CLOCK.now_ns(), self._clock.now_ns(tray, t_ns))
+            self.health.add_output(t_ns, HOST_CLOCK.now_ns(), self.clock.now_ns(tray, t_ns))

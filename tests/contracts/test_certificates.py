@@ -35,13 +35,12 @@ from tests.support.ports import free_port
 from tests.support.site_certificates import SiteCertificates
 
 CERTIFICATE, KEY, CA = "own.pem", "own.key", "ca.pem"
-PAIR: dict[str, Any] = {"certificate": Path(CERTIFICATE), "key": Path(KEY)}
+PAIR: dict[str, Any] = {"certificate": Path(CERTIFICATE)}
 
 
 def problems_of_bus(folder: Path) -> list[str]:
     try:
-        files: dict[str, Any] = {"ca": folder / CA, "certificate": folder / CERTIFICATE, "key": folder / KEY}
-        checked_credentials(SecurityConfig(**files), ("own",))
+        checked_credentials(SecurityConfig(ca=folder / CA, certificate=folder / CERTIFICATE), ("own",))
     except UserError as error:
         return [str(error)]
     return []
