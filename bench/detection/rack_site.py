@@ -25,6 +25,7 @@ from fantwin.pipeline.config.loading import parse_config
 from fantwin.pipeline.config.settings import Config
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.learning.healthy_history import HealthyHistory
+from fantwin.pipeline.learning.learner_core import LearnerCore
 from fantwin.pipeline.learning.learning_schedule import LearningProcess
 from fantwin.pipeline.learning.next_version import make_next_version
 from fantwin.pipeline.learning.ordinary_operation import OrdinaryOperation
@@ -36,7 +37,6 @@ from fantwin.schemas.enums import Action
 from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Alarm, Raw, Request, Score
 from fantwin.schemas.units import NS_PER_S
-from fantwin.stages.learner import LearnerCore
 
 NOTED_AFTER_D = 0.1
 """so many days after a change that they made themselves, operators commission the fans again"""

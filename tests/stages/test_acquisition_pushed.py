@@ -8,12 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from fantwin.pipeline.acquisition.acquisition_core import AcquisitionCore
 from fantwin.pipeline.runtime.stage import Context
 from fantwin.pipeline.sources.push.source import SILENT_NS, PushSource
 from fantwin.schemas.header import Header
 from fantwin.schemas.messages import PushedSamples, Raw
 from fantwin.schemas.units import NS_PER_S
-from fantwin.stages.acquisition import STAGE, AcquisitionCore
+from fantwin.stages.acquisition import STAGE
 from tests.support.running_acquisition import push_config
 
 S = NS_PER_S

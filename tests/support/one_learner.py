@@ -8,13 +8,13 @@ import numpy as np
 
 from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.learning.healthy_history import HealthyHistory, healthy_recordings, recordings_near_alarms
+from fantwin.pipeline.learning.learner_core import LearnerConfig, LearnerCore
 from fantwin.pipeline.learning.learning_schedule import LearningProcess
 from fantwin.pipeline.learning.ordinary_operation import OrdinaryOperation
 from fantwin.pipeline.learning.versions import Check, TwinVersions
 from fantwin.schemas.enums import FanState
 from fantwin.schemas.messages import Message, NewTwin, Raw, Score
 from fantwin.schemas.units import NS_PER_S
-from fantwin.stages.learner import LearnerConfig, LearnerCore
 from tests.support.learned_versions import version
 
 START_NS = 1_800_000_000 * NS_PER_S

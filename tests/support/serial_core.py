@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+from fantwin.pipeline.acquisition.acquisition_core import AcquisitionCore, Item
 from fantwin.pipeline.acquisition.sample_blocks import SampleBlocks
 from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.sources.serial.config import SerialConfig
@@ -14,7 +15,7 @@ from fantwin.pipeline.sources.source import LinkDown, LinkUp, ReadingBatch, Sour
 from fantwin.pipeline.timebase.host_clock import HOST_CLOCK, HostClock
 from fantwin.schemas.messages import Raw
 from fantwin.schemas.units import NS_PER_S
-from fantwin.stages.acquisition import AcquisitionConfig, AcquisitionCore, Item
+from fantwin.stages.acquisition import AcquisitionConfig
 
 
 class FakeLink:
