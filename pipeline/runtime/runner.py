@@ -10,10 +10,7 @@ from __future__ import annotations
 import functools
 import threading
 import time
-from collections import Counter
-from collections.abc import Callable, Iterator, Sequence, Set
-from dataclasses import replace
-from itertools import chain
+from collections.abc import Callable, Set
 
 from fantwin.pipeline.bus.identity import new_session_id
 from fantwin.pipeline.bus.kept_messages import KeptQuery
@@ -28,19 +25,17 @@ from fantwin.pipeline.runtime.inbox import INBOX_SIZE, DueMessages, FromBus, Fro
 from fantwin.pipeline.runtime.kept_snapshots import KeptForOthers
 from fantwin.pipeline.runtime.publishing import Outputs
 from fantwin.pipeline.runtime.receiving import Receiver
+from fantwin.pipeline.runtime.reports import Reports
 from fantwin.pipeline.runtime.service_manager import Notifier
 from fantwin.pipeline.runtime.sessions import Session, Sessions, trays_in_words
-from fantwin.pipeline.runtime.stage import BuiltStage, Core, Stage, StageError
+from fantwin.pipeline.runtime.stage import BuiltStage, Stage, StageError
 from fantwin.pipeline.runtime.started_sources import Sources
 from fantwin.pipeline.runtime.steps import Steps
 from fantwin.pipeline.timebase.host_clock import HOST_CLOCK
 from fantwin.pipeline.timebase.stage_clock import StageClock
-from fantwin.schemas.codec import encode, type_name
+from fantwin.schemas.codec import type_name
 from fantwin.schemas.enums import StageStatus
-from fantwin.schemas.envelope import Envelope
-from fantwin.schemas.header import Header
-from fantwin.schemas.health import Health, Note
-from fantwin.schemas.streams import stage_losses
+from fantwin.schemas.health import Health
 from fantwin.schemas.topics import BY_NAME, alive_key, health_key, tray_key
 
 TICK_S, EARLY_S = 0.06, 0.02
@@ -79,7 +74,6 @@ class Runner:
         shard = shard or chosen_shard(stage.name, config)
         self.stage = stage
         self.stop = stop
-        self._on_health = on_health or (lambda _health: None)
         self.launcher_gone = threading.Event()
         """Set when the process that started this stage has gone: it ends as soon as its producers have ended."""
         self._site = config.site
@@ -87,7 +81,6 @@ class Runner:
         session_id = new_session_id()
         self.producer = f"{stage.name}-{self._shard.name}-{session_id}"
         self._inbox = Inbox(drops_oldest=stage.may_drop)
-        self._counts: Counter[str] = Counter()
         started_t_ns = HOST_CLOCK.now_ns()
         self._sources = Sources(self._inbox)
         self._clock = StageClock()
@@ -106,9 +99,6 @@ class Runner:
         self._due = DueMessages(self._parts, joins=joins)
         """to be processed before anything else"""
         self._outputs = Outputs(self._bus, config.site, stage, list(shard.trays), self.producer)
-        self._health_publisher = self._bus.publisher(
-            health_key(config.site, stage.name, self._shard.name), BY_NAME["health"], type_name(Health), self.producer
-        )
         main = stage.reads[:1] if not self._has_source else ()  # the core of a source reports its silence
         self._health = HealthBuilder(
             stage.name,
@@ -149,6 +139,23 @@ class Runner:
             health=self._health,
             clock=self._clock,
         )
+        key = health_key(config.site, stage.name, self._shard.name)
+        self._reports = Reports(
+            stage=stage,
+            parts=self._parts,
+            producer=self.producer,
+            publisher=self._bus.publisher(key, BY_NAME["health"], type_name(Health), self.producer),
+            bus=self._bus,
+            inbox=self._inbox,
+            due=self._due,
+            sources=self._sources,
+            receiver=self._receiver,
+            steps=self._steps,
+            outputs=self._outputs,
+            health=self._health,
+            ending=self._ending,
+            on_health=on_health,
+        )
 
     def run(self) -> Health:
         """Run to the end and return the last health, which is published whatever happens.
@@ -183,7 +190,7 @@ class Runner:
         for name, parts in self._parts.items():
             self._close_core(name, parts, failed)
         ending.run("reporting what was consumed", self._outputs.report_last, CORES_CLOSED)
-        last = self._report_end()
+        last = self._reports.publish_last(HEALTH_SENT)
         ending.run("leaving the bus", self._bus.close, BUS_LEFT)
         if ending.error is not None:
             raise ending.error
@@ -216,7 +223,7 @@ class Runner:
         self._receiver.start(follows_clock=self.stage.core_per_tray and not self._has_source)
         self._bus.declare_alive(self._session.key(self._site))  # before the first message
         self._sessions.update(self._session.key(self._site), alive=True)
-        self._publish_health(StageStatus.STARTING)
+        self._reports.publish(StageStatus.STARTING)
         if not self.stage.may_drop:
             self._receiver.catch_up()
             self._loop(self._has_caught_up, StageStatus.STARTING)
@@ -248,11 +255,11 @@ class Runner:
                 news = False
                 if now >= next_loss:
                     next_loss = now + LOSS_REPORT_S
-                    news = self._steps.owes_answer or self._lost() > reported_lost
+                    news = self._steps.owes_answer or self._reports.lost() > reported_lost
                 if news or now >= next_health:
                     self._steps.owes_answer = False
                     next_health = now + HEALTH_PERIOD_S
-                    reported_lost = self._publish_health(status).lost
+                    reported_lost = self._reports.publish(status).lost
                 self._notifier.at_work(self._health.summary)
 
     def _should_end(self) -> bool:
@@ -287,12 +294,12 @@ class Runner:
     def _discard_waiting(self) -> None:
         self._inbox.close()  # from now on it takes nothing, and the sources count what they deliver
         if not self.stage.may_drop:
-            self._counts["lost_at_stop"] += len(self._due) + self._tracker.held
+            self._reports.lost_at_stop += len(self._due) + self._tracker.held
         while (item := self._inbox.get(0)) is not None:
             if isinstance(item, FromSource):
                 self._sources.discard(item)
             elif isinstance(item, FromBus) and item.key in self._receiver.keys and not self.stage.may_drop:
-                self._counts["lost_at_stop"] += 1
+                self._reports.lost_at_stop += 1
 
     def _close_core(self, name: str, parts: BuiltStage, failed: Set[str]) -> None:
         what = name or "the core"
@@ -301,25 +308,6 @@ class Runner:
         else:
             close = functools.partial(self._steps.call, name, parts.core.close, from_timer=True)
             self._ending.run(f"closing {what}", close, CORES_CLOSED)
-
-    def _report_end(self) -> Health:
-        """Build and publish the last health; without counts if collecting them fails."""
-        reported: list[Health] = []
-
-        def report() -> None:
-            status = StageStatus.DEGRADED if self._ending.error else StageStatus.STOPPED
-            try:
-                health = self._build_health(status, is_last=True)
-                payload = encode(health)
-            except Exception as error:  # noqa: BLE001  kept, and reported without what raised it
-                self._ending.fail(error, f"counting failed: {type(error).__name__}: {error}")
-                health = self._build_health(StageStatus.DEGRADED, with_counts=False, is_last=True)
-                payload = encode(health)
-            reported.append(health)
-            self._health_publisher.put(payload)
-
-        self._ending.run("reporting the last health", report, HEALTH_SENT)
-        return reported[0] if reported else self._build_health(StageStatus.DEGRADED, with_counts=False, is_last=True)
 
     def _handle_what_waits(self) -> int:
         """Take what else is in the inbox now, so that messages of a tray are joined; returns the number of items. It is
@@ -362,73 +350,3 @@ class Runner:
 
     def _has_caught_up(self) -> bool:
         return not (self._receiver.is_catching_up or self._due) or self._ending.left_s(CAUGHT_UP) < 0
-
-    def _counters(self) -> Counter[str]:
-        counters = (
-            self._counts
-            + self._steps.counts
-            + self._receiver.counts
-            + Counter(self._tracker.counters())
-            + Counter(lost_at_stop=self._sources.lost)
-        )
-        if self._due.refused_requests:
-            counters["refused_requests"] = self._due.refused_requests
-        if self._bus.refused_too_large:
-            counters["refused_too_large"] = self._bus.refused_too_large
-        if self._bus.forgeries.count:
-            counters["refused_forged"] = self._bus.forgeries.count
-        for parts in self._parts.values():
-            counters.update(parts.core.counters())
-        if self._inbox.dropped:
-            counters["dropped"] = self._inbox.dropped
-        return counters
-
-    def _unsaved(self, cores: Sequence[Core]) -> Iterator[Envelope]:
-        """What a kill would lose; at the end, what was received and there was no time to process."""
-        return chain(tuple(self._due), *(core.unsaved() for core in cores))
-
-    def _lost(self) -> int:
-        return stage_losses(self._tracker.inputs(), self._counters(), may_drop=self.stage.may_drop)
-
-    def _has_more(self, tray: str) -> bool:
-        """Whether input waits from which more outputs of a tray may be made. A core that serves all trays takes any."""
-        name = tray if tray in self._parts else ""
-        return self._inbox.has_input(name) or (self._due.has(name) if name else bool(self._due))
-
-    def _build_health(self, status: StageStatus, *, with_counts: bool = True, is_last: bool = False) -> Health:
-        cores = [parts.core for parts in self._parts.values()] if with_counts else []
-        health = self._health.build(
-            status=status,
-            problems=[
-                self._ending.problem,
-                self._bus.certificate_warning(),
-                self._bus.forgeries.problem(),
-                self._tracker.problem(),
-                *(core.problem() for core in cores),
-            ],
-            inputs=self._tracker.inputs(self._unsaved(cores)) if with_counts else (),
-            outputs=self._outputs.counts(self._has_more) if with_counts else (),
-            counters=self._counters() if with_counts else {},
-            now_ns=HOST_CLOCK.now_ns(),
-            notes=[*self._notes()] if with_counts else (),
-            accepts=filter(None, (core.accepts() for core in cores)),
-        )
-        header = Header(self.producer, self._health_publisher.published, "")
-        return replace(health, header=header, is_last=is_last)
-
-    def _notes(self) -> Iterator[Note]:
-        if note := self._receiver.note():
-            yield Note(tray="", text=note)
-        for name, parts in self._parts.items():
-            yield from (Note(tray=name, text=note) for note in parts.core.notes())
-
-    def _publish_health(self, status: StageStatus) -> Health:
-        health = self._build_health(status)
-        payload = encode(health)
-        self._health_publisher.put(payload)
-        self._on_health(health)
-        if "health" in self.stage.reads:
-            # the bus does not return a session's own messages
-            own = Envelope(self._health_publisher.key, "health", payload, HOST_CLOCK.now_ns(), health)
-            self._steps.step([[own]])
-        return health

@@ -160,7 +160,7 @@ def test_row_16_a_stage_that_was_held_up_says_that_its_input_is_not_all_processe
         for number in range(3):
             bench.feed(TRAY_A, number)
         assert is_held.wait(20)
-        eventually(lambda: bench.runner._has_more(TRAY_A), "another one has arrived")
+        eventually(lambda: bench.runner._reports._has_more(TRAY_A), "another one has arrived")
         threading.Event().wait(2 * TICK_S)
         may_step.release()
         healths = [bench.next(Health)]
