@@ -132,15 +132,7 @@ class Bus:
         # not indirect: with a thread and a queue for each subscriber, keys lose their order and publishers never wait
         handler = zenoh.handlers.Callback(receive, indirect=False)
         subscriber = self._session.declare_subscriber(key_expression, handler, allowed_origin=zenoh.Locality.REMOTE)
-        self._declared.append(subscriber)
-        self._claims.append(("declare_subscriber", key_expression))
-
-        def unsubscribe() -> None:
-            self._claims.remove(("declare_subscriber", key_expression))
-            self._declared.remove(subscriber)
-            subscriber.undeclare()
-
-        return unsubscribe
+        return self._ended_by_call(subscriber, ("declare_subscriber", key_expression))
 
     def declare_alive(self, key: str) -> None:
         """Show a liveliness token until this session ends, however it ends."""
@@ -155,9 +147,15 @@ class Bus:
 
         handler = zenoh.handlers.Callback(receive, indirect=False)
         subscriber = self._session.liveliness().declare_subscriber(key_expression, handler, history=True)
+        return self._ended_by_call(subscriber)
+
+    def _ended_by_call(self, subscriber: zenoh.Subscriber[None], *claims: tuple[str, str]) -> Callable[[], None]:
         self._declared.append(subscriber)
+        self._claims += claims
 
         def unsubscribe() -> None:
+            for claim in claims:
+                self._claims.remove(claim)
             self._declared.remove(subscriber)
             subscriber.undeclare()
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 
 from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.config.roles import roles_of
@@ -46,79 +47,73 @@ MOST_UNREADABLE_KEYS = 16
 """the most keys that are named in the note on messages that cannot be read"""
 
 
+@dataclass(kw_only=True, eq=False)
 class Receiver:
-    """Takes items of the inbox that came from the bus, and puts the messages that are due into `due`."""
+    """Takes items of the inbox that came from the bus, and puts the messages that are due into `due`.
 
-    def __init__(
-        self,
-        stage: Stage,
-        config: Config,
-        shard: Shard,
-        bus: Bus,
-        inbox: Inbox,
-        *,
-        producer: str,
-        sessions: Sessions,
-        clock: StageClock,
-        health: HealthBuilder,
-        due: DueMessages,
-    ) -> None:
-        """shard: the trays of the process. producer: its name; its own messages are not taken. sessions, clock, health:
-        what is received changes them."""
-        self._stage = stage
+    Attributes:
+        shard: the trays of the process.
+        producer: its name; its own messages are not taken.
+        sessions, clock, health: what is received changes them.
+    """
+
+    stage: Stage
+    config: Config
+    shard: Shard
+    bus: Bus
+    inbox: Inbox
+    producer: str
+    sessions: Sessions
+    clock: StageClock
+    health: HealthBuilder
+    due: DueMessages
+    counts: Counter[str] = field(default_factory=Counter)
+    """of messages that could not be taken, by reason"""
+
+    def __post_init__(self) -> None:
+        stage, config, shard = self.stage, self.config, self.shard
         self._site = config.site
         self._roles = roles_of(config)
-        self._shard = shard
         self._trays = frozenset(shard.trays)
         self._is_patient = stage.is_patient or (stage.joint is not None and len(shard.trays) >= MANY_TRAYS)
-        self._producer = producer
-        self._bus = bus
-        self._inbox = inbox
-        self._sessions = sessions
-        self._clock = clock
-        self._health = health
-        self._due = due
-        self.counts: Counter[str] = Counter()
-        """of messages that could not be taken, by reason"""
         self._unreadable: Counter[str] = Counter()
         """by key, the number of messages that cannot be read; at most MOST_UNREADABLE_KEYS keys"""
-        self._recovery = Recovery(bus, inbox, bus.answer_timeout_s, only_rare=stage.may_drop)
-        self.tracker = SequenceTracker(self._recovery.ask, sessions=sessions)
+        self._recovery = Recovery(self.bus, self.inbox, self.bus.answer_timeout_s, only_rare=stage.may_drop)
+        self.tracker = SequenceTracker(self._recovery.ask, sessions=self.sessions)
         reads = stage.reads_as_configured(config)
         self.keys = {tray_key(config.site, tray, topic) for topic in reads if topic != "health" for tray in shard.trays}
         """all that the stage reads, health apart"""
         self._unhurried = {key for key in self.keys if topic_of(key).name in stage.undecoded}
-        self._silences = Silences(
-            {tray_key(config.site, tray, topic): tray for topic in stage.reads[:1] for tray in shard.trays}, sessions
-        )
+        main = {tray_key(config.site, tray, topic): tray for topic in stage.reads[:1] for tray in shard.trays}
+        self._silences = Silences(main, self.sessions)
 
     def start(self, *, follows_clock: bool) -> None:
         """Subscribe to what the stage reads, to health, to who is there and, if it follows them, to the clocks of the
         trays."""
         for key in sorted(self.keys):
-            self._bus.subscribe(key, self.on_message)
+            self.bus.subscribe(key, self.on_message)
         if follows_clock:
-            for tray in self._shard.trays:
-                self._bus.subscribe(tray_key(self._site, tray, "clock"), self.on_message)
-        self._bus.subscribe(health_key(self._site, "*", "*"), self._on_health)
-        self._bus.watch_alive(alive_key(self._site, REPLAY, ALL_TRAYS), self._on_liveness)
-        self._bus.watch_alive(sessions_key(self._site), self._on_liveness)
+            for tray in self.shard.trays:
+                self.bus.subscribe(tray_key(self._site, tray, "clock"), self.on_message)
+        self.bus.subscribe(health_key(self._site, "*", "*"), self._on_health)
+        self.bus.watch_alive(alive_key(self._site, REPLAY, ALL_TRAYS), self._on_liveness)
+        self.bus.watch_alive(sessions_key(self._site), self._on_liveness)
 
     def on_message(self, key: str, payload: bytes) -> None:
         """A message has come, in a thread of the bus: put it into the inbox."""
         is_urgent = not (self._is_patient or key in self._unhurried)
-        self._inbox.put(FromBus(key, payload, HOST_CLOCK.now_ns()), is_urgent=is_urgent)
+        self.inbox.put(FromBus(key, payload, HOST_CLOCK.now_ns()), is_urgent=is_urgent)
 
     def _on_health(self, key: str, payload: bytes) -> None:
-        self._inbox.put(FromBus(key, payload, HOST_CLOCK.now_ns()), is_urgent=False)
+        self.inbox.put(FromBus(key, payload, HOST_CLOCK.now_ns()), is_urgent=False)
 
     def _on_liveness(self, key: str, alive: bool) -> None:
-        self._inbox.put(Liveness(key, alive))
+        self.inbox.put(Liveness(key, alive))
 
     def catch_up(self) -> None:
         """Request what producers still keep from before this stage started: only then is it ready."""
         keys = sorted(self.keys, key=lambda key: (not topic_of(key).is_needed_first, key))
-        if "health" in self._stage.reads:
+        if "health" in self.stage.reads:
             keys.append(health_key(self._site, "*", "*"))
         self._recovery.catch_up(keys)
 
@@ -130,21 +125,21 @@ class Receiver:
     @property
     def awaits_more(self) -> bool:
         """Whether something that other stages have sent, or say at their end, is still to come."""
-        return self._sessions.awaits_last_health() or self.tracker.is_waiting
+        return self.sessions.awaits_last_health() or self.tracker.is_waiting
 
     def ask_again(self) -> None:
         """Repeat unanswered requests when they are due; find sessions that were killed, and those that were cut off."""
         self._recovery.send_due()
-        for producer in self._sessions.take_killed():
+        for producer in self.sessions.take_killed():
             self._silences.end(producer)
-        if self._sessions.has_cut_off():
-            self._bus.meet_again()
+        if self.sessions.has_cut_off():
+            self.bus.meet_again()
 
     def is_complete(self, tray: str) -> bool:
         """Whether the producer of a tray's main input has shown, since this was last asked, that all that it has sent
         has been processed; a replay shows it by its clock."""
         is_shown = self._silences.take(tray)
-        return not self._due.has(tray) and (is_shown or self._clock.is_of_replay(tray))
+        return not self.due.has(tray) and (is_shown or self.clock.is_of_replay(tray))
 
     def take(self, item: FromBus | Recovered | Liveness) -> None:
         """Take an item of the inbox."""
@@ -154,9 +149,9 @@ class Receiver:
             case Recovered():
                 self._take_recovered(item)
             case Liveness():
-                self._sessions.update(item.key, item.alive)
+                self.sessions.update(item.key, item.alive)
                 if item.key == alive_key(self._site, REPLAY, ALL_TRAYS):
-                    self._clock.set_replay_alive(item.alive)
+                    self.clock.set_replay_alive(item.alive)
 
     def _take_message(self, item: FromBus) -> None:
         envelope = self._decode(item.key, item.payload, item.received_t_ns)
@@ -166,26 +161,26 @@ class Receiver:
         if isinstance(message, Health):
             self._take_health(envelope, message)
         elif isinstance(message, Clock):
-            if not self._clock.update(message):
+            if not self.clock.update(message):
                 self.counts["refused_clocks"] += 1
         else:
-            self._health.add_input(envelope.key, envelope.received_t_ns, HOST_CLOCK.now_ns())
-            self._due.add(self.tracker.accept(envelope))
+            self.health.add_input(envelope.key, envelope.received_t_ns, HOST_CLOCK.now_ns())
+            self.due.add(self.tracker.accept(envelope))
 
     def _take_recovered(self, item: Recovered) -> None:
         now_ns = HOST_CLOCK.now_ns()
         envelopes = [
             each
             for each in self._decoded(item.answer.messages, now_ns)
-            if each.header.producer != self._producer and self._concerns(each)
+            if each.header.producer != self.producer and self._concerns(each)
         ]
         if self._recovery.is_catch_up(item.request):
             due = self.tracker.accept_kept(envelopes)
         else:
             due = self.tracker.answer(item.request, Found(envelopes, item.answer.published))
         for key in dict.fromkeys(envelope.key for envelope in due if envelope.topic != "health"):
-            self._health.add_input(key, now_ns, now_ns)
-        self._due.add(due)
+            self.health.add_input(key, now_ns, now_ns)
+        self.due.add(due)
         self._recovery.finish(item)
 
     def _take_health(self, envelope: Envelope, health: Health) -> None:
@@ -193,17 +188,17 @@ class Receiver:
         if health is not said:
             self.counts["refused_outputs"] += 1
         if health.stage == REPLAY:
-            self._clock.add_replay_health(health.header.producer, has_ended=health.is_last)
-        self._sessions.add_health(health, self.keys)
-        self._due.add(self.tracker.reconcile(health, self.keys))
+            self.clock.add_replay_health(health.header.producer, has_ended=health.is_last)
+        self.sessions.add_health(health, self.keys)
+        self.due.add(self.tracker.reconcile(health, self.keys))
         self._silences.add_health(health, self.tracker.has_all_of)
-        if "health" in self._stage.reads and self._concerns(envelope):
-            self._due.add(self.tracker.accept(envelope))
+        if "health" in self.stage.reads and self._concerns(envelope):
+            self.due.add(self.tracker.accept(envelope))
 
     def _concerns(self, envelope: Envelope) -> bool:
         """Whether a message is of a tray of this process. Health is of all trays of its process: so each recorder has
         the health of all processes that work on its trays, whatever becomes of the others."""
-        if envelope.topic != "health" or self._shard.is_whole:
+        if envelope.topic != "health" or self.shard.is_whole:
             return True
         message = envelope.message
         if not isinstance(message, Health) or not message.trays:
@@ -245,4 +240,4 @@ class Receiver:
 
     def is_undecoded(self, envelope: Envelope) -> bool:
         """Whether the core takes a message as it came."""
-        return envelope.topic in self._stage.undecoded
+        return envelope.topic in self.stage.undecoded

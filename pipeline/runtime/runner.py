@@ -115,11 +115,11 @@ class Runner:
             trays=() if shard.is_whole else shard.trays,
         )
         self._receiver = Receiver(
-            stage,
-            config,
-            shard,
-            self._bus,
-            self._inbox,
+            stage=stage,
+            config=config,
+            shard=shard,
+            bus=self._bus,
+            inbox=self._inbox,
             producer=self.producer,
             sessions=self._sessions,
             clock=self._clock,
