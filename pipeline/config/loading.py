@@ -108,18 +108,15 @@ MOST_SHOWN = 5
 """problems of a section"""
 
 
-class _File(Section):
+class File(Section):
+    """The whole file without the sections of stages."""
+
     format: int = Field(default=CONFIGURATION.written, description="format number of this file")
     site: Name = Field(default="site", description="name of the site: it begins the keys on the bus")
     run_folder: Path = Field(default=Path("runs"), description="where recordings, snapshots and logs are written")
     bus: BusConfig = BusConfig()
     launcher: LauncherConfig = LauncherConfig()
     tray: tuple[TrayConfig, ...] = Field(min_length=1)
-
-
-def top_level() -> type[BaseModel]:
-    """The model of the whole file without the sections of stages."""
-    return _File
 
 
 def load_config(path: Path, overrides: Iterable[str] = (), stages: Iterable[str] | None = None) -> Config:
@@ -177,9 +174,9 @@ def _checked(
         raise ConfigError(f"{path}: {refusal}")
     own = {key: value for key, value in table.items() if key not in STAGES and key not in LEFT_OUT}
     for key in own:
-        if key not in _File.model_fields:
-            raise ConfigError(f"{path}: unknown key {_shown(key)}{nearest(key, [*_File.model_fields, *STAGES])}")
-    file = checked_section(_File, own, path, "")
+        if key not in File.model_fields:
+            raise ConfigError(f"{path}: unknown key {_shown(key)}{nearest(key, [*File.model_fields, *STAGES])}")
+    file = checked_section(File, own, path, "")
     enabled = enabled_stages(file.launcher, table)
     sections = {
         name: checked_section(STAGES[name].load().config, table.get(name, {}), path, name)
@@ -189,23 +186,21 @@ def _checked(
     if len(set(names)) != len(names):
         raise ConfigError(f"{path}: two trays have the same name; names must differ: {', '.join(names)}")
     _require_trays_for_shards(file.launcher, len(names), path)
-    folder = path.parent
+    folder, bus = path.parent, file.bus
+    if bus.security:
+        bus = bus.model_copy(update={"security": bus.security.within(folder)})
     return Config(
         path=path,
         text=text,
         overrides=overrides,
         site=file.site,
         run_folder=Path(os.path.normpath(folder / file.run_folder)),
-        bus=_with_paths_within(file.bus, folder),
+        bus=bus,
         launcher=file.launcher,
         trays=file.tray,
         stages=enabled,
         sections=sections,
     )
-
-
-def _with_paths_within(bus: BusConfig, folder: Path) -> BusConfig:
-    return bus.model_copy(update={"security": bus.security.within(folder)}) if bus.security else bus
 
 
 def _require_trays_for_shards(launcher: LauncherConfig, trays: int, path: Path) -> None:

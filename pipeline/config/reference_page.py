@@ -15,7 +15,7 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from fantwin.pipeline.config.loading import LARGEST_FILE_BYTES, top_level
+from fantwin.pipeline.config.loading import LARGEST_FILE_BYTES, File
 from fantwin.pipeline.config.registry import STAGES
 from fantwin.pipeline.config.settings import BusConfig, LauncherConfig, SecurityConfig, TrayConfig
 from fantwin.pipeline.sources.kinds import SOURCE_KINDS
@@ -51,7 +51,7 @@ def page() -> str:
     parts = [
         _INTRODUCTION,
         "## The file\n",
-        table(top_level(), but=tables),
+        table(File, but=tables),
         "## `[[tray]]`\n",
         "One for each tray. `port`, `baud` and `protocol` may be written in it directly, for a serial source.\n",
         table(TrayConfig),

@@ -24,6 +24,7 @@ OPERATED = ("command", "request")
 PUSHED = ("reading",)
 """topics of sources outside the site"""
 REPORTS = "consumed"
+EVERYTHING = tuple(topic.name for topic in TOPICS)
 
 
 @dataclass(frozen=True)
@@ -99,7 +100,6 @@ def _of_stage(name: str, stage: str, instances: tuple[str, ...], trays: tuple[st
     if makes_samples_of_samples(reads, writes):
         writes = (*writes, REPORTS)
     of = f" of {', '.join(trays)}" if trays else ""
-    everything = tuple(topic.name for topic in TOPICS)
     return Role(
         name,
         "people who look, and the stage viewer" if name == VIEWER else f"stage {stage}{of}",
@@ -107,17 +107,16 @@ def _of_stage(name: str, stage: str, instances: tuple[str, ...], trays: tuple[st
         instances=instances,
         trays=trays,
         writes=writes,
-        reads=everything if name == VIEWER else (*reads, "clock"),
+        reads=EVERYTHING if name == VIEWER else (*reads, "clock"),
         keeps=row.keeps,
     )
 
 
 def _roles_of_others(config: Config) -> Iterator[Role]:
-    everything = tuple(topic.name for topic in TOPICS)
-    yield Role(OPERATOR, "people who act: commands, requests", writes=OPERATED, reads=everything, moves_fans=True)
+    yield Role(OPERATOR, "people who act: commands, requests", writes=OPERATED, reads=EVERYTHING, moves_fans=True)
     security = config.bus.security
     for name in security.controllers if security else ():
-        yield Role(name, "a program that commands fans", writes=OPERATED, reads=everything, moves_fans=True)
+        yield Role(name, "a program that commands fans", writes=OPERATED, reads=EVERYTHING, moves_fans=True)
     pushed = tuple(name for name in PUSHED if name in BY_NAME)
     for tray in (None, *(tray.name for tray in config.trays)):
         name, of = (f"{SOURCE}.{tray}", f" of {tray}") if tray else (SOURCE, "")
@@ -128,5 +127,4 @@ def _roles_of_others(config: Config) -> Iterator[Role]:
 
 def _of_replay() -> Role:
     replayed = tuple(topic.name for topic in TOPICS if not topic.is_of_session)
-    everything = tuple(topic.name for topic in TOPICS)
-    return Role(REPLAY, "a replay of a recording onto the bus", stage=REPLAY, writes=replayed, reads=everything)
+    return Role(REPLAY, "a replay of a recording onto the bus", stage=REPLAY, writes=replayed, reads=EVERYTHING)

@@ -264,18 +264,10 @@ class TrayConfig(Section):
         return value
 
     @model_validator(mode="after")
-    def _tacho_for_each_fan(self) -> Self:
+    def _fits(self) -> Self:
         tacho_of_each_fan(self.tachos, self.fans)
-        return self
-
-    @model_validator(mode="after")
-    def _fans_that_the_source_carries(self) -> Self:
         if self.fans > self.source.most_fans:
             raise ValueError(too_many_fans(self.source.kind, self.fans, self.source.most_fans))
-        return self
-
-    @model_validator(mode="after")
-    def _commands_in_order(self) -> Self:
         if self.command_min > self.command_max:
             raise ValueError(f"command_min = {self.command_min:g} is greater than command_max = {self.command_max:g}")
         return self

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from fantwin.pipeline.config.loading import top_level
+from fantwin.pipeline.config.loading import File
 from fantwin.pipeline.config.registry import RESERVED, why_no_output
 from fantwin.pipeline.config.settings import OWN_ROLES
 from fantwin.pipeline.plugins import StageRow
@@ -142,7 +142,7 @@ def test_a_source_and_an_output_of_another_package_run_and_what_is_broken_is_lef
 
 
 def test_no_stage_may_have_the_name_of_a_key_or_a_role():
-    assert {*top_level().model_fields, *OWN_ROLES} == RESERVED
+    assert {*File.model_fields, *OWN_ROLES} == RESERVED
 
 
 @pytest.mark.parametrize(
