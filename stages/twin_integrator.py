@@ -29,7 +29,7 @@ measured motion. It needs no free run and is available a third of a second after
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 from fantwin.pipeline.config.registry import STAGES
 from fantwin.pipeline.errors import refusals
@@ -39,7 +39,7 @@ from fantwin.pipeline.prediction.new_samples import NewSamples
 from fantwin.pipeline.prediction.tray_integrator import TrayIntegrator, TwinIntegratorConfig
 from fantwin.pipeline.prediction.twin_file import TwinFile, load_twin
 from fantwin.pipeline.runtime.stage import Admitted, BuiltStage, Context, Core, Stage
-from fantwin.schemas.messages import Grid, Message, ModelCard, NewTwin, Prediction
+from fantwin.schemas.messages import Grid, Message, ModelCard, NewTwin
 from fantwin.schemas.units import NS_PER_S
 
 RATE_TOLERANCE = 0.01  # a card holds the measured rate
@@ -79,7 +79,7 @@ class TwinIntegratorCore(Core):
         admitted = self.admit(item)
         if admitted.block is None:
             return list(admitted.before)
-        return [*admitted.before, *self.finish(admitted.block, self.tray.predict(admitted.block))]
+        return [*admitted.before, self.tray.predict(admitted.block)]
 
     def admit(self, item: Grid | NewTwin) -> Admitted:
         """See Core. The twin is that of the configuration: no other one takes over."""
@@ -105,10 +105,6 @@ class TwinIntegratorCore(Core):
             )
             return Admitted([*messages, self.tray.without_twin(grid)])
         return Admitted(messages, grid, self.tray.joint_key(grid))
-
-    def finish(self, block: Grid, made: Prediction) -> list[Message]:
-        """See Core. made: the prediction of the block."""
-        return [made]
 
     def tick(self, now_ns: int) -> list[ModelCard]:
         """Publish the model card once."""
@@ -136,17 +132,6 @@ class TwinIntegratorCore(Core):
         return f"twin {name} needs {missing}, which the source does not send: send it, or train without it (--ignore)"
 
 
-class JointIntegrators:
-    """Predicts trays of one process, see Joint."""
-
-    def __init__(self) -> None:
-        self._joint = JointTrayIntegrator()
-
-    def process(self, cores: Sequence[TwinIntegratorCore], blocks: Sequence[Grid]) -> Sequence[Prediction]:
-        """Predict blocks; return what `finish` of each is given."""
-        return self._joint.predict([core.tray for core in cores], blocks)
-
-
 def build(context: Context) -> BuiltStage:
     """The core of one tray and its twin; without one in the configuration, of the twins that are learned.
 
@@ -172,6 +157,6 @@ STAGE = Stage(
     about="the healthy twin on the same commands as the fans",
     config=TwinIntegratorConfig,
     build=build,
-    joint=JointIntegrators,
+    joint=JointTrayIntegrator,
     check=check,
 )

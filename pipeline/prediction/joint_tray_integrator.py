@@ -6,6 +6,7 @@ The states of the trays are put together as those of one tray that has the fans 
 from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -64,18 +65,20 @@ class JointTrayIntegrator:
         self._kept: dict[Hashable, TrayIntegrator] = {}
         """joint integrators, by twin, fans of a tray, and number of trays; the one that was used last is the last"""
 
-    def predict(self, integrators: Sequence[TrayIntegrator], grids: Sequence[Grid]) -> list[Prediction]:
-        """Predict as TrayIntegrator.predict of each; the keys of their blocks are equal (`joint_key`)."""
+    def process(self, cores: Sequence[Any], blocks: Sequence[Grid]) -> list[Prediction]:
+        """Predict as TrayIntegrator.predict of each; the keys of their blocks are equal (`joint_key`). cores: each with
+        its TrayIntegrator, `tray`."""
+        integrators: list[TrayIntegrator] = [core.tray for core in cores]
         if len(integrators) == 1:
-            return [integrators[0].predict(grids[0])]
+            return [integrators[0].predict(blocks[0])]
         joint = self._of_trays(integrators)
         joint.continue_from(integrators[0])
-        begin_t_ns = [int(grid.t_ns[0]) for grid in grids]
+        begin_t_ns = [int(grid.t_ns[0]) for grid in blocks]
         states = JointStates(joint.states, [each.states for each in integrators], begin_t_ns)
         states.gather()
-        predictions = apart(joint.predict(side_by_side(grids)), [grid.t_ns for grid in grids])
+        predictions = apart(joint.predict(side_by_side(blocks)), [grid.t_ns for grid in blocks])
         states.scatter()
-        for each, grid in zip(integrators, grids, strict=True):
+        for each, grid in zip(integrators, blocks, strict=True):
             each.skip(grid)
         return predictions
 

@@ -62,10 +62,6 @@ class Core(Protocol):
         The default does all that `step` does."""
         return Admitted(self.step(item))
 
-    def finish(self, block: Any, made: Any) -> Sequence[Message]:
-        """The last part of `step`: the messages on what was made of an admitted block."""
-        return ()
-
     def tick(self, now_ns: int) -> Sequence[Message]:
         """Let time pass; called about every 50 ms. now_ns: time of the host, or of the replay that feeds the stage."""
         return ()
@@ -114,8 +110,8 @@ class Core(Protocol):
 class Joint(Protocol):
     """Processes admitted blocks, for one process of a stage."""
 
-    def process(self, cores: Sequence[Any], blocks: Sequence[Any]) -> Sequence[Any]:
-        """The result of each core's block, for its `finish`; processed alone, it would differ only by rounding.
+    def process(self, cores: Sequence[Any], blocks: Sequence[Any]) -> Sequence[Message]:
+        """The message on each core's block; processed alone, it would differ only by rounding.
 
         Blocks of several cores have equal keys.
         """

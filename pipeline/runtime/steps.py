@@ -6,7 +6,7 @@ Blocks of several trays are processed in one pass where that is possible.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -25,18 +25,16 @@ MOST_FANS = 512
 """in one pass: with more, a fan costs hardly less"""
 
 
-def step_together(joint: Joint, cores: Sequence[Core], items: Sequence[Any]) -> Iterator[list[Message]]:
-    """The messages of `core.step(item)` for each of several trays: the same decisions; numbers may differ by rounding.
-
-    A core finishes its step only when its messages are taken, so what it saves is never ahead of what is published.
-    """
+def step_together(joint: Joint, cores: Sequence[Core], items: Sequence[Any]) -> list[list[Message]]:
+    """The messages of `core.step(item)` for each of several trays: the same, but for rounding."""
     admitted = [core.admit(item) for core, item in zip(cores, items, strict=True)]
-    made: dict[int, Any] = {}
+    made = [list(each.before) for each in admitted]
     for numbers in _passes(admitted):
         blocks = [admitted[number].block for number in numbers]
-        made |= zip(numbers, joint.process([cores[number] for number in numbers], blocks), strict=True)
-    for number, (core, each) in enumerate(zip(cores, admitted, strict=True)):
-        yield [*each.before, *(core.finish(each.block, made[number]) if number in made else ())]
+        messages = joint.process([cores[number] for number in numbers], blocks)
+        for number, message in zip(numbers, messages, strict=True):
+            made[number].append(message)
+    return made
 
 
 def _passes(admitted: Sequence[Admitted]) -> list[list[int]]:

@@ -12,7 +12,6 @@ import pytest
 from fantwin.pipeline.runtime.inbox import INBOX_SIZE
 from fantwin.pipeline.runtime.runner import Runner
 from fantwin.pipeline.runtime.stage import Admitted, BuiltStage, Context, Core, StageError
-from fantwin.pipeline.runtime.steps import step_together
 from fantwin.schemas.enums import StageStatus
 from fantwin.schemas.header import Header, InputPosition
 from fantwin.schemas.health import Health
@@ -39,9 +38,6 @@ class Joined(Passer):
     def admit(self, item: Any) -> Admitted:
         return Admitted((), item, "all")
 
-    def finish(self, block: Any, made: Any) -> Sequence[Message]:
-        return made
-
     def abort(self) -> None:
         self.aborted.append(self.name)
 
@@ -51,11 +47,11 @@ class InOnePass:
 
     passes: ClassVar[list[int]] = []
 
-    def process(self, cores: Sequence[Joined], blocks: Sequence[Raw]) -> Sequence[Any]:
+    def process(self, cores: Sequence[Joined], blocks: Sequence[Raw]) -> Sequence[Message]:
         self.passes.append(len(cores))
         if any(int(block.host_receive_t_ns[0]) < 0 for block in blocks):
             raise ZeroDivisionError("on purpose")
-        return [core.step(block) for core, block in zip(cores, blocks, strict=True)]
+        return [message for core, block in zip(cores, blocks, strict=True) for message in core.step(block)]
 
 
 @pytest.mark.parametrize("raises", [False, True])
@@ -88,32 +84,6 @@ def test_what_waits_of_several_trays_is_processed_in_one_pass(config, raises):
         (TRAY_A, 3, InputPosition("raw", "feeder", 1, 2, 0)),
         (TRAY_B, 4, InputPosition("raw", "feeder", 1, 2, 0)),
     ]
-
-
-def test_a_core_finishes_its_step_when_its_messages_are_taken():
-    finished: list[str] = []
-
-    class Finishing(Passer):
-        def __init__(self, name: str) -> None:
-            super().__init__()
-            self.name = name
-
-        def admit(self, item: Any) -> Admitted:
-            return Admitted((), item, "all")
-
-        def finish(self, block: Any, made: Any) -> Sequence[Message]:
-            finished.append(self.name)
-            return ()
-
-    class Nothing:
-        def process(self, cores: Sequence[Any], blocks: Sequence[Any]) -> Sequence[Any]:
-            return blocks
-
-    steps = step_together(Nothing(), [Finishing(TRAY_A), Finishing(TRAY_B)], [raw(1), raw(2)])
-    next(steps)
-    assert finished == [TRAY_A], "what the other would save must not be ahead of what is published of it"
-    next(steps)
-    assert finished == [TRAY_A, TRAY_B]
 
 
 class CrashesOnce(Passer):
