@@ -132,8 +132,7 @@ def judged(
                 logs[method.name].take(path.stem, detector.take(message).changes)
 
     with open_replay_input([path], None, (), twin, from_s, to_s) as replay_input:
-        for replayed in replay_input.pipeline(replay_input.trays[0].name, observe=observe).run():
-            message = replayed.message
+        for _, message in replay_input.pipeline(replay_input.trays[0].name, observe=observe).run():
             if isinstance(message, Alarm):
                 alarms.append(message)
             elif isinstance(message, Score):

@@ -132,7 +132,7 @@ def _left_alone(recorded: ReplayInput, tray: str, raws: Sequence[Raw]) -> tuple[
     blocks = RawBlocks(lambda: (Envelope.of(key, raw, int(raw.host_receive_t_ns[-1])) for raw in raws), _ignore)
     contexts = recorded.contexts(recorded.config.tray(tray))
     pipeline = OfflinePipeline(recorded.stages, contexts, blocks, undisturbed_plan(recorded.stages), _ignore)
-    made = [replayed.message for replayed in pipeline.run()]
+    made = [message for _, message in pipeline.run()]
     alarms = [replace(each, header=Header("left alone", 0, tray)) for each in made if isinstance(each, Alarm)]
     times = [each.t_ns for each in made if isinstance(each, Score)]
     return episodes(alarms), np.unique(np.concatenate([np.empty(0, np.int64), *times]))

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from pydantic import TypeAdapter
 
+from fantwin.pipeline.tray_scoring.scorer_core import RESTORE_ERRORS, ScorerCore
 from fantwin.schemas.blocks import cut
 from fantwin.schemas.codec import decode, encode
 from fantwin.schemas.enums import Action, FanState, Transition
@@ -27,7 +28,6 @@ from fantwin.scoring.alarms.alarm_state import DATA_LOST_AFTER_NS
 from fantwin.scoring.alarms.alarms_of_tray import AlarmsOfTray, Decided, KeptConditions
 from fantwin.scoring.model.saved import as_json, from_json
 from fantwin.scoring.standing.against_command import AgainstCommand
-from fantwin.stages.scorer import RESTORE_ERRORS, ScorerCore
 from tests.support.scored_blocks import core_of, prediction_of, request_of
 
 FANS, BLOCK = 3, 20

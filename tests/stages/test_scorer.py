@@ -14,13 +14,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fantwin.pipeline.tray_scoring.scorer_core import ScorerCore
 from fantwin.schemas.blocks import cut
 from fantwin.schemas.enums import Action, FanState, InvalidReason, Severity, Statistic, Transition
 from fantwin.schemas.fields import columns
 from fantwin.schemas.messages import Alarm, Prediction, Request, Score, ScorerSnapshot
 from fantwin.schemas.units import NS_PER_S
 from fantwin.scoring.unseen_error import UnseenError
-from fantwin.stages.scorer import ScorerCore
 from tests.support import scored_blocks
 from tests.support.scored_blocks import (
     EPOCH_NS,
@@ -260,7 +260,7 @@ def test_blocks_of_any_size_are_judged_the_same_to_the_bit(
     whole = replace(whole, t_ns=EPOCH_NS + (whole.t_ns - EPOCH_NS) // STEP_NS * period_ns, period_ns=period_ns)
     ends = [0, *takewhile(lambda end: end < samples, accumulate(cycle(sizes))), samples]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("fantwin.stages.scorer.NOT_JUDGED_S", 0.1)
+        patch.setattr("fantwin.pipeline.tray_scoring.scorer_core.NOT_JUDGED_S", 0.1)
         single, blocks = (judged(core_of(3), parts(whole, marks)) for marks in (range(samples + 1), ends))
     assert single == blocks
 

@@ -10,8 +10,9 @@ import pytest
 from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.runtime.stage import Context, StageError
 from fantwin.pipeline.tray_scoring.scorer_config import FALSE_ALARMS_PER_DAY, ScorerConfig
+from fantwin.pipeline.tray_scoring.scorer_core import NOT_CALIBRATED, ScorerCore
 from fantwin.schemas.units import S_PER_DAY
-from fantwin.stages.scorer import NOT_CALIBRATED, STAGE, ScorerCore
+from fantwin.stages.scorer import STAGE
 from tests.support.scored_blocks import STEP, feed, prediction_of, with_step
 from tests.support.twin_files import write_twin
 

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from fantwin.pipeline.tray_scoring.scorer_core import ScorerCore
 from fantwin.schemas.enums import Action, Feedback, Transition
 from fantwin.schemas.messages import Alarm, Prediction
 from fantwin.schemas.units import NS_PER_S
-from fantwin.stages.scorer import ScorerCore
 from tests.support.scored_blocks import core_of, feed, prediction_of, request_of, snapshot_of
 
 PERIOD_NS = NS_PER_S

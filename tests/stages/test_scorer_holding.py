@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from fantwin.pipeline.tray_scoring import tray_scorer
 from fantwin.pipeline.tray_scoring.scorer_config import ScorerConfig
+from fantwin.pipeline.tray_scoring.scorer_core import ScorerCore
 from fantwin.schemas.blocks import join
 from fantwin.schemas.enums import Severity, Statistic, Transition
 from fantwin.schemas.messages import Prediction, Raw
@@ -22,7 +23,6 @@ from fantwin.schemas.standstill import Standstill
 from fantwin.schemas.tacho import INSTANTANEOUS, Tacho
 from fantwin.schemas.units import NS_PER_S
 from fantwin.stages.resampler import ResamplerConfig, ResamplerCore
-from fantwin.stages.scorer import ScorerCore
 from tests.support.scored_blocks import EPOCH_NS, NEEDED, TWIN_SPEED, Floats, core_of, feed, prediction_of, twin_of
 
 PERIOD_NS = 100_000_000

@@ -14,6 +14,7 @@ import pytest
 
 from fantwin.pipeline.site.alarm_book import AlarmBook
 from fantwin.pipeline.tray_scoring.scorer_config import ScorerConfig
+from fantwin.pipeline.tray_scoring.scorer_core import ScorerCore
 from fantwin.pipeline.tray_scoring.snapshot_store import SnapshotStore
 from fantwin.schemas.blocks import cut
 from fantwin.schemas.enums import Action, FanState, Transition
@@ -25,7 +26,6 @@ from fantwin.scoring.alarms.alarm_state import is_listed, is_retained, is_silenc
 from fantwin.scoring.alarms.current_alarms import CurrentAlarm
 from fantwin.scoring.model.saved import as_json, from_json
 from fantwin.scoring.wear.wear_monitor import WearMonitor
-from fantwin.stages.scorer import ScorerCore
 from tests.support.scored_blocks import (
     EPOCH_NS,
     core_of,
@@ -112,8 +112,8 @@ def test_in_a_storm_of_alarms_a_large_tray_takes_its_snapshots_one_after_a_rest(
 def test_without_events_there_is_a_snapshot_after_a_time_and_at_slow_rates_after_a_number_of_samples(
     period_ns: int, apart_s: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("fantwin.stages.scorer.SNAPSHOT_PERIOD_NS", 6 * NS_PER_S)
-    monkeypatch.setattr("fantwin.stages.scorer.SNAPSHOT_PERIOD_SAMPLES", 30)
+    monkeypatch.setattr("fantwin.pipeline.tray_scoring.scorer_core.SNAPSHOT_PERIOD_NS", 6 * NS_PER_S)
+    monkeypatch.setattr("fantwin.pipeline.tray_scoring.scorer_core.SNAPSHOT_PERIOD_SAMPLES", 30)
     scorer, taken_ns, samples = core_of(), list[int](), NS_PER_S // period_ns
     for second in range(3 * apart_s):
         made = scorer.step(prediction_of(np.full(samples, 0.1), first=second * samples, period_ns=period_ns))

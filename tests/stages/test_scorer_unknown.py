@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from fantwin.pipeline.tray_scoring.scorer_core import ScorerCore
 from fantwin.schemas.enums import Action, FanState, InvalidReason, Transition
 from fantwin.schemas.messages import Alarm, Score
 from fantwin.schemas.standstill import Standstill
 from fantwin.schemas.tacho import Tacho
 from fantwin.scoring.model.healthy import RISE
-from fantwin.stages.scorer import ScorerCore
 from tests.support.scored_blocks import NEEDED, TWIN_SPEED, core_of, prediction_of, request_of
 
 STANDS = Standstill(

@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 
 from fantwin.pipeline.tray_scoring.healthy_twin import known_of
 from fantwin.pipeline.tray_scoring.scorer_config import ScorerConfig
+from fantwin.pipeline.tray_scoring.scorer_core import ScorerCore
 from fantwin.schemas.blocks import cut
 from fantwin.schemas.enums import FanState, InvalidReason, Transition
 from fantwin.schemas.messages import Alarm, Grid, Prediction, Score
 from fantwin.schemas.reference_conditions import ReferenceConditions
 from fantwin.schemas.standstill import Standstill
 from fantwin.scoring.alarms.current_alarms import current_alarm
-from fantwin.stages.scorer import ScorerCore
 from tests.support.integrated_twins import core_of, physical_twin, run_freely
 
 pytestmark = pytest.mark.usefixtures("one_reading_starts")

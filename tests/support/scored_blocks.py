@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from fantwin.pipeline.tray_scoring.healthy_twin import HealthyTwin
 from fantwin.pipeline.tray_scoring.scorer_config import ScorerConfig
+from fantwin.pipeline.tray_scoring.scorer_core import ScorerCore
 from fantwin.pipeline.tray_scoring.snapshot_store import SnapshotStore
 from fantwin.schemas.enums import Action, InvalidReason
 from fantwin.schemas.header import Header
@@ -22,7 +23,6 @@ from fantwin.schemas.tacho import INSTANTANEOUS, Tacho, tacho_of_each_fan
 from fantwin.schemas.units import SpeedUnit
 from fantwin.scoring.diagnosis.ranked_causes import Advice, SteadyFan
 from fantwin.scoring.model.operation import Fans
-from fantwin.stages.scorer import ScorerCore
 
 EPOCH_NS = 1_700_000_000_000_000_000
 STEP_NS = 10_000_000
