@@ -3,7 +3,9 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import reduce
 from importlib.metadata import PackageNotFoundError, version
+from operator import add
 from pathlib import Path
 
 import numpy as np
@@ -12,21 +14,14 @@ from fantwin.schemas.model_uncertainty import ModelUncertainty
 from fantwin.schemas.reference_conditions import ReferenceConditions
 from fantwin.schemas.standstill import Standstill
 from fantwin.schemas.tacho import Tacho
-from fantwin.schemas.twin_card import (
-    DataCard,
-    DriveCard,
-    TrainingCard,
-    TwinCard,
-    ValidationCard,
-)
+from fantwin.schemas.twin_card import DataCard, DriveCard, TrainingCard, TwinCard, ValidationCard
 from fantwin.twin.errors import TwinError
 from fantwin.twin.evaluation.accuracy import (
     Evaluation,
     UnseenStd,
     evaluation_pieces,
-    free_run_readings,
-    residuals_of_readings,
-    sums_of_readings,
+    figure_sums,
+    free_run_of_piece,
 )
 from fantwin.twin.evaluation.reading_range import reading_sigma_rad_s
 from fantwin.twin.evaluation.residual_analysis import finite_or_none, healthy_residual
@@ -88,8 +83,8 @@ def finish_twin(
     judged = validation_runs or runs
     progress("evaluation", 0, 0, np.nan)
     pieces = evaluation_pieces(judged)
-    expected = [free_run_readings(model, parameters, piece) for piece in pieces]
-    sigma_rad_s, healthy = healthy_residual(residuals_of_readings(pieces, expected), pieces)
+    free_runs = [free_run_of_piece(model, parameters, piece) for piece in pieces]
+    sigma_rad_s, healthy = healthy_residual(np.concatenate([each.residual_rad_s for each in free_runs]), pieces)
     unmeasured = np.flatnonzero(sigma_rad_s == 0.0)
     if unmeasured.size:
         where = "held-out" if validation_runs else "training"
@@ -102,7 +97,8 @@ def finish_twin(
             f"the {model.kind} model of {name!r} diverges when run freely; record more levels, or try another kind"
         )
     unseen_std = unseen_std_of(uncertainty, drive.card if drive else None)
-    validation = sums_of_readings(model, parameters, sigma_rad_s, pieces, expected, unseen_std).evaluation()
+    sums = (figure_sums(model, parameters, sigma_rad_s, each, unseen_std) for each in free_runs)
+    validation = reduce(add, sums).evaluation()
     progress("torque balance", 0, 0, np.nan)
     if drive is None:
         balance = fit_balance(runs, validation_runs, identification)

@@ -9,8 +9,10 @@ and R2 are equations (32) to (34) of Peng and Chen, the band of two sigma (35) a
 """
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import reduce
+from operator import add
 
 import numpy as np
 from numpy.typing import NDArray
@@ -112,45 +114,35 @@ class FigureSums:
         )
 
 
+@dataclass(frozen=True, eq=False)
+class FreeRun:
+    """A piece of a run beside the free run of a model, (n, fans) in rad/s. expected: the readings that its tachos would
+    show, not finite where it diverged. residual: measured minus that, NaN where nothing is compared
+    (compared_readings), infinite where the free run diverged."""
+
+    piece: Run
+    expected_rad_s: Array
+    residual_rad_s: Array
+
+
 def sums_of_model(
     model: TwinModel, parameters: Array, sigma_rad_s: Array, runs: Sequence[Run], unseen_std: UnseenStd | None = None
 ) -> FigureSums:
     """What the figures on runs are made of. parameters: (fans, 4). sigma_rad_s: (fans,) healthy standard deviation of
     the free run: the band has this and the unseen error, as that of a running site."""
-    pieces = evaluation_pieces(runs)
-    expected = (free_run_readings(model, parameters, piece) for piece in pieces)
-    return sums_of_readings(model, parameters, sigma_rad_s, pieces, expected, unseen_std)
-
-
-def sums_of_readings(
-    model: TwinModel,
-    parameters: Array,
-    sigma_rad_s: Array,
-    pieces: Sequence[Run],
-    expected: Iterable[Array],
-    unseen_std: UnseenStd | None = None,
-) -> FigureSums:
-    """The sums over pieces. expected: of each piece, as of figure_sums. The others as of sums_of_model."""
-    first, *others = (
-        figure_sums(model, parameters, sigma_rad_s, piece, its, unseen_std)
-        for piece, its in zip(pieces, expected, strict=True)
-    )
-    return sum(others, first)
+    free_runs = (free_run_of_piece(model, parameters, piece) for piece in evaluation_pieces(runs))
+    return reduce(add, (figure_sums(model, parameters, sigma_rad_s, each, unseen_std) for each in free_runs))
 
 
 def figure_sums(
-    model: TwinModel,
-    parameters: Array,
-    sigma_rad_s: Array,
-    piece: Run,
-    expected: Array,
-    unseen_std: UnseenStd | None = None,
+    model: TwinModel, parameters: Array, sigma_rad_s: Array, free_run: FreeRun, unseen_std: UnseenStd | None = None
 ) -> FigureSums:
-    """The sums over one piece. expected: (n, fans) as free_run_readings gives them. The others as of sums_of_model."""
+    """The sums over one piece. The others as of sums_of_model."""
+    piece, expected = free_run.piece, free_run.expected_rad_s
     speed = compared_readings(piece)
     measured = np.isfinite(speed)
     count = measured.sum(axis=0, dtype=np.float64)
-    errors = np.where(measured, _residual(speed, expected), 0.0)
+    errors = np.where(measured, free_run.residual_rad_s, 0.0)
     with np.errstate(invalid="ignore", over="ignore"):
         noise = measurement_of(piece).noise_rad_s(expected)
         std = np.hypot(sigma_rad_s, np.nan_to_num(unseen_std(expected, piece.command))) if unseen_std else sigma_rad_s
@@ -204,26 +196,16 @@ def free_run_readings(model: TwinModel, parameters: Array, piece: Run) -> Array:
     return measurement_of(piece).of_speed(free_run_speeds(model, parameters, piece))
 
 
+def free_run_of_piece(model: TwinModel, parameters: Array, piece: Run) -> FreeRun:
+    """Run a model freely over a piece."""
+    expected, measured = free_run_readings(model, parameters, piece), compared_readings(piece)
+    diverged = np.isfinite(measured) & ~np.isfinite(expected)
+    return FreeRun(piece, expected, np.where(diverged, np.inf, measured - expected))
+
+
 def free_run_residuals(model: TwinModel, parameters: Array, pieces: Sequence[Run]) -> Array:
-    """(samples, fans) reading minus that of the free run over pieces one after the other.
-
-    NaN where there is nothing to compare (compared_readings), infinite where the free run diverged.
-    """
-    return residuals_of_readings(pieces, [free_run_readings(model, parameters, piece) for piece in pieces])
-
-
-def residuals_of_readings(pieces: Sequence[Run], expected: Sequence[Array]) -> Array:
-    """free_run_residuals of pieces whose free_run_readings are `expected`."""
-    return np.concatenate(
-        [_residual(compared_readings(piece), its) for piece, its in zip(pieces, expected, strict=True)]
-    )
-
-
-def healthy_sigma_rad_s(residual: Array) -> Array:
-    """(fans,) root mean square of the healthy free-run residual (samples, fans): the band is centred on the twin."""
-    count = np.maximum(np.isfinite(residual).sum(axis=0), 1)
-    with np.errstate(over="ignore"):
-        return np.sqrt(np.nansum(residual**2, axis=0) / count)
+    """(samples, fans) residual of the free runs over pieces one after the other, as of FreeRun."""
+    return np.concatenate([free_run_of_piece(model, parameters, piece).residual_rad_s for piece in pieces])
 
 
 def pooled_rmse_rad_s(residual: Array) -> float:
@@ -314,8 +296,3 @@ def _advance_side_by_side(model: TwinModel, states: Array, command: Array, step_
         _, ends = model.advance(together, command[same].reshape(1, -1), step_s[same][:1], everyone)
         following[same] = ends.reshape(count, *states.shape[1:])
     return following
-
-
-def _residual(measured: Array, predicted: Array) -> Array:
-    diverged = np.isfinite(measured) & ~np.isfinite(predicted)
-    return np.where(diverged, np.inf, measured - predicted)

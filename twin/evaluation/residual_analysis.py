@@ -13,6 +13,8 @@ summed one by one (ResidualSums), wherever they are.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import reduce
+from operator import add
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +22,7 @@ from scipy.fft import next_fast_len
 from scipy.special import chdtrc
 
 from fantwin.schemas.twin_card import HealthyCard
-from fantwin.twin.evaluation.accuracy import healthy_sigma_rad_s, sums_by_fan
+from fantwin.twin.evaluation.accuracy import sums_by_fan
 from fantwin.twin.runs import Array, Run
 
 Spectrum = NDArray[np.complex128]
@@ -144,8 +146,7 @@ def residual_sums(
     settled = _settled(residual_rad_s, pieces, settling_s)
     ends = np.cumsum([piece.samples for piece in pieces])
     parts = np.split(settled, ends[:-1])
-    first, *others = (_sums_of_piece(part, piece, grid) for part, piece in zip(parts, pieces, strict=True))
-    return sum(others, first)
+    return reduce(add, (_sums_of_piece(part, piece, grid) for part, piece in zip(parts, pieces, strict=True)))
 
 
 def _sums_of_piece(settled: Array, piece: Run, grid: ResidualGrid) -> ResidualSums:
@@ -208,7 +209,9 @@ def analysis_of(sums: ResidualSums, grid: ResidualGrid) -> tuple[ResidualAnalysi
 def healthy_residual(residual_rad_s: Array, pieces: Sequence[Run]) -> tuple[Array, HealthyCard]:
     """Healthy standard deviation (fans,), rad/s, and the healthy residual for a card. Arguments as of residual_sums."""
     settled = _settled(residual_rad_s, pieces, SETTLING_S)
-    sigma_rad_s = healthy_sigma_rad_s(settled)
+    count = np.maximum(np.isfinite(settled).sum(axis=0), 1)
+    with np.errstate(over="ignore"):  # a root mean square, for the band is centred on the twin
+        sigma_rad_s = np.sqrt(np.nansum(settled**2, axis=0) / count)
     analyses = analyse_residual(residual_rad_s, pieces)
     with np.errstate(invalid="ignore", divide="ignore"):
         in_sigma = np.abs(settled) / sigma_rad_s

@@ -50,7 +50,6 @@ def minimise(
     problem: LeastSquaresProblem[P],
     point: P,
     max_iterations: int,
-    *,
     tolerance: float,
     accepted: Callable[[int, P], bool],
     iteration: int = 0,

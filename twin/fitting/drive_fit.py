@@ -24,7 +24,7 @@ from fantwin.schemas.twin_card import DriveCard
 from fantwin.twin.errors import TwinError
 from fantwin.twin.fitting.damped_least_squares import Flags, minimise
 from fantwin.twin.fitting.free_run_fit import ERROR_ROUNDS
-from fantwin.twin.fitting.free_run_problem import INERTIA, FreeRunProblem, Point, Prior, Unknowns
+from fantwin.twin.fitting.free_run_problem import INERTIA, FreeRunProblem, Point, Unknowns
 from fantwin.twin.fitting.identification import Identification
 from fantwin.twin.fitting.trajectories import MAX_SAMPLES, Trajectories, cut_into_trajectories, practical_samples
 from fantwin.twin.models.drive import DRIVE_PARAMETERS, Drive
@@ -49,6 +49,7 @@ FIRST_PLATEAU, FIRST_KICK = 0.05, 0.5
 """shares of the range of commands above the lowest that turns the fans"""
 LOWEST, FRICTION, KICK = (LAG + index for index in range(len(DRIVE_PARAMETERS)))
 UNKNOWNS = LAG + len(DRIVE_PARAMETERS)
+NO_WEIGHTS = np.zeros(0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,13 +142,13 @@ def find_drive(
     def steadied(drive: Drive, unknowns: Array, free: Flags) -> Array:
         problem = behind(drive)
         for _ in range(ERROR_ROUNDS):
-            problem.learn_errors(problem.point(unknowns))
+            problem.learn_errors(problem.point(NO_WEIGHTS, unknowns))
             unknowns, _ = problem.fit(unknowns, free & steady, MORE_ITERATIONS, iteration_done)
         return unknowns
 
     final, of_friction = steadied(drive, best, everything), steadied(never, of_friction, without)
     with_drive, friction_alone = behind(drive, judged), behind(never, judged)
-    with_drive.learn_errors(with_drive.point(final))
+    with_drive.learn_errors(with_drive.point(NO_WEIGHTS, final))
     friction_alone.errors = with_drive.errors
     if not with_drive.mean_square(final) < (1.0 - LEAST_GAIN) ** 2 * friction_alone.mean_square(of_friction):
         return None
@@ -181,17 +182,10 @@ class _Problem(FreeRunProblem):
     """The free run of fans behind one drive. Physics unknowns (fans, 6): ln J, two ln dampings, DRIVE_PARAMETERS."""
 
     def __init__(self, runs: _Runs, drive: Drive, top_speed_rad_s: Array, highest_command: float) -> None:
-        nothing = Prior(0.0, np.zeros(UNKNOWNS), np.zeros((len(top_speed_rad_s), UNKNOWNS)))
         everything = np.ones(UNKNOWNS, np.bool_)
-        super().__init__(PhysicalModel(), runs.data, top_speed_rad_s, everything, nothing, estimate_initial_speed=False)
+        super().__init__(PhysicalModel(), runs.data, top_speed_rad_s, everything, estimate_initial_speed=False)
         self._drive, self._share = drive, runs.kick(drive)
         self._highest_command = highest_command
-
-    def point(self, physics: Array) -> Point:
-        """The candidate with these unknowns."""
-        data = self.trajectories
-        unknowns = Unknowns(np.zeros(0), physics, data.starting_speed_rad_s())
-        return self.evaluate(unknowns, data.interpolated_speed_rad_s())
 
     def fit(
         self, physics: Array, free: Flags, iterations: int, iteration_done: Callable[[], None]
@@ -203,13 +197,13 @@ class _Problem(FreeRunProblem):
             iteration_done()
             return False
 
-        start = self.rescaled(self.point(physics))
-        point, _, _ = minimise(self, start, iterations, tolerance=0.0, accepted=accepted)
+        start = self.rescaled(self.point(NO_WEIGHTS, physics))
+        point, _, _ = minimise(self, start, iterations, 0.0, accepted)
         return point.unknowns.physics, self._mean_square(point)
 
     def mean_square(self, physics: Array) -> float:
         """Mean square of the residual of all fans, (rad/s)^2."""
-        return self._mean_square(self.point(physics))
+        return self._mean_square(self.point(NO_WEIGHTS, physics))
 
     def _mean_square(self, point: Point) -> float:
         return float(np.sum(point.residual**2) / np.count_nonzero(self.trajectories.compared))

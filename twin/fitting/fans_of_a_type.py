@@ -8,7 +8,7 @@ is taken as typical. The standard errors are those of the quadratic at the mode.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -100,14 +100,11 @@ def place_fans(
     free = ALL_FREE.copy()
     free[LAG] = of_type.std[LAG] > 0.0
     precision = np.where(free, correlated_samples / np.where(free, of_type.std, 1.0) ** 2, 0.0)
-    prior = Prior(0.0, precision, typical)
-    model = _FixedNetwork(fixed_network=network)
-
-    found = fit_physics(
-        model, typical, top_speed_rad_s, stretches, free=free, prior=prior, part="placing", progress=progress
+    problem = FreeRunProblem(
+        _FixedNetwork(fixed_network=network), stretches, top_speed_rad_s, free, Prior(0.0, precision, typical)
     )
-    problem = FreeRunProblem(model, stretches, top_speed_rad_s, free, prior)
-    of_unknowns = _covariance(problem, found, correlated_samples)
+    found = fit_physics(problem, typical, "placing", progress)
+    of_unknowns = _covariance(replace(problem, free=free), found, correlated_samples)
     unknowns = found.point.unknowns.physics
     chain = parameters_by_unknowns(unknowns, top_speed_rad_s)
     parameters = physical_parameters(unknowns, top_speed_rad_s)
@@ -116,7 +113,7 @@ def place_fans(
         covariance=chain @ of_unknowns @ chain.transpose(0, 2, 1),
         degrees_of_freedom=np.full(parameters.shape, np.inf),
         lambda_per_s=np.full(fans, np.nan),
-        rmse_rad_s=found.rmse_of_fans_rad_s(stretches),
+        rmse_rad_s=stretches.rms_of_fans(found.error_rad_s),
         time_constant_s=physics.time_constant_s(typical_speed, parameters),
         top_speed_rad_s=top_speed_rad_s,
         iterations=found.iterations,

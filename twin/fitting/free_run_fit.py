@@ -17,14 +17,11 @@ shared weights every fan is a group of its own.
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-
-import numpy as np
+from functools import partial
 
 from fantwin.twin.fitting.damped_least_squares import minimise
-from fantwin.twin.fitting.free_run_problem import OF_STEADY_SPEEDS, Flags, FreeRunProblem, Point, Prior, Unknowns
+from fantwin.twin.fitting.free_run_problem import OF_STEADY_SPEEDS, FreeRunProblem, Point, Unknowns
 from fantwin.twin.fitting.reading_errors import counts
-from fantwin.twin.fitting.trajectories import Trajectories
-from fantwin.twin.models.fan_ode import FanOde
 from fantwin.twin.progress import Progress
 from fantwin.twin.runs import Array
 
@@ -41,49 +38,32 @@ class FreeRunFit:
     error_rad_s: Array
     iterations: int
 
-    def rmse_of_fans_rad_s(self, trajectories: Trajectories) -> Array:
-        """(fans,) the same of each fan of the trajectories."""
-        fans = len(trajectories.tacho)
-        squares = np.bincount(trajectories.fan, np.sum(self.error_rad_s**2, axis=0), fans)
-        return np.sqrt(squares / np.bincount(trajectories.fan, trajectories.compared.sum(axis=0), fans))
-
 
 IterationDone = Callable[[int, Unknowns, float], bool]
 """Called with iteration, unknowns and rmse in rad/s after each accepted step; true stops the fit."""
 
 
 def fit_free_run(
-    model: FanOde,
+    problem: FreeRunProblem,
     physics: Array,
-    top_speed_rad_s: Array,
-    trajectories: Trajectories,
     *,
-    free: Flags,
-    prior: Prior,
     max_iterations: int,
     tolerance: float = 1e-5,
-    estimate_initial_speed: bool = True,
     with_errors: bool = False,
     iteration_done: IterationDone | None = None,
 ) -> FreeRunFit:
     """Fit the weights of the model, where it has any, starting from its own, and the free ones of the physics unknowns.
 
-    physics: (fans, 4) to start from. top_speed_rad_s: (fans,). free: (4,) or (fans, 4).
-    estimate_initial_speed: otherwise the first measured speeds are used, as in operation; an unstable equilibrium
-    then cannot be hidden by an initial speed that happens to lie on it. with_errors: readings of tachos that count are
-    taken with the errors that they have in the free run of each round (twin.fitting.reading_errors); inertia and lag
-    are held, for what shows them then counts little. It stops when a step lowers the cost by less than tolerance,
-    relative, or when none lowers it.
+    physics: (fans, 4) to start from. with_errors: readings of tachos that count are taken with the errors that they
+    have in the free run of each round (twin.fitting.reading_errors); inertia and lag are held, for what shows them then
+    counts little. It stops when a step lowers the cost by less than tolerance, relative, or when none lowers it.
     """
-    problem = FreeRunProblem(model, trajectories, top_speed_rad_s, free, prior, estimate_initial_speed)
 
     def accepted(iteration: int, point: Point) -> bool:
         return iteration_done is not None and iteration_done(iteration, point.unknowns, problem.rmse_rad_s(point))
 
-    start = Unknowns(model.theta, physics, trajectories.starting_speed_rad_s())
-    point = problem.evaluate(start, trajectories.interpolated_speed_rad_s())
-    iteration = 0
-    learns_errors = with_errors and counts(trajectories)
+    point, iteration = problem.point(problem.model.theta, physics), 0
+    learns_errors = with_errors and counts(problem.trajectories)
     if learns_errors:
         problem.free = problem.free & OF_STEADY_SPEEDS
     for _ in range(ERROR_ROUNDS if learns_errors else SCALE_ROUNDS):
@@ -91,53 +71,26 @@ def fit_free_run(
             problem.learn_errors(point)
             point = problem.evaluate(point.unknowns, point.speed_rad_s)
         point, iteration, stopped = minimise(
-            problem,
-            problem.rescaled(point),
-            max_iterations,
-            tolerance=tolerance,
-            accepted=accepted,
-            iteration=iteration,
+            problem, problem.rescaled(point), max_iterations, tolerance, accepted, iteration
         )
         if stopped:
             break
     return FreeRunFit(point, problem.rmse_rad_s(point), point.residual / problem.errors.weight, iteration)
 
 
-def fit_physics(
-    model: FanOde,
-    physics: Array,
-    top_speed_rad_s: Array,
-    trajectories: Trajectories,
-    *,
-    free: Flags,
-    prior: Prior,
-    part: str,
-    progress: Progress,
-) -> FreeRunFit:
+def fit_physics(problem: FreeRunProblem, physics: Array, part: str, progress: Progress) -> FreeRunFit:
     """Fit the physics of each fan alone; where a tacho counts, again with the errors of readings that this fit shows.
 
-    part: the name of this work in reports of progress. The other arguments are those of fit_free_run.
+    physics: (fans, 4) to start from. part: the name of this work in reports of progress.
     """
 
     def iteration_done(iteration: int, _unknowns: Unknowns, rmse_rad_s: float) -> bool:
         progress(part, iteration, MOST_ITERATIONS_OF_PHYSICS, rmse_rad_s)
         return False
 
-    def fitted(start: Array, *, with_errors: bool) -> FreeRunFit:
-        return fit_free_run(
-            model,
-            start,
-            top_speed_rad_s,
-            trajectories,
-            free=free,
-            prior=prior,
-            max_iterations=MOST_ITERATIONS_OF_PHYSICS,
-            with_errors=with_errors,
-            iteration_done=iteration_done,
-        )
-
-    fit = fitted(physics, with_errors=False)
-    if not counts(trajectories):
+    fitted = partial(fit_free_run, max_iterations=MOST_ITERATIONS_OF_PHYSICS, iteration_done=iteration_done)
+    fit = fitted(problem, physics)
+    if not counts(problem.trajectories):
         return fit
-    weighted = fitted(fit.point.unknowns.physics, with_errors=True)
+    weighted = fitted(problem, fit.point.unknowns.physics, with_errors=True)
     return replace(weighted, iterations=fit.iterations + weighted.iterations)

@@ -1,7 +1,7 @@
 """The errors of a free run as a sum of losses, its normal equations and their damped steps: see free_run_fit."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -41,24 +41,6 @@ class Unknowns:
 
 
 @dataclass(frozen=True, eq=False)
-class Prior:
-    """Quadratic pulls, in units of squared scaled residuals: weights towards zero, the physics towards
-    physics_mean.
-
-    physics: (4,). physics_mean: (fans, 4). network: pulls the acceleration of the network towards a
-    given one where there are no data, or None. limits_steps: the damping of a step counts the pulls on the weights like
-    the data. Without, a weight of which the data show nothing goes all the way at once, however large the damping, and
-    a fit from a good start may find no step that is better.
-    """
-
-    weights: float
-    physics: Array
-    physics_mean: Array
-    network: "NetworkPrior | None" = None
-    limits_steps: bool = False
-
-
-@dataclass(frozen=True, eq=False)
 class NetworkPrior:
     """Virtual observations of the network: at speed_rad_s and command (k,) it gives acceleration_rad_s2 (k,).
 
@@ -83,6 +65,27 @@ class NetworkPrior:
 
 
 @dataclass(frozen=True, eq=False)
+class Prior:
+    """Quadratic pulls, in units of squared scaled residuals: weights towards zero, the physics towards
+    physics_mean.
+
+    physics: (4,). physics_mean: (fans, 4). network: pulls the acceleration of the network towards a
+    given one where there are no data, or None. limits_steps: the damping of a step counts the pulls on the weights like
+    the data. Without, a weight of which the data show nothing goes all the way at once, however large the damping, and
+    a fit from a good start may find no step that is better.
+    """
+
+    weights: float
+    physics: Array
+    physics_mean: Array
+    network: NetworkPrior | None = None
+    limits_steps: bool = False
+
+
+NO_PRIOR = Prior(0.0, np.zeros(1), np.zeros(1))
+
+
+@dataclass(frozen=True, eq=False)
 class Point:
     """A candidate: its free run; the residual of its readings (n, batch), each less its expected error and times its
     weight (ReadingErrors), zero where nothing is compared; and its cost (fans,) without the prior.
@@ -94,30 +97,34 @@ class Point:
     cost: Array
 
 
+@dataclass(eq=False)
 class FreeRunProblem:
-    """The sum of losses and its normal equations for one set of trajectories."""
+    """The sum of losses and its normal equations for one set of trajectories.
 
-    def __init__(
-        self,
-        model: FanOde,
-        trajectories: Trajectories,
-        top_speed_rad_s: Array,
-        free: Flags,
-        prior: Prior,
-        estimate_initial_speed: bool = True,
-    ) -> None:
-        self.model = model
-        self.trajectories = trajectories
-        self.top_speed_rad_s = top_speed_rad_s
-        self.free = free
-        self.prior = prior
-        self.estimate_initial_speed = estimate_initial_speed
-        self.fans = len(top_speed_rad_s)
-        self.weights = len(model.theta)
+    top_speed_rad_s: (fans,). free: (4,) or (fans, 4), the physics unknowns that are fitted. estimate_initial_speed:
+    otherwise the first measured speeds are used, as in operation; an unstable equilibrium then cannot be hidden by an
+    initial speed that happens to lie on it. scale_rad_s, errors: what is known of the errors so far.
+    """
+
+    model: FanOde
+    trajectories: Trajectories
+    top_speed_rad_s: Array
+    free: Flags = field(default_factory=NONE_FREE.copy)
+    prior: Prior = NO_PRIOR
+    estimate_initial_speed: bool = True
+
+    def __post_init__(self) -> None:
+        self.fans, self.weights = len(self.top_speed_rad_s), len(self.model.theta)
         self.groups = 1 if self.weights else self.fans
         self.group_of_fan = np.zeros(self.fans, dtype=np.intp) if self.weights else np.arange(self.fans)
         self.scale_rad_s = np.ones(self.fans)
-        self.errors = ReadingErrors.unknown(trajectories.command.shape)
+        self.errors = ReadingErrors.unknown(self.trajectories.command.shape)
+
+    def point(self, weights: Array, physics: Array) -> Point:
+        """The candidate with these unknowns whose free runs start from the first measured speeds."""
+        data = self.trajectories
+        unknowns = Unknowns(weights, physics, data.starting_speed_rad_s())
+        return self.evaluate(unknowns, data.interpolated_speed_rad_s())
 
     def evaluate(self, unknowns: Unknowns, guess_rad_s: Array) -> Point:
         """The free run of these unknowns. guess_rad_s: (n, batch), speeds nearby."""
@@ -193,7 +200,7 @@ class FreeRunProblem:
         """The trajectories that are differentiated at once: with as many derivatives as a cache holds, or where these
         are of few trajectories, as many as memory should."""
         steps, batch = self.trajectories.command.shape
-        numbers = steps * (self.weights + self.prior.physics_mean.shape[1] + 1)
+        numbers = steps * (self.weights + self.free.shape[-1] + 1)
         fast = FAST_CHUNK_NUMBERS // numbers // ALIGNED_COLUMNS * ALIGNED_COLUMNS
         width = fast or max(1, MAX_CHUNK_NUMBERS // numbers)
         return (slice(first, first + width) for first in range(0, batch, width))

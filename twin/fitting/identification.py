@@ -21,14 +21,14 @@ Annals of Statistics 9 (1981).
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import t as student_t
 
 from fantwin.twin.errors import TwinError
+from fantwin.twin.fitting.damped_least_squares import Flags
 from fantwin.twin.fitting.filtering import filtered_regression
 from fantwin.twin.fitting.free_run_fit import FreeRunFit, fit_physics
 from fantwin.twin.fitting.free_run_problem import ALL_FREE, FreeRunProblem, Prior
@@ -43,7 +43,7 @@ from fantwin.twin.fitting.trajectories import Trajectories, cut_into_trajectorie
 from fantwin.twin.measurement import with_measured_command
 from fantwin.twin.models import physics
 from fantwin.twin.models.integration import free_run
-from fantwin.twin.models.physical import PhysicalModel, fitted_unknowns, parameters_by_unknowns, physical_parameters
+from fantwin.twin.models.physical import PhysicalModel, fitted_unknowns, physical_parameters
 from fantwin.twin.models.physics import LAG, PARAMETER_NAMES
 from fantwin.twin.models.right_hand_side import FanEquation
 from fantwin.twin.progress import Progress, unreported
@@ -122,7 +122,9 @@ def identify(runs: Sequence[Run], *, progress: Progress = unreported) -> Identif
         fit, covariance, freedom = _refine(without, free, top_speed, trajectories, part, progress, start)
         iterations += fit.iterations
     parameters = physical_parameters(fit.point.unknowns.physics, top_speed)
-    rmse_rad_s = fit.rmse_of_fans_rad_s(trajectories)
+    rmse_rad_s = trajectories.rms_of_fans(fit.error_rad_s)
+    measurement = trajectories.measurement
+    noise_rad_s = measurement.noise_rad_s(measurement.of_speed(fit.point.speed_rad_s))  # about a perfect model
     time_constant_s = _positive(physics.time_constant_s(speed, parameters), pieces)
     progress("identification: checks", 0, 0, np.nan)
     return Identification(
@@ -138,7 +140,7 @@ def identify(runs: Sequence[Run], *, progress: Progress = unreported) -> Identif
             *short_warnings(pieces, time_constant_s),
             *identifiability_warnings(runs, parameters, covariance),
         ),
-        misfits=misfit_warnings(pieces, rmse_rad_s, _floor_rad_s(fit, trajectories, fans)),
+        misfits=misfit_warnings(pieces, rmse_rad_s, trajectories.rms_of_fans(noise_rad_s)),
     )
 
 
@@ -247,7 +249,7 @@ def _free_run_errors(candidates: Array, trajectories: Trajectories) -> Array:
 
 def _refine(
     start: Array,
-    free: NDArray[np.bool_],
+    free: Flags,
     top_speed_rad_s: Array,
     trajectories: Trajectories,
     part: str,
@@ -255,21 +257,11 @@ def _refine(
     anchor: Array | None = None,
 ) -> tuple[FreeRunFit, Array, Array]:
     """The fit of the free run from parameters (fans, 4), and what _covariance says of it. part: its name in reports."""
-    fans = len(start)
-    start_physics = fitted_unknowns(start, top_speed_rad_s)
-    pull = inertia_anchor(np.count_nonzero(trajectories.compared) / fans)
-    prior = Prior(0.0, pull, start_physics if anchor is None else fitted_unknowns(anchor, top_speed_rad_s))
-    fit = fit_physics(
-        PhysicalModel(),
-        start_physics,
-        top_speed_rad_s,
-        trajectories,
-        free=free,
-        prior=prior,
-        part=part,
-        progress=progress,
-    )
-    return fit, *_covariance(fit, free, top_speed_rad_s, trajectories, prior)
+    pull = inertia_anchor(np.count_nonzero(trajectories.compared) / len(start))
+    held_to = fitted_unknowns(start if anchor is None else anchor, top_speed_rad_s)
+    problem = FreeRunProblem(PhysicalModel(), trajectories, top_speed_rad_s, free, Prior(0.0, pull, held_to))
+    fit = fit_physics(problem, fitted_unknowns(start, top_speed_rad_s), part, progress)
+    return fit, *_covariance(fit, replace(problem, free=free))
 
 
 def inertia_anchor(samples: float) -> Array:
@@ -279,9 +271,7 @@ def inertia_anchor(samples: float) -> Array:
     return pull
 
 
-def _covariance(
-    fit: FreeRunFit, free: NDArray[np.bool_], top_speed_rad_s: Array, trajectories: Trajectories, prior: Prior
-) -> tuple[Array, Array]:
+def _covariance(fit: FreeRunFit, problem: FreeRunProblem) -> tuple[Array, Array]:
     """Covariance (fans, 4, 4) of J, alpha, C_D, lag_s by the block jackknife, zero where one is held, and its degrees
     of freedom (fans, 4).
 
@@ -289,7 +279,7 @@ def _covariance(
     the variance of a sum of squares d_b^2 of normal moves is 2/3 of sum d_b^4, and a
     chi-square with that variance has 3 (sum d_b^2)^2 / sum d_b^4 of them (Satterthwaite, Biometrics Bulletin 2, 1946).
     """
-    problem = FreeRunProblem(PhysicalModel(), trajectories, top_speed_rad_s, free, prior)
+    trajectories = problem.trajectories
     problem.scale_rad_s = robust_scale(fit.error_rad_s, trajectories)
     everything = slice(None)
     sensitivity = problem.sensitivities(fit.point, everything)
@@ -298,11 +288,11 @@ def _covariance(
     weighted_initial = weight[:, :, np.newaxis] * by_initial
     overlap = np.sum(weighted_initial * sensitivity[:, :, :-1], axis=0) / np.sum(weighted_initial * by_initial, axis=0)
     slopes_of_all = sensitivity[:, :, :-1] - by_initial * overlap
-    chain = parameters_by_unknowns(fit.point.unknowns.physics, top_speed_rad_s)
+    chain = problem.parameters_by_unknowns(fit.point.unknowns)
     covariance = np.zeros((len(chain), len(PARAMETER_NAMES), len(PARAMETER_NAMES)))
     freedom = np.full((len(chain), len(PARAMETER_NAMES)), BLOCKS - 1.0)
     for fan in range(len(chain)):
-        columns, known = trajectories.fan == fan, np.flatnonzero(free[fan])
+        columns, known = trajectories.fan == fan, np.flatnonzero(problem.free[fan])
         # Stretches one after the other, so that a block is a piece of time.
         slopes = slopes_of_all[:, columns].transpose(1, 0, 2).reshape(-1, len(PARAMETER_NAMES))[:, known]
         weights, residual = weight[:, columns].T.ravel(), fit.error_rad_s[:, columns].T.ravel()
@@ -325,14 +315,6 @@ def _covariance(
         known = fourth > 0.0
         freedom[fan, known] = np.clip(3.0 * np.sum(moves**2, axis=0)[known] ** 2 / fourth[known], 2.0, BLOCKS - 1)
     return covariance, freedom
-
-
-def _floor_rad_s(fit: FreeRunFit, trajectories: Trajectories, fans: int) -> Array:
-    """(fans,) root mean square that the tachos would leave a perfect model."""
-    measurement, compared = trajectories.measurement, trajectories.compared
-    noise = measurement.noise_rad_s(measurement.of_speed(fit.point.speed_rad_s))
-    squares = np.bincount(trajectories.fan, np.sum(noise**2, axis=0, where=compared), fans)
-    return np.sqrt(squares / np.bincount(trajectories.fan, compared.sum(axis=0), fans))
 
 
 def _physical_basis(speed_rad_s: Array, command: Array) -> Array:

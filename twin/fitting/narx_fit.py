@@ -69,7 +69,7 @@ class OutputErrorFit:
 
         self.precision = prior_precision * self.prior_weight
         self.scale_rad_s = self._robust_scale(self._free_run(theta))
-        point, _, _ = minimise(self, self._candidate(theta), max_iterations, tolerance=TOLERANCE, accepted=accepted)
+        point, _, _ = minimise(self, self._candidate(theta), max_iterations, TOLERANCE, accepted)
         return point.theta
 
     def total(self, point: Candidate) -> Array:

@@ -28,13 +28,14 @@ import numpy as np
 from fantwin.twin.each_network import ForEachNetwork, one_after_another
 from fantwin.twin.evaluation.accuracy import evaluation_pieces
 from fantwin.twin.fitting.free_run_fit import FreeRunFit, fit_free_run
-from fantwin.twin.fitting.free_run_problem import NONE_FREE, FreeRunProblem, NetworkPrior, Point, Prior, Unknowns
+from fantwin.twin.fitting.free_run_problem import FreeRunProblem, NetworkPrior, Point, Prior, Unknowns
 from fantwin.twin.fitting.identification import Identification, inertia_anchor
 from fantwin.twin.fitting.initial_weights import PLACEMENTS, initial_weights
 from fantwin.twin.fitting.mean_of_networks import mean_model
 from fantwin.twin.fitting.reading_errors import counts, robust_scale
 from fantwin.twin.fitting.trajectories import (
     MAX_SAMPLES,
+    Trajectories,
     cut_into_trajectories,
     practical_samples,
     stretch_samples,
@@ -45,7 +46,7 @@ from fantwin.twin.models.fan_ode import NetworkOde
 from fantwin.twin.models.integration import WIDE_BATCH
 from fantwin.twin.models.network import Scaling
 from fantwin.twin.models.physical import PhysicalModel, fitted_unknowns, physical_parameters
-from fantwin.twin.models.physics import LAG, PARAMETER_NAMES
+from fantwin.twin.models.physics import LAG
 from fantwin.twin.progress import Progress, unreported
 from fantwin.twin.runs import Array, Run
 
@@ -138,23 +139,23 @@ class _Training:
         prior_std: float,
     ) -> None:
         slowest_s = float(identification.time_constant_s.max())
-        self._model = model
+        self.model = model
         self._all_pieces = evaluation_pieces(runs)
         factor = thinning_factor(self._all_pieces, slowest_s)
         self._pieces, self.is_thinned = windows_of(self._all_pieces, slowest_s), factor > 1
-        self._held_out = bool(validation_runs)
-        self._judged = windows_of(evaluation_pieces(validation_runs), slowest_s) if validation_runs else self._pieces
+        self.held_out = bool(validation_runs)
+        self.judged = windows_of(evaluation_pieces(validation_runs), slowest_s) if validation_runs else self._pieces
         self._identification = identification
-        self._top_speed_rad_s = identification.top_speed_rad_s
+        self.top_speed_rad_s = identification.top_speed_rad_s
         period_s = min(piece.median_period_s for piece in self._pieces)
         self._short = stretch_samples(slowest_s, period_s, SHORT_STRETCH_TIME_CONSTANTS)
         self._stretches = cut_into_trajectories(self._pieces, self._short)
-        self._physics = fitted_unknowns(identification.parameters, self._top_speed_rad_s)
-        self._free = np.ones(self._physics.shape, np.bool_)
+        self.physics = fitted_unknowns(identification.parameters, self.top_speed_rad_s)
+        self._free = np.ones(self.physics.shape, np.bool_)
         # A lag that identification has not found stays out of the model.
         self._free[:, LAG] &= identification.parameters[:, LAG] > 0.0
         pull = inertia_anchor(sum(piece.samples for piece in self._pieces) / factor)
-        self._prior = Prior(PRIOR_PRECISION, pull, self._physics, _network_prior(model, identification, prior_std))
+        self._prior = Prior(PRIOR_PRECISION, pull, self.physics, _network_prior(model, identification, prior_std))
 
     def starts(self, rng: np.random.Generator, count: int, progress: Progress) -> list[Unknowns]:
         """So many of them, each after a few steps with the physics as identified, best first."""
@@ -166,24 +167,17 @@ class _Training:
             progress("starting weights", done, START_ITERATIONS * count, rmse_rad_s)
             return False
 
-        for theta in initial_weights(self._model, self._pieces, self._identification, rng, count):
-            fit = fit_free_run(
-                self._model.with_theta(theta),
-                self._physics,
-                self._top_speed_rad_s,
-                few,
-                free=np.zeros_like(self._free),
-                prior=self._prior,
-                max_iterations=START_ITERATIONS,
-                iteration_done=iteration_done,
+        for theta in initial_weights(self.model, self._pieces, self._identification, rng, count):
+            problem = replace(self._problem(theta, few), free=np.zeros_like(self._free))
+            fits.append(
+                fit_free_run(problem, self.physics, max_iterations=START_ITERATIONS, iteration_done=iteration_done)
             )
-            fits.append(fit)
         ranked = sorted(fits, key=lambda fit: fit.rmse_rad_s if np.isfinite(fit.rmse_rad_s) else np.inf)
         return [fit.point.unknowns for fit in ranked]
 
     def continued(self, max_iterations: int, start: Unknowns, progress: Progress) -> _Trained:
         """A training from a start to its end."""
-        best_run = self._best_free_run(max_iterations, progress)
+        best_run = _BestFreeRun(self, max_iterations, progress)
         best_run.consider(start)
         best = start
         for data, share, estimate in (
@@ -191,15 +185,10 @@ class _Training:
             (cut_into_trajectories(self._pieces, practical_samples(self._pieces, MAX_SAMPLES)), 1.0, False),
         ):
             fit = fit_free_run(
-                self._model.with_theta(best.weights),
+                replace(self._problem(best.weights, data), estimate_initial_speed=estimate),
                 best.physics,
-                self._top_speed_rad_s,
-                data,
-                free=self._free,
-                prior=self._prior,
                 max_iterations=round(share * max_iterations) - best_run.iterations,
                 tolerance=TOLERANCE,
-                estimate_initial_speed=estimate,
                 with_errors=True,
                 iteration_done=best_run.iteration_done,
             )
@@ -209,8 +198,7 @@ class _Training:
 
     def model_of(self, unknowns: Unknowns) -> tuple[NetworkOde, Array]:
         """The model of these unknowns, and the parameters (fans, 4)."""
-        parameters = physical_parameters(unknowns.physics, self._top_speed_rad_s)
-        return self._model.with_theta(unknowns.weights), parameters
+        return self.model.with_theta(unknowns.weights), physical_parameters(unknowns.physics, self.top_speed_rad_s)
 
     def on_all_samples(self, trained: _Trained, progress: Progress) -> tuple[Unknowns, int]:
         """The last iterations of a training on windows, and their number; none where its network stayed silent.
@@ -221,7 +209,6 @@ class _Training:
         best = trained.best
         if not np.any(best.weights):
             return best, 0
-
         steps = itertools.count(1)
 
         def iteration_done(_iteration: int, _unknowns: Unknowns, rmse_rad_s: float) -> bool:
@@ -230,34 +217,22 @@ class _Training:
             return step == LAST_STEPS
 
         pull = inertia_anchor(sum(piece.samples for piece in self._all_pieces))
-        prior = replace(self._prior, physics=pull, limits_steps=True)
+        problem = self._problem(best.weights, cut_into_trajectories(self._all_pieces, self._short))
+        problem.prior = replace(self._prior, physics=pull, limits_steps=True)
         fit = fit_free_run(
-            self._model.with_theta(best.weights),
+            problem,
             best.physics,
-            self._top_speed_rad_s,
-            cut_into_trajectories(self._all_pieces, self._short),
-            free=self._free,
-            prior=prior,
             max_iterations=LAST_ITERATIONS,
             tolerance=TOLERANCE,
             with_errors=True,
             iteration_done=iteration_done,
         )
         found = fit.point.unknowns
-        loss = self._best_free_run(0, progress).loss_of(found)
+        loss = _BestFreeRun(self, 0, progress).loss_of(found)
         return found if loss <= MUCH_WORSE * trained.best_loss else best, fit.iterations
 
-    def _best_free_run(self, max_iterations: int, progress: Progress) -> "_BestFreeRun":
-        untrained = Unknowns(np.zeros_like(self._model.network.theta), self._physics, np.zeros(0))
-        return _BestFreeRun(
-            self._model,
-            untrained,
-            self._judged,
-            self._held_out,
-            self._top_speed_rad_s,
-            max_iterations,
-            progress,
-        )
+    def _problem(self, weights: Array, data: Trajectories) -> FreeRunProblem:
+        return FreeRunProblem(self.model.with_theta(weights), data, self.top_speed_rad_s, self._free, self._prior)
 
 
 def _network_prior(model: NetworkOde, identification: Identification, prior_std: float) -> NetworkPrior:
@@ -278,38 +253,25 @@ def _network_prior(model: NetworkOde, identification: Identification, prior_std:
 class _BestFreeRun:
     """Keeps the unknowns with the best free run, and stops the fit when held-out runs no longer improve."""
 
-    def __init__(
-        self,
-        model: NetworkOde,
-        untrained: Unknowns,
-        pieces: Sequence[Run],
-        held_out: bool,
-        top_speed_rad_s: Array,
-        max_iterations: int,
-        progress: Progress,
-    ) -> None:
+    def __init__(self, training: _Training, max_iterations: int, progress: Progress) -> None:
+        pieces, top_speed_rad_s = training.judged, training.top_speed_rad_s
         whole = max(piece.samples for piece in pieces)
         self.data = cut_into_trajectories(pieces, practical_samples(pieces, whole))
-        nothing = Prior(0.0, np.zeros(len(PARAMETER_NAMES)), np.zeros((len(top_speed_rad_s), len(PARAMETER_NAMES))))
-        self.problem = FreeRunProblem(model, self.data, top_speed_rad_s, NONE_FREE, nothing)
-        self.beginning = self.problem
+        self.problem = self.beginning = FreeRunProblem(training.model, self.data, top_speed_rad_s)
         if len(self.data.fan) >= WIDE_BATCH:
             rows = int(np.flatnonzero(self.data.early.any(axis=1)).max(initial=0)) + 1
-            self.beginning = FreeRunProblem(model, self.data.first_samples(rows), top_speed_rad_s, NONE_FREE, nothing)
-        self.held_out = held_out
-        self.max_iterations = max_iterations
-        self.progress = progress
-        self.iterations = 0
+            self.beginning = FreeRunProblem(training.model, self.data.first_samples(rows), top_speed_rad_s)
+        self.held_out, self.max_iterations, self.progress = training.held_out, max_iterations, progress
+        self.iterations = self.stalled_iterations = 0
         self.guess_rad_s = self.data.interpolated_speed_rad_s()
+        untrained = Unknowns(np.zeros_like(training.model.theta), training.physics, np.zeros(0))
         if counts(self.data):
             # By the physics: an untrained network without them says nothing of how the speed changes.
-            physical = FreeRunProblem(PhysicalModel(), self.data, top_speed_rad_s, NONE_FREE, nothing)
-            start = Unknowns(np.zeros(0), untrained.physics, self.data.starting_speed_rad_s())
-            physical.learn_errors(physical.evaluate(start, self.guess_rad_s))
+            physical = FreeRunProblem(PhysicalModel(), self.data, top_speed_rad_s)
+            physical.learn_errors(physical.point(np.zeros(0), untrained.physics))
             self.problem.errors = physical.errors
         self.problem.scale_rad_s = robust_scale(self._free_run(untrained).residual, self.data)
         self.best, self.best_loss = untrained, self.loss_of(untrained)
-        self.stalled_iterations = 0
 
     def consider(self, unknowns: Unknowns) -> None:
         """Keep these unknowns if the robust loss of their free run from the measured start is the smallest so far."""

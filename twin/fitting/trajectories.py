@@ -61,6 +61,12 @@ class Trajectories:
         """(n, batch) the readings that a free run starts from (twin.runs.starting_samples)."""
         return starting_samples(self.measurement.t_s, self.speed_rad_s, self.measurement.tacho)
 
+    def rms_of_fans(self, values: Array) -> Array:
+        """(fans,) root mean square of values (n, batch) over the readings that are compared."""
+        fans = len(self.tacho)
+        squares = np.bincount(self.fan, np.sum(values**2, axis=0, where=self.compared), fans)
+        return np.sqrt(squares / np.bincount(self.fan, self.compared.sum(axis=0), fans))
+
     def thinned(self, max_samples: int) -> "Trajectories":
         """Some of the stretches, always the same ones of a random choice, with at most about max_samples in all."""
         count = min(len(self.fan), max(1, max_samples // len(self.command)))

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import numpy as np
 
 from fantwin.schemas.model_uncertainty import ModelUncertainty
 from fantwin.schemas.twin_card import DriveCard
-from fantwin.twin.report.content import FanSummary, Parameter, Summary
+from fantwin.twin.report.content import FanSummary, Summary
 from fantwin.twin.report.steady_states import StaticCurve
 
 LEAST_RATIO = 1.5
@@ -103,10 +104,12 @@ def level_of(fan: FanSummary) -> Level:
 
 def warnings(content: Summary) -> tuple[str, ...]:
     """One line for each thing a reader should know before trusting the figures."""
-    return (*_about_the_data(content), *_about_the_fit(content), *_about_the_parameters(content))
+    concerned = ((sentence, list(filter(concerns, content.fans))) for concerns, sentence in _about_fans(content))
+    of_fans = (f"{_these(fans, content).capitalize()}: {sentence}." for sentence, fans in concerned if fans)
+    return (*_about_the_data(content), *of_fans)
 
 
-def _about_the_data(content: Summary) -> Iterable[str]:
+def _about_the_data(content: Summary) -> Iterator[str]:
     card = content.card
     fastest_rad_s = float(np.nanmax([0.0, *(fan.fastest_rad_s for fan in content.fans)]))
     if fastest_rad_s > ANOTHER_UNIT * card.top_speed_rad_s > 0.0:
@@ -137,62 +140,39 @@ def _about_the_data(content: Summary) -> Iterable[str]:
             "these figures are meaningless."
         )
 
-    def often_missing(fan: FanSummary) -> bool:
-        return fan.missing_share > OFTEN_MISSING
 
-    yield from _of_fans(content, often_missing, "more than a tenth of the speeds are missing")
+def _about_fans(content: Summary) -> Iterator[tuple[Callable[[FanSummary], bool], str]]:
+    """Whether something is to be said of a fan, and what."""
+    fewest = min((_independent(fan) for fan in content.fans if _few(fan)), default=1.0)
+    yield lambda fan: fan.missing_share > OFTEN_MISSING, "more than a tenth of the speeds are missing"
+    yield _unmeasured, "no speed was measured"
+    yield _diverged, "the free run diverges"
+    wide = f"the card's sigma is over {WIDE_BAND:g} times the standard deviation of the errors"
+    yield lambda fan: fan.sigma_rad_s > WIDE_BAND * fan.error_std_rad_s, f"{wide}: the assessment is too favourable"
+    certain = f"{fewest:.0f} independent errors determine the rmse to {_uncertainty(fewest):.0%} only"
+    yield _few, f"{certain}; use longer recordings"
+    yield lambda fan: _biased(fan) and fan.residual.mean_rad_s > 0.0, "on average faster than the twin"
+    yield lambda fan: _biased(fan) and fan.residual.mean_rad_s < 0.0, "on average slower than the twin"
+    at_speeds = "the mean error exceeds sigma at some speeds: see Error over speed in `fantwin report`"
+    yield _biased_at_a_speed, at_speeds
+    misses = "the error correlates with the command: the twin misses part of its effect"
+    yield lambda fan: abs(fan.residual.cross_over_bound) > CHANCE_PEAK, misses
+    for name in content.card.used_parameters:
+        yield partial(_is_negative, name), f"{name} is negative, so physics alone do not describe the fan"
+        yield partial(_is_uncertain, name), f"{name} is poorly determined: record more and wider command levels"
 
 
-def _about_the_fit(content: Summary) -> Iterable[str]:
-    yield from _of_fans(content, _unmeasured, "no speed was measured")
-    yield from _of_fans(content, _diverged, "the free run diverges")
-    yield from _of_fans(
-        content, _wide_band, f"the card's sigma is over {WIDE_BAND:g} times the standard deviation of the errors: "
-        "the assessment is too favourable"
-    )  # fmt: skip
-    if few := [fan for fan in content.fans if _few(fan)]:
-        fewest = min(_independent(fan) for fan in few)
-        yield (
-            f"{_these(few, content).capitalize()}: {fewest:.0f} independent errors determine the rmse "
-            f"to {_uncertainty(fewest):.0%} only; use longer recordings."
-        )
-    yield from _of_fans(
-        content, lambda fan: _biased(fan) and fan.residual.mean_rad_s > 0.0, "on average faster than the twin"
-    )
-    yield from _of_fans(
-        content, lambda fan: _biased(fan) and fan.residual.mean_rad_s < 0.0, "on average slower than the twin"
-    )
-    yield from _of_fans(
-        content,
-        _biased_at_a_speed,
-        "the mean error exceeds sigma at some speeds: see Error over speed in `fantwin report`",
-    )
-    yield from _of_fans(
-        content,
-        lambda fan: bool(abs(fan.residual.cross_over_bound) > CHANCE_PEAK),
-        "the error correlates with the command: the twin misses part of its effect",
-    )
+def _is_negative(name: str, fan: FanSummary) -> bool:
+    return any(its.value < 0.0 for its in fan.parameters if its.name == name)
+
+
+def _is_uncertain(name: str, fan: FanSummary) -> bool:
+    own = [its for its in fan.parameters if its.name == name]
+    return any(0.0 < UNCERTAIN * its.value < 0.5 * (its.high - its.low) for its in own)
 
 
 def _biased_at_a_speed(fan: FanSummary) -> bool:
     return any(abs(part.mean_rad_s) > BIASED_AT_A_SPEED_IN_SIGMA * fan.sigma_rad_s for part in fan.by_speed)
-
-
-def _about_the_parameters(content: Summary) -> Iterable[str]:
-    for name in content.card.used_parameters:
-
-        def negative(fan: FanSummary, name: str = name) -> bool:
-            return any(parameter.name == name and parameter.value < 0.0 for parameter in fan.parameters)
-
-        def uncertain(fan: FanSummary, name: str = name) -> bool:
-            return any(parameter.name == name and _uncertain(parameter) for parameter in fan.parameters)
-
-        yield from _of_fans(content, negative, f"{name} is negative, so physics alone do not describe the fan")
-        yield from _of_fans(content, uncertain, f"{name} is poorly determined: record more and wider command levels")
-
-
-def _uncertain(parameter: Parameter) -> bool:
-    return 0.0 < UNCERTAIN * parameter.value < 0.5 * (parameter.high - parameter.low)
 
 
 def _unmeasured(fan: FanSummary) -> bool:
@@ -201,10 +181,6 @@ def _unmeasured(fan: FanSummary) -> bool:
 
 def _diverged(fan: FanSummary) -> bool:
     return bool(np.isinf(fan.figures.max_error_rad_s))
-
-
-def _wide_band(fan: FanSummary) -> bool:
-    return bool(fan.sigma_rad_s > WIDE_BAND * fan.error_std_rad_s)
 
 
 def _few(fan: FanSummary) -> bool:
@@ -226,12 +202,6 @@ def _biased(fan: FanSummary) -> bool:
     offset = abs(fan.residual.mean_rad_s)
     standard_error = fan.figures.rmse_rad_s / np.sqrt(fan.residual.independent_samples)
     return bool(offset > BIASED_IN_SIGMA * fan.sigma_rad_s and offset > BIASED_IN_ERRORS * standard_error)
-
-
-def _of_fans(content: Summary, concerned: Callable[[FanSummary], bool], sentence: str) -> Iterable[str]:
-    """One line that names the fans concerned; none when there are none."""
-    if fans := [fan for fan in content.fans if concerned(fan)]:
-        yield f"{_these(fans, content).capitalize()}: {sentence}."
 
 
 def _these(fans: Sequence[FanSummary], content: Summary) -> str:

@@ -2,17 +2,19 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import reduce
+from operator import add
 from typing import Any
 
 import numpy as np
 
 from fantwin.schemas.twin_card import DataCard, DriveCard, TwinCard
 from fantwin.twin.build import runs_of_twin
-from fantwin.twin.evaluation.accuracy import Evaluation, Figures, evaluation_pieces
+from fantwin.twin.evaluation.accuracy import Evaluation, Figures, evaluation_pieces, free_run_of_piece
 from fantwin.twin.evaluation.residual_analysis import ResidualAnalysis, analysis_of
 from fantwin.twin.export.fan_rows import drive_of_fans, fan_rows
 from fantwin.twin.export.onnx_twin import OnnxTwin
-from fantwin.twin.report.recording_sums import Extent, RecordingSums, SpeedBin, extent_of, free_run_of_piece
+from fantwin.twin.report.recording_sums import Extent, RecordingSums, SpeedBin, extent_of, sums_of_free_run
 from fantwin.twin.report.timeline import Timeline, timeline
 from fantwin.twin.runs import Array, Run
 
@@ -83,8 +85,8 @@ class Summary:
 @dataclass(frozen=True, eq=False)
 class FanContent(FanSummary):
     """One fan with its samples. column: of the runs. Arrays (n,) are in rad/s or command units, over all pieces one
-    after the other; predicted_rad_s, error_rad_s: as of recording_sums.FreeRun. auxiliary: other measured
-    columns, (n,) by name, NaN where not measured."""
+    after the other; predicted_rad_s: NaN where the free run diverged; error_rad_s: the residual of accuracy.FreeRun.
+    auxiliary: other measured columns, (n,) by name, NaN where not measured."""
 
     column: int
     command: Array
@@ -163,17 +165,17 @@ def report_content(
     Raises TwinError when the twin does not fit the runs, or there is nothing to evaluate.
     """
     of, extent = runs_of_twin(twin, runs, fan_numbers), extent_of(runs)
-    free_runs = [free_run_of_piece(of, piece, extent) for piece in evaluation_pieces(of.runs)]
-    pieces = tuple(free_run.piece for free_run in free_runs)
-    first, *others = (free_run.sums for free_run in free_runs)
-    summary = summary_of(twin, sum(others, first), extent, recordings, unit, fan_numbers)
+    pieces = tuple(evaluation_pieces(of.runs))
+    free_runs = [free_run_of_piece(of.model, of.parameters, piece) for piece in pieces]
+    sums = reduce(add, (sums_of_free_run(of, each, extent) for each in free_runs))
+    summary = summary_of(twin, sums, extent, recordings, unit, fan_numbers)
     command, measured = (
         np.concatenate([getattr(piece, name) for piece in pieces]) for name in ("command", "speed_rad_s")
     )
-    predicted, error = (
-        np.concatenate([getattr(free_run, name) for free_run in free_runs])
-        for name in ("predicted_rad_s", "error_rad_s")
+    expected, error = (
+        np.concatenate([getattr(each, name) for each in free_runs]) for name in ("expected_rad_s", "residual_rad_s")
     )
+    predicted = np.where(np.isfinite(expected), expected, np.nan)
     measured_beside = _auxiliary(evaluation_pieces(runs))
     fans = tuple(
         FanContent(

@@ -6,6 +6,8 @@ over its range of speeds.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import reduce
+from operator import add
 from typing import Any
 
 import numpy as np
@@ -16,10 +18,10 @@ from fantwin.twin.errors import TwinError
 from fantwin.twin.evaluation.accuracy import (
     FigureSums,
     Flags,
-    compared_readings,
+    FreeRun,
     evaluation_pieces,
     figure_sums,
-    free_run_readings,
+    free_run_of_piece,
 )
 from fantwin.twin.evaluation.residual_analysis import ResidualGrid, ResidualSums, residual_grid, residual_sums
 from fantwin.twin.runs import Array, Run
@@ -158,39 +160,24 @@ class RecordingSums:
         return RecordingSums(**sums)
 
 
-@dataclass(frozen=True, eq=False)
-class FreeRun:
-    """A piece of a run beside the free run of a twin, (n, fans) in rad/s. predicted: the readings expected of it, NaN
-    where it diverged. error: measured minus that, NaN where nothing is compared, infinite where it diverged."""
-
-    piece: Run
-    predicted_rad_s: Array
-    error_rad_s: Array
-    sums: RecordingSums
-
-
-def free_run_of_piece(of: RunsOfTwin, piece: Run, extent: Extent) -> FreeRun:
-    """Run a twin freely over a piece."""
-    expected = free_run_readings(of.model, of.parameters, piece)
-    predicted = np.where(np.isfinite(expected), expected, np.nan)
-    compared = compared_readings(piece)
-    error = np.where(np.isfinite(compared) & np.isnan(predicted), np.inf, compared - predicted)
-    sums = RecordingSums(
-        figures=figure_sums(of.model, of.parameters, of.sigma_rad_s, piece, expected, of.unseen_std),
+def sums_of_free_run(of: RunsOfTwin, free_run: FreeRun, extent: Extent) -> RecordingSums:
+    """The sums over one piece."""
+    piece, error = free_run.piece, free_run.residual_rad_s
+    return RecordingSums(
+        figures=figure_sums(of.model, of.parameters, of.sigma_rad_s, free_run, of.unseen_std),
         residual=residual_sums(error, [piece], extent.grid),
-        by_speed=speed_sums(predicted, error, extent.range_rad_s),
+        by_speed=speed_sums(free_run.expected_rad_s, error, extent.range_rad_s),
         samples=piece.samples,
         fastest_rad_s=np.fmax.reduce(np.abs(piece.speed_rad_s)),
         missing=np.isnan(piece.speed_rad_s).sum(axis=0, dtype=np.float64),
         outside=_is_outside(of.card, piece.command).sum(axis=0, dtype=np.float64),
     )
-    return FreeRun(piece, predicted, error, sums)
 
 
 def recording_sums(of: RunsOfTwin, extent: Extent) -> RecordingSums:
     """The sums over all runs, one piece in memory at a time. Raises TwinError when there is nothing to evaluate."""
-    first, *others = (free_run_of_piece(of, piece, extent).sums for piece in evaluation_pieces(of.runs))
-    return sum(others, first)
+    free_runs = (free_run_of_piece(of.model, of.parameters, piece) for piece in evaluation_pieces(of.runs))
+    return reduce(add, (sums_of_free_run(of, each, extent) for each in free_runs))
 
 
 def _is_outside(card: TwinCard, command: Array) -> Flags:
