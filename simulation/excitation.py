@@ -7,17 +7,14 @@ again.
 
 from __future__ import annotations
 
-import difflib
-from collections.abc import Callable, Sequence
-from copy import copy
-from typing import Protocol, TypeAlias
+from collections.abc import Callable
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fantwin.simulation.errors import SimulationError
-
-Array: TypeAlias = NDArray[np.float64]
+from fantwin.simulation.errors import SimulationError, nearest
+from fantwin.simulation.plant import Array
 
 UPDATES_HZ = 10.0
 STEPS = 255
@@ -31,6 +28,12 @@ LAG_S = 5.0
 NOISE_C = 0.2
 """standard deviation of the wandering of a temperature"""
 STOP_C, START_C, FULL_C = 29.0, 31.0, 65.0
+BIT_S = 0.5
+MULTISINE_S, MANUAL_S = 50.0, 3600.0
+"""periods"""
+FIRST_HZ, LAST_HZ, SWEEP_S = 0.02, 2.0, 60.0
+TURN_S, PAUSE_S = (0.5, 3.0), (1.0, 6.0)
+"""shortest and longest"""
 
 
 class Thermostat:
@@ -58,18 +61,6 @@ class Thermostat:
     def command(self, t_s: float) -> Array:
         """(fans,) duty in force at t_s."""
         return self._steps[int(t_s * UPDATES_HZ + 1e-6) % len(self._steps)] / STEPS
-
-    def side_by_side(self, starts_s: Sequence[float], seconds: float) -> Thermostat:
-        """A thermostat of as many times the fans, which have the commands from each of these times on, for a time."""
-        found = copy(self)
-        numbers = np.arange(round(seconds * UPDATES_HZ))
-        parts = [self._steps[(round(start_s * UPDATES_HZ) + numbers) % len(self._steps)] for start_s in starts_s]
-        found._steps = np.concatenate(parts, axis=1)
-        return found
-
-    def is_on(self, times_s: Array, fan: int) -> NDArray[np.bool_]:
-        """Whether a fan has a duty at times; same shape."""
-        return self._steps[(times_s * UPDATES_HZ + 1e-6).astype(np.int64) % len(self._steps), fan] > 0
 
 
 def _zone_c(rng: np.random.Generator, samples: int) -> Array:
@@ -107,36 +98,36 @@ class Excitation(Protocol):
         ...
 
 
-class Staircase:
-    """Up in equal steps and down again, each step held; each fan starts at a step of its own."""
+class HeldLevels:
+    """Levels in turn, each held; each fan starts at one of its own."""
 
-    def __init__(self, fans: int, seed: int, low: float, high: float, steps: int = 8, hold_s: float = 4.0) -> None:
-        climb = np.linspace(low, high, steps + 1)
-        self._levels = np.concatenate((climb, climb[-2:0:-1]))
-        self._hold_s = hold_s
-        self._shift = np.random.default_rng(seed).integers(len(self._levels), size=fans)
+    def __init__(self, levels: Array, hold_s: float, fans: int, seed: int) -> None:
+        self._levels, self._hold_s = levels, hold_s
+        self._shift = np.random.default_rng(seed).integers(len(levels), size=fans)
 
     def command(self, t_s: float) -> Array:
         """(fans,) levels in force at t_s."""
         return self._levels[(int(t_s / self._hold_s) + self._shift) % len(self._levels)]
 
 
-class Prbs:
+class Staircase(HeldLevels):
+    """Up in equal steps and down again, each step held."""
+
+    def __init__(self, fans: int, seed: int, low: float, high: float, steps: int = 8, hold_s: float = 4.0) -> None:
+        climb = np.linspace(low, high, steps + 1)
+        super().__init__(np.concatenate((climb, climb[-2:0:-1])), hold_s, fans, seed)
+
+
+class Prbs(HeldLevels):
     """Pseudo-random binary sequence: a maximum-length shift register x^10 + x^7 + 1 chooses between two levels."""
 
-    def __init__(self, fans: int, seed: int, low: float, high: float, bit_s: float = 0.5) -> None:
+    def __init__(self, fans: int, seed: int, low: float, high: float) -> None:
         register = [1] * 10
         bits = []
         for _ in range(2**10 - 1):
             bits.append(register[-1])
             register = [register[9] ^ register[6], *register[:-1]]
-        self._levels = np.where(np.array(bits) == 1, high, low)
-        self._bit_s = bit_s
-        self._shift = np.random.default_rng(seed).integers(len(bits), size=fans)
-
-    def command(self, t_s: float) -> Array:
-        """(fans,) levels in force at t_s."""
-        return self._levels[(int(t_s / self._bit_s) + self._shift) % len(self._levels)]
+        super().__init__(np.where(np.array(bits) == 1, high, low), BIT_S, fans, seed)
 
 
 class Multisine:
@@ -144,11 +135,11 @@ class Multisine:
 
     HARMONICS = np.array([1, 2, 3, 5, 8, 13, 21, 34, 55, 89])
 
-    def __init__(self, fans: int, seed: int, low: float, high: float, period_s: float = 50.0) -> None:
-        self._omega_rad_s = 2.0 * np.pi * self.HARMONICS / period_s
+    def __init__(self, fans: int, seed: int, low: float, high: float) -> None:
+        self._omega_rad_s = 2.0 * np.pi * self.HARMONICS / MULTISINE_S
         self._phase_rad = np.random.default_rng(seed).uniform(0.0, 2.0 * np.pi, size=(fans, len(self.HARMONICS)))
         self._low, self._high = low, high
-        samples_s = np.linspace(0.0, period_s, 40 * int(self.HARMONICS[-1]))
+        samples_s = np.linspace(0.0, MULTISINE_S, 40 * int(self.HARMONICS[-1]))
         waves = np.stack([self._wave(t_s) for t_s in samples_s])
         self._minimum, self._maximum = waves.min(axis=0), waves.max(axis=0)
 
@@ -162,86 +153,55 @@ class Multisine:
 
 
 class Chirp:
-    """A sine whose frequency rises exponentially from first_hz to last_hz, then falls back the same way."""
+    """A sine whose frequency rises exponentially from `FIRST_HZ` to `LAST_HZ`, then falls back the same way."""
 
-    def __init__(
-        self,
-        fans: int,
-        seed: int,
-        low: float,
-        high: float,
-        first_hz: float = 0.02,
-        last_hz: float = 2.0,
-        sweep_s: float = 60.0,
-    ) -> None:
-        self._rate = np.log(last_hz / first_hz) / sweep_s
-        self._first_hz, self._sweep_s = first_hz, sweep_s
+    def __init__(self, fans: int, seed: int, low: float, high: float) -> None:
+        self._rate = np.log(LAST_HZ / FIRST_HZ) / SWEEP_S
         self._centre, self._amplitude = (low + high) / 2.0, (high - low) / 2.0
         self._phase_rad = np.random.default_rng(seed).uniform(0.0, 2.0 * np.pi, size=fans)
 
     def command(self, t_s: float) -> Array:
         """(fans,) commands at t_s."""
-        sweeps, into_s = divmod(t_s, 2.0 * self._sweep_s)
-        sweep_cycles = self._cycles(self._sweep_s)
-        falling_s = into_s - self._sweep_s
+        sweeps, into_s = divmod(t_s, 2.0 * SWEEP_S)
+        sweep_cycles = self._cycles(SWEEP_S)
+        falling_s = into_s - SWEEP_S
         # On the way down the sweep runs backwards: the remaining cycles are subtracted from the total.
-        cycles = (
-            self._cycles(into_s) if falling_s < 0.0 else 2.0 * sweep_cycles - self._cycles(self._sweep_s - falling_s)
-        )
+        cycles = self._cycles(into_s) if falling_s < 0.0 else 2.0 * sweep_cycles - self._cycles(SWEEP_S - falling_s)
         turn_rad = 2.0 * np.pi * (2.0 * sweep_cycles * sweeps + cycles)
         return self._centre + self._amplitude * np.sin(turn_rad + self._phase_rad)
 
     def _cycles(self, into_s: float) -> float:
-        return self._first_hz * (np.exp(self._rate * into_s) - 1.0) / self._rate
+        return FIRST_HZ * (np.exp(self._rate * into_s) - 1.0) / self._rate
 
 
 class Manual:
     """A person turning a knob per fan: slow turns to random levels, with pauses between them."""
 
-    def __init__(
-        self,
-        fans: int,
-        seed: int,
-        low: float,
-        high: float,
-        period_s: float = 3600.0,
-        turn_s: tuple[float, float] = (0.5, 3.0),
-        hold_s: tuple[float, float] = (1.0, 6.0),
-    ) -> None:
-        self._period_s = period_s
+    def __init__(self, fans: int, seed: int, low: float, high: float) -> None:
         # The profiles of all fans follow one another on one time axis, so that one interpolation serves them all.
-        self._offset_s = np.arange(fans) * period_s
-        times, levels = [], []
-        for offset_s, rng in zip(self._offset_s, np.random.default_rng(seed).spawn(fans), strict=True):
-            knob_s, knob = _knob(rng, low, high, period_s, turn_s, hold_s)
-            times.append(offset_s + knob_s)
-            levels.append(knob)
-        self._times_s, self._levels = np.concatenate(times), np.concatenate(levels)
+        self._offset_s = np.arange(fans) * MANUAL_S
+        knobs = [_knob(rng, low, high) for rng in np.random.default_rng(seed).spawn(fans)]
+        offset_s = zip(self._offset_s, knobs, strict=True)
+        self._times_s = np.concatenate([first_s + times_s for first_s, (times_s, _) in offset_s])
+        self._levels = np.concatenate([levels for _, levels in knobs])
 
     def command(self, t_s: float) -> Array:
         """(fans,) commands at t_s."""
-        return np.interp(t_s % self._period_s + self._offset_s, self._times_s, self._levels)
+        return np.interp(t_s % MANUAL_S + self._offset_s, self._times_s, self._levels)
 
 
-def _knob(
-    rng: np.random.Generator,
-    low: float,
-    high: float,
-    period_s: float,
-    turn_s: tuple[float, float],
-    hold_s: tuple[float, float],
-) -> tuple[Array, Array]:
-    """Breakpoints of one profile: times (n,) from 0 to below period_s, and levels (n,).
+def _knob(rng: np.random.Generator, low: float, high: float) -> tuple[Array, Array]:
+    """Breakpoints of one profile: times (n,) from 0 to below `MANUAL_S`, and levels (n,).
 
     The last level is the first one, so that the next period continues without a jump.
     """
-    turns = int(period_s / (turn_s[0] + hold_s[0])) + 1
-    durations_s = np.stack((rng.uniform(*hold_s, size=turns), rng.uniform(*turn_s, size=turns)), axis=1)
+    turns = int(MANUAL_S / (TURN_S[0] + PAUSE_S[0])) + 1
+    durations_s = np.stack((rng.uniform(*PAUSE_S, size=turns), rng.uniform(*TURN_S, size=turns)), axis=1)
     corners_s = np.concatenate(([0.0], np.cumsum(durations_s)))
     levels = np.repeat(rng.uniform(low, high, size=turns + 1), 2)[: len(corners_s)]
     # Only turns that leave time for the last one, which goes back to the first level.
-    count = 2 * int(np.searchsorted(corners_s[::2], period_s - turn_s[1])) - 1
-    last_s = np.nextafter(period_s, 0.0)
+    count = 2 * int(np.searchsorted(corners_s[::2], MANUAL_S - TURN_S[1])) - 1
+    last_s = np.nextafter(MANUAL_S, 0.0)
     return np.append(corners_s[:count], last_s), np.append(levels[:count], levels[0])
 
 
@@ -263,9 +223,7 @@ def excitation(profile: str, fans: int, seed: int, low: float = LOW, high: float
         SimulationError: no such profile, or low is not below high.
     """
     if profile not in PROFILES:
-        close = difflib.get_close_matches(profile, PROFILES, n=1)
-        hint = f"did you mean {close[0]!r}?" if close else f"known: {', '.join(PROFILES)}"
-        raise SimulationError(f"unknown profile {profile!r}; {hint}")
+        raise SimulationError(f"unknown profile {profile!r}; {nearest(profile, PROFILES)}")
     if not low < high:
         raise SimulationError(f"commands from {low:g} to {high:g}: the first must be smaller")
     return PROFILES[profile](fans, seed, low, high)

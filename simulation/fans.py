@@ -10,16 +10,16 @@ from typing import Literal, Protocol
 import numpy as np
 
 from fantwin.simulation.faults import Fault, disturbance, four_pin_damage
-from fantwin.simulation.four_pin import FourPinFans, FourPinParameters, four_pin_tray
+from fantwin.simulation.four_pin import FourPinFans, FourPinParameters
 from fantwin.simulation.plant import (
     BACK_EMF_SHARE,
     HEALTHY,
     RESISTANCE_OHM,
     Array,
+    Disturbance,
     FanParameters,
     advance,
     at_rest,
-    tray_of_fans,
 )
 
 FanKind = Literal["dc", "4-pin"]
@@ -50,16 +50,12 @@ class Fans(Protocol):
         """The faults act from now on as they do at t_s."""
         ...
 
+    def surround(self, supply_factor: float, drag_factor: float) -> tuple[Array, Array]:
+        """The supply voltage and the drag are changed by these factors from now on, beside faults.
 
-def simulated_fans(kind: FanKind, fans: int, fans_seed: int, fan_variation: float, seed: int) -> Fans:
-    """A tray of fans. seed: of what changes from run to run.
-
-    Raises:
-        SimulationError: fan_variation is out of range.
-    """
-    if kind == "dc":
-        return DcFans(tray_of_fans(fans, fans_seed, fan_variation))
-    return FourPinTray(four_pin_tray(fans, fans_seed, fan_variation), np.random.default_rng(seed), fans)
+        Returns the voltage and the current of each fan, V and A (fans,); NaN where it is not simulated.
+        """
+        ...
 
 
 class DcFans:
@@ -70,8 +66,7 @@ class DcFans:
     def __init__(self, parameters: FanParameters) -> None:
         self.parameters = parameters
         self._state = at_rest(len(np.asarray(parameters.J)))
-        self._damage = self._disturbance = HEALTHY
-        self._around = (1.0, 1.0)
+        self._damage, self._around = HEALTHY, (1.0, 1.0)
 
     @property
     def speed_rad_s(self) -> Array:
@@ -79,15 +74,9 @@ class DcFans:
         return self._state.speed_rad_s
 
     @property
-    def supply_v(self) -> Array:
-        """(fans,) voltage of their drives now."""
-        return np.broadcast_to(self.parameters.supply_v * self._disturbance.supply_factor, self.speed_rad_s.shape)
-
-    @property
-    def current_a(self) -> Array:
-        """(fans,) that they take now, A: what drives it less what the turning motor induces."""
-        back_emf_v = BACK_EMF_SHARE * self.parameters.alpha * self.speed_rad_s
-        return (self._state.current_v - back_emf_v) / RESISTANCE_OHM
+    def _disturbance(self) -> Disturbance:
+        supply, drag = (self._damage.supply_factor, self._damage.drag_factor)
+        return replace(self._damage, supply_factor=supply * self._around[0], drag_factor=drag * self._around[1])
 
     def advance(self, duty: Array, duration_s: float) -> None:
         """See Fans."""
@@ -96,27 +85,24 @@ class DcFans:
     def set_faults(self, faults: Sequence[Fault], t_s: float) -> None:
         """See Fans."""
         self._damage = disturbance(faults, len(self.speed_rad_s), t_s)
-        self.surround(*self._around)
 
-    def surround(self, supply_factor: float, drag_factor: float) -> None:
-        """The supply voltage and the drag are changed by these factors from now on, beside faults."""
+    def surround(self, supply_factor: float, drag_factor: float) -> tuple[Array, Array]:
+        """See Fans. The current is by what drives it less what the turning motor induces."""
         self._around = supply_factor, drag_factor
-        self._disturbance = replace(
-            self._damage,
-            supply_factor=self._damage.supply_factor * supply_factor,
-            drag_factor=self._damage.drag_factor * drag_factor,
-        )
+        supply_v = np.broadcast_to(self.parameters.supply_v * self._disturbance.supply_factor, self.speed_rad_s.shape)
+        back_emf_v = BACK_EMF_SHARE * self.parameters.alpha * self.speed_rad_s
+        return supply_v, (self._state.current_v - back_emf_v) / RESISTANCE_OHM
 
 
 class FourPinTray(FourPinFans):
     """4-pin fans on one supply."""
 
-    @property
-    def supply_v(self) -> Array:
-        """(fans,) voltage of their supply now; that of a fan without power is 0."""
-        supply_v = np.full(len(self.speed_rad_s), FOUR_PIN_SUPPLY_V * self.supply_factor)
-        return np.where(self.damage.is_unpowered, 0.0, supply_v)
-
     def set_faults(self, faults: Sequence[Fault], t_s: float) -> None:
         """See Fans."""
         self.damage = four_pin_damage(faults, len(self.speed_rad_s), t_s)
+
+    def surround(self, supply_factor: float, drag_factor: float) -> tuple[Array, Array]:
+        """See Fans. A fan without power has no voltage; one that controls its speed does not feel the air."""
+        self.supply_factor = supply_factor
+        supply_v = np.full(len(self.speed_rad_s), FOUR_PIN_SUPPLY_V * supply_factor)
+        return np.where(self.damage.is_unpowered, 0.0, supply_v), np.full(len(supply_v), np.nan)

@@ -19,16 +19,16 @@ Each acts on one fan from `start_s` until `stop_s`, and has no effect afterwards
 
 from __future__ import annotations
 
-import difflib
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
-from fantwin.simulation.errors import SimulationError
+from fantwin.simulation.errors import SimulationError, nearest
 from fantwin.simulation.four_pin import FourPinDamage
-from fantwin.simulation.plant import Disturbance
+from fantwin.simulation.plant import Array, Disturbance
 
 CLOG_S = 180.0
 """the time in which clogging reaches its size"""
@@ -75,8 +75,9 @@ class Fault:
         return self.start_s <= t_s < self.stop_s
 
     def size_at(self, t_s: float) -> float:
-        """Its size at t_s while it is active; that of wear and of clogging grows linearly."""
-        assert self.size is not None
+        """Its size at t_s while it is active, 0 without one; that of wear and of clogging grows linearly."""
+        if self.size is None:
+            return 0.0
         since_s = t_s - self.start_s
         if self.kind == "wear":
             return self.size * (since_s / (self.stop_s - self.start_s))
@@ -91,12 +92,12 @@ def parse_fault(text: str) -> Fault:
     """
     kind, _, settings = text.partition(":")
     if kind not in KINDS:
-        raise SimulationError(f"fault {text!r}: unknown kind {kind!r}; {_nearest(kind, KINDS)}")
+        raise SimulationError(f"fault {text!r}: unknown kind {kind!r}; {nearest(kind, KINDS)}")
     values: dict[str, float] = {}
     for setting in filter(None, settings.split(",")):
         key, _, number = setting.partition("=")
         if key not in KEYS:
-            raise SimulationError(f"fault {text!r}: unknown key {key!r}; {_nearest(key, KEYS)}")
+            raise SimulationError(f"fault {text!r}: unknown key {key!r}; {nearest(key, KEYS)}")
         if key in values:
             raise SimulationError(f"fault {text!r}: {key} is given twice")
         try:
@@ -158,31 +159,21 @@ def check_schedule(faults: Iterable[Fault], fans: int, duration_s: float, fan_ki
             raise SimulationError("wear fault: stop is missing; give stop=S, the time at which it reaches its size")
 
 
-def _nearest(word: str, known: Iterable[str]) -> str:
-    close = difflib.get_close_matches(word, known, n=1)
-    return f"did you mean {close[0]!r}?" if close else f"known: {', '.join(known)}"
+def _active(faults: Iterable[Fault], t_s: float) -> Iterator[tuple[Fault, float]]:
+    """The faults that act at t_s, and their sizes; 0 of one that has none."""
+    return ((fault, fault.size_at(t_s)) for fault in faults if fault.active(t_s))
 
 
-@dataclass(frozen=True)
-class TachoFaults:
-    """Tacho faults: which tachos are stuck (fans,), and the share of missing readings (fans,)."""
-
-    stuck: np.ndarray
-    dropout: np.ndarray
-
-
-def disturbance(faults: Sequence[Fault], fans: int, t_s: float) -> Disturbance:
+def disturbance(faults: Iterable[Fault], fans: int, t_s: float) -> Disturbance:
     """The disturbance of the fans at t_s. Several faults of one fan combine: factors multiply, torques add."""
     drag, brake, supply = np.ones(fans), np.zeros(fans), np.ones(fans)
-    for fault in faults:
-        if not fault.active(t_s):
-            continue
+    for fault, size in _active(faults, t_s):
         if fault.kind == "inlet":
-            drag[fault.fan] *= fault.size_at(t_s)
+            drag[fault.fan] *= size
         elif fault.kind in ("rotor", "wear"):
-            brake[fault.fan] += fault.size_at(t_s)
+            brake[fault.fan] += size
         elif fault.kind == "supply":
-            supply[fault.fan] *= fault.size_at(t_s)
+            supply[fault.fan] *= size
     return Disturbance(drag, brake, supply)
 
 
@@ -190,11 +181,9 @@ def four_pin_damage(faults: Iterable[Fault], fans: int, t_s: float) -> FourPinDa
     """The damage of 4-pin fans at t_s. Several faults of one fan combine: factors multiply."""
     speed, up, down = np.ones(fans), np.ones(fans), np.ones(fans)
     blocked, unpowered = np.zeros(fans, np.bool_), np.zeros(fans, np.bool_)
-    for fault in faults:
-        if not fault.active(t_s):
-            continue
+    for fault, size in _active(faults, t_s):
         if fault.kind in ("clog", "blade", "bearing"):
-            speed[fault.fan] *= 1.0 - fault.size_at(t_s)
+            speed[fault.fan] *= 1.0 - size
         if fault.kind == "bearing":
             up[fault.fan] *= BEARING_UP_FACTOR
             down[fault.fan] *= BEARING_DOWN_FACTOR
@@ -203,12 +192,11 @@ def four_pin_damage(faults: Iterable[Fault], fans: int, t_s: float) -> FourPinDa
     return FourPinDamage(speed, up, down, blocked, unpowered)
 
 
-def tacho_faults(faults: Sequence[Fault], fans: int, t_s: float) -> TachoFaults:
-    """The tacho faults that are active at t_s."""
-    stuck, dropout = np.zeros(fans, dtype=bool), np.zeros(fans)
-    for fault in faults:
-        if fault.kind == "tacho-stuck" and fault.active(t_s):
-            stuck[fault.fan] = True
-        elif fault.kind == "tacho-dropout" and fault.active(t_s):
-            dropout[fault.fan] = max(dropout[fault.fan], fault.size_at(t_s))
-    return TachoFaults(stuck, dropout)
+def tacho_faults(faults: Iterable[Fault], fans: int, t_s: float) -> tuple[NDArray[np.bool_], Array]:
+    """Which tachos are stuck at t_s (fans,), and the share of missing readings (fans,)."""
+    stuck, dropout = np.zeros(fans, np.bool_), np.zeros(fans)
+    for fault, size in _active(faults, t_s):
+        stuck[fault.fan] |= fault.kind == "tacho-stuck"
+        if fault.kind == "tacho-dropout":
+            dropout[fault.fan] = max(dropout[fault.fan], size)
+    return stuck, dropout

@@ -12,15 +12,12 @@ with its section below; it leaves dynamics to the vendor. All other defaults are
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
-from typing import TypeAlias
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fantwin.simulation.errors import SimulationError
-
-Array: TypeAlias = NDArray[np.float64]
+from fantwin.simulation.plant import Array, varied
 
 RPM = 2.0 * np.pi / 60.0
 STANDSTILL_RAD_S = 30.0 * RPM
@@ -91,23 +88,8 @@ NO_DAMAGE = FourPinDamage()
 
 
 def four_pin_tray(fans: int, seed: int, fan_variation: float = 0.03) -> FourPinParameters:
-    """Parameters of fans, each field (fans,). Fans differ by a normal variation, cut at three standard deviations.
-
-    fan_variation: relative standard deviation of each of `VARYING_PARAMETERS`. The same seed gives the same fans.
-
-    Raises:
-        SimulationError: fan_variation is negative or too large.
-    """
-    if not 0.0 <= fan_variation < 0.3:
-        raise SimulationError(f"fan_variation = {fan_variation:g}: give a relative standard deviation from 0 to 0.3")
-    rng = np.random.default_rng(seed)
-    varied = {}
-    for field in fields(FourPinParameters):
-        values = np.full(fans, field.default, dtype=np.float64)
-        if field.name in VARYING_PARAMETERS:
-            values *= 1.0 + fan_variation * np.clip(rng.normal(size=fans), -3.0, 3.0)
-        varied[field.name] = values
-    return FourPinParameters(**varied)
+    """Parameters of fans that differ, as of `plant.varied`."""
+    return varied(FourPinParameters(), VARYING_PARAMETERS, fans, seed, fan_variation)
 
 
 def wanted_speed_rad_s(duty: Array, parameters: FourPinParameters) -> Array:

@@ -16,13 +16,17 @@ has exactly zero speed.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Literal, TypeAlias
+from typing import TYPE_CHECKING, Literal, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fantwin.simulation.errors import SimulationError
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
 
 Array: TypeAlias = NDArray[np.float64]
 Measured = Literal["supply_voltage_v", "current_a", "temperature_c"]
@@ -134,12 +138,14 @@ class FanParameters:
 
 
 VARYING_PARAMETERS = ("J", "alpha", "C_D", "gain", "lag_s", "coulomb_v", "breakaway_v", "stribeck_rad_s")
+Parameters = TypeVar("Parameters", bound="DataclassInstance")
 
 
-def tray_of_fans(fans: int, seed: int, fan_variation: float = 0.03, base: FanParameters | None = None) -> FanParameters:
-    """Parameters of a tray, each field (fans,). Fans differ by a normal variation, cut at three standard deviations.
+def varied(base: Parameters, varying: Sequence[str], fans: int, seed: int, fan_variation: float) -> Parameters:
+    """Parameters of fans, each field (fans,). Fans differ by a normal variation, cut at three standard deviations.
 
-    fan_variation: relative standard deviation of each of `VARYING_PARAMETERS`. The same seed gives the same fans.
+    varying: names of the parameters that vary. fan_variation: relative standard deviation of each. The same seed gives
+    the same fans.
 
     Raises:
         SimulationError: fan_variation is negative or so large that a parameter could become negative.
@@ -147,15 +153,18 @@ def tray_of_fans(fans: int, seed: int, fan_variation: float = 0.03, base: FanPar
     if not 0.0 <= fan_variation < 0.3:
         raise SimulationError(f"fan_variation = {fan_variation:g}: give a relative standard deviation from 0 to 0.3")
     rng = np.random.default_rng(seed)
-    base = base or FanParameters()
-    varied = {}
-    for field in fields(FanParameters):
-        values = np.full(fans, getattr(base, field.name), dtype=np.float64)
-        if field.name in VARYING_PARAMETERS:
-            values *= 1.0 + fan_variation * np.clip(rng.normal(size=fans), -3.0, 3.0)
-        varied[field.name] = values
-    varied["breakaway_v"] = np.maximum(varied["breakaway_v"], varied["coulomb_v"])
-    return FanParameters(**varied)
+    own = {}
+    for field in fields(base):
+        own[field.name] = np.full(fans, getattr(base, field.name), dtype=np.float64)
+        if field.name in varying:
+            own[field.name] *= 1.0 + fan_variation * np.clip(rng.normal(size=fans), -3.0, 3.0)
+    return replace(base, **own)
+
+
+def tray_of_fans(fans: int, seed: int, fan_variation: float = 0.03, base: FanParameters | None = None) -> FanParameters:
+    """Parameters of a tray of fans that differ, as of `varied`."""
+    tray = varied(base or FanParameters(), VARYING_PARAMETERS, fans, seed, fan_variation)
+    return replace(tray, breakaway_v=np.maximum(tray.breakaway_v, tray.coulomb_v))
 
 
 def drive(duty: Array, parameters: FanParameters) -> Array:
@@ -235,10 +244,3 @@ class DeviceClock:
     def at(self, t_s: float) -> int:
         """Reading of the clock at true time t_s; wraps at 2^32."""
         return (self.start_us + round(t_s * (1e6 + self.drift_ppm))) % 2**32
-
-
-def fan(parameters: FanParameters, index: int) -> FanParameters:
-    """The parameters of one fan of a tray, as numbers."""
-    return replace(
-        parameters, **{f.name: float(np.asarray(getattr(parameters, f.name))[index]) for f in fields(parameters)}
-    )

@@ -10,15 +10,14 @@ import math
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, Protocol, TypeAlias
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fantwin.schemas.tacho import INSTANTANEOUS, Tacho, tacho_of_each_fan
 from fantwin.simulation.errors import SimulationError
-
-Array: TypeAlias = NDArray[np.float64]
+from fantwin.simulation.plant import Array
 
 COUNT_PIECE_S, PERIOD_PIECE_S, DELAY_PIECE_S = 0.05, 0.01, 0.01
 """longest pieces of the course of the speeds: within them the angle, or the delay, is approximate"""

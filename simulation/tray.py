@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,12 +16,11 @@ from numpy.typing import NDArray
 from fantwin.schemas.device_sample import DeviceSample
 from fantwin.simulation.errors import SimulationError
 from fantwin.simulation.excitation import excitation
-from fantwin.simulation.fans import DcFans, FanKind, FourPinTray, simulated_fans
+from fantwin.simulation.fans import DcFans, FanKind, Fans, FourPinTray
 from fantwin.simulation.faults import Fault, check_schedule, tacho_faults
-from fantwin.simulation.plant import DeviceClock, Surroundings, SurroundingsNow
+from fantwin.simulation.four_pin import four_pin_tray
+from fantwin.simulation.plant import Array, DeviceClock, Surroundings, SurroundingsNow, tray_of_fans
 from fantwin.simulation.tacho import TachoSettings, simulated_tacho
-
-Array: TypeAlias = NDArray[np.float64]
 
 MAX_FANS = 64
 MAX_JITTER_PERIODS = 0.4
@@ -71,9 +69,7 @@ class SimulatedTray:
         profile, *others = np.random.SeedSequence(settings.seed).generate_state(6).tolist()
         self._excitation = excitation(settings.profile, settings.fans, profile)
         self._jitter_rng, self._loss_rng, tacho, self._dropout_rng = map(np.random.default_rng, others[:4])
-        self._plant = simulated_fans(
-            settings.fan, settings.fans, settings.fans_seed, settings.fan_variation, seed=others[4]
-        )
+        self._plant = _fans(settings, np.random.default_rng(others[4]))
         self.parameters = self._plant.parameters
         surroundings_rng = np.random.default_rng(np.random.SeedSequence(settings.seed, spawn_key=(1,)))
         self._surroundings = SurroundingsNow(settings.surroundings, surroundings_rng)
@@ -171,20 +167,15 @@ class SimulatedTray:
         """Supply and air act from now on as they do at t_s; returns what is measured of them."""
         if self.settings.surroundings == Surroundings():
             return {}
-        plant, now = self._plant, self._surroundings
+        now = self._surroundings
         now.advance(t_s)
-        if isinstance(plant, FourPinTray):
-            plant.supply_factor, plant.supply_held = now.supply_factor, self.settings.surroundings.supply_held
-            return now.measure(plant.supply_v, np.full(self.fans, np.nan))
-        assert isinstance(plant, DcFans), "there are no others"
-        plant.surround(now.supply_factor, now.drag_factor)
-        return now.measure(plant.supply_v, plant.current_a)
+        return now.measure(*self._plant.surround(now.supply_factor, now.drag_factor))
 
     def _measure(self, t_s: float) -> Array:
         """(fans,) tacho readings. Faults do not change which random numbers are drawn."""
-        faults = tacho_faults(self.settings.faults, self.fans, t_s)
-        self._reading_rad_s = np.where(faults.stuck, self._reading_rad_s, self._tacho.read())
-        missing = self._dropout_rng.random(self.fans) < np.maximum(faults.dropout, self.settings.tacho.missing_readings)
+        stuck, dropout = tacho_faults(self.settings.faults, self.fans, t_s)
+        self._reading_rad_s = np.where(stuck, self._reading_rad_s, self._tacho.read())
+        missing = self._dropout_rng.random(self.fans) < np.maximum(dropout, self.settings.tacho.missing_readings)
         return np.where(missing, np.nan, self._reading_rad_s)
 
     def _next_duty(self, t_s: float, speed_rad_s: Array, step_s: float) -> Array:
@@ -206,6 +197,15 @@ class SimulatedTray:
                 self._started_s.setdefault(number, t_s)
             elif number in self._started_s:
                 self._stopped_s.setdefault(number, t_s)
+
+
+def _fans(settings: TraySettings, rng: np.random.Generator) -> Fans:
+    of = settings.fans, settings.fans_seed, settings.fan_variation
+    if settings.fan == "dc":
+        return DcFans(tray_of_fans(*of))
+    fans = FourPinTray(four_pin_tray(*of), rng, settings.fans)
+    fans.supply_held = settings.surroundings.supply_held
+    return fans
 
 
 def _check(settings: TraySettings) -> None:

@@ -14,6 +14,8 @@ from typing import Any
 from fantwin.schemas.units import NS_PER_S
 from fantwin.simulation.tray import SimulatedTray
 
+AS_SET = ("fans", "fan", "rate_hz", "profile", "seed", "fans_seed", "fan_variation", "lost", "jitter_us")
+
 
 def truth(tray: SimulatedTray, start_ns: int | None, *, complete: bool, counts: Mapping[str, int]) -> dict[str, Any]:
     """The ground truth so far. start_ns: epoch time of t_s = 0, None before the start.
@@ -27,15 +29,7 @@ def truth(tray: SimulatedTray, start_ns: int | None, *, complete: bool, counts: 
         "end_ns": _at(start_ns, tray.t_s) if complete else None,
         **counts,
         "faults": [_fault(tray, number, start_ns, complete) for number in range(len(settings.faults))],
-        "fans": settings.fans,
-        "fan": settings.fan,
-        "rate_hz": settings.rate_hz,
-        "profile": settings.profile,
-        "seed": settings.seed,
-        "fans_seed": settings.fans_seed,
-        "fan_variation": settings.fan_variation,
-        "lost": settings.lost,
-        "jitter_us": settings.jitter_us,
+        **{name: getattr(settings, name) for name in AS_SET},
         "clock": asdict(settings.clock),
         "tacho": settings.tacho.as_record(),
         "surroundings": asdict(settings.surroundings),

@@ -11,7 +11,8 @@ the fan is on and lasts for a quarter of the part; the last part of a fault and 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from typing import TypeAlias
 
@@ -24,7 +25,7 @@ from fantwin.pipeline.learning.sweep_steps import LEVELS, SHORT_LEVELS, levels_o
 from fantwin.schemas.messages import Array, Raw
 from fantwin.schemas.tacho import Tacho
 from fantwin.schemas.units import NS_PER_S
-from fantwin.simulation.excitation import Thermostat
+from fantwin.simulation.excitation import UPDATES_HZ, Thermostat
 from fantwin.simulation.faults import CLOG_S, Fault, four_pin_damage
 from fantwin.simulation.four_pin import FourPinFans, FourPinParameters, four_pin_tray
 from fantwin.simulation.tacho import CountingTacho
@@ -69,12 +70,28 @@ Ageing: TypeAlias = Callable[[float], Array]
 """(columns,) factor on the speed of each fan at a time in seconds"""
 
 
+class RackThermostat(Thermostat):
+    """Its commands at many times at once."""
+
+    def side_by_side(self, starts_s: Sequence[float], seconds: float) -> RackThermostat:
+        """A thermostat of as many times the fans, which have the commands from each of these times on, for a time."""
+        found = copy(self)
+        numbers = np.arange(round(seconds * UPDATES_HZ))
+        parts = [self._steps[(round(start_s * UPDATES_HZ) + numbers) % len(self._steps)] for start_s in starts_s]
+        found._steps = np.concatenate(parts, axis=1)
+        return found
+
+    def is_on(self, times_s: Array, fan: int) -> NDArray[np.bool_]:
+        """Whether a fan has a duty at times; same shape."""
+        return self._steps[(times_s * UPDATES_HZ + 1e-6).astype(np.int64) % len(self._steps), fan] > 0
+
+
 @dataclass(frozen=True)
 class Racks:
     """Racks of fans, and the commands of their runs. Each field of parameters: (columns,), rack by rack."""
 
     parameters: FourPinParameters
-    thermostat: Thermostat
+    thermostat: RackThermostat
     seconds: float
     seed: int
     copies: int = 1
@@ -94,7 +111,7 @@ class Racks:
 def racks(count: int, seconds: float, seed: int, fans_seed: int = FANS_SEED) -> Racks:
     """So many racks for a time. The same fans_seed gives the same fans, the same seed the same commands and chances."""
     columns = count * RACK_FANS
-    thermostat = Thermostat(columns, seed, *DUTIES, period_s=seconds)
+    thermostat = RackThermostat(columns, seed, *DUTIES, period_s=seconds)
     return Racks(four_pin_tray(columns, fans_seed), thermostat, seconds, seed)
 
 

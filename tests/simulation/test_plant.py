@@ -13,12 +13,11 @@ from fantwin.simulation.plant import (
     advance,
     at_rest,
     drive,
-    fan,
     tray_of_fans,
 )
 from fantwin.simulation.tray import SimulatedTray, TraySettings
 
-ONE = tray_of_fans(1, seed=0, fan_variation=0.0)
+ONE, BASE = tray_of_fans(1, seed=0, fan_variation=0.0), FanParameters()
 
 
 def friction_v(speed_rad_s: np.ndarray, parameters: FanParameters) -> np.ndarray | float:
@@ -33,7 +32,7 @@ def settle(duty: float, parameters: FanParameters = ONE, disturbance: Disturbanc
 
 
 def test_a_turning_fan_follows_the_equation_of_motion() -> None:
-    base = fan(ONE, 0)
+    base = BASE
 
     def motion(_t: float, x: np.ndarray) -> list[float]:
         w, current = x
@@ -52,13 +51,12 @@ def test_a_turning_fan_follows_the_equation_of_motion() -> None:
 
 
 def just_enough_for(torque_v: float) -> float:
-    base = fan(ONE, 0)
-    dead, full = float(base.duty_dead), float(base.duty_full)
+    dead, full = float(BASE.duty_dead), float(BASE.duty_full)
     return dead + torque_v / 12.0 * (full - dead)
 
 
 def test_a_rotor_stands_exactly_still_below_breakaway_and_starts_above_it() -> None:
-    breakaway_v = float(fan(ONE, 0).breakaway_v)
+    breakaway_v = float(BASE.breakaway_v)
     assert settle(just_enough_for(0.98 * breakaway_v)) == 0.0
     assert settle(just_enough_for(1.02 * breakaway_v)) > 1.0
 
