@@ -4,6 +4,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from bench.detection.tray_run import run_of
 from fantwin.simulation.errors import SimulationError
 from fantwin.simulation.faults import Fault, check_schedule, parse_fault
 from fantwin.simulation.tacho import NoisyTacho, TachoSettings
@@ -19,14 +20,9 @@ QUIET = TraySettings(
 )
 
 
-def speeds(*faults: str, duty: float = 0.6) -> np.ndarray:
+def speeds(*faults: str) -> np.ndarray:
     """(n, 2) speeds of two equal fans at one duty, the first with the faults."""
-    tray = SimulatedTray(replace(QUIET, faults=tuple(map(parse_fault, faults))))
-    tray.command(np.full(2, duty))
-    rows = []
-    while tray.due_s() is not None:
-        rows.append(tray.take().speed_rad_s)
-    return np.array(rows)
+    return run_of(replace(QUIET, faults=tuple(map(parse_fault, faults))), 0.6).speed_rad_s
 
 
 @pytest.mark.parametrize(
@@ -104,24 +100,16 @@ def test_a_fault_is_read_from_the_command_line() -> None:
         ("tacho-dropout:fan=1,size=1.1", "give one from 0 to 1"),
         ("tacho-stuck:fan=1,size=2", "has no size"),
         ("rotor:fan=1,size=nan", "must be finite"),
-    ],
-)
-def test_a_wrong_fault_is_a_one_line_error_that_names_the_part(text: str, message: str) -> None:
-    with pytest.raises(SimulationError, match=message) as caught:
-        parse_fault(text)
-    assert text in str(caught.value)
-    assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
         ("inlet:fan=2", "fan 2 does not exist; the tray has fans 0 to 1"),
         ("inlet:fan=1,start=10", "start = 10 s is after the end at 10 s"),
         ("wear:fan=1", "give stop=S"),
         ("clog:fan=1", "dc fans have no such fault; they have inlet, rotor"),
     ],
 )
-def test_a_fault_that_does_not_fit_the_tray_is_refused(text: str, message: str) -> None:
-    with pytest.raises(SimulationError, match=message):
+def test_a_wrong_fault_or_one_that_does_not_fit_the_tray_is_a_one_line_error_that_names_the_part(
+    text: str, message: str
+) -> None:
+    with pytest.raises(SimulationError, match=message) as caught:
         check_schedule([parse_fault(text)], fans=2, duration_s=10.0)
+    assert str(caught.value).startswith((f"fault {text!r}: ", f"{text.partition(':')[0]} fault: "))
+    assert "\n" not in str(caught.value)

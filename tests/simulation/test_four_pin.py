@@ -5,12 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from bench.detection.tray_run import run_of
 from fantwin.schemas.tacho import Tacho
 from fantwin.simulation.excitation import STEPS, Thermostat
 from fantwin.simulation.faults import CLOG_S, four_pin_damage, parse_fault
 from fantwin.simulation.four_pin import FourPinDamage, FourPinFans, FourPinParameters, four_pin_tray, wanted_speed_rad_s
 from fantwin.simulation.tacho import TachoSettings
-from fantwin.simulation.tray import SimulatedTray, TraySettings
+from fantwin.simulation.tray import TraySettings
 
 FAN = FourPinParameters()
 STEADY = {"sag": 0.0, "wander": 0.0, "air": 0.0}
@@ -139,24 +140,15 @@ RACK = TraySettings(
 )
 
 
-def samples(settings: TraySettings, duty: float | None = None) -> tuple[np.ndarray, np.ndarray]:
-    tray = SimulatedTray(settings)
-    if duty is not None:
-        tray.command(np.full(settings.fans, duty))
-    taken = []
-    while tray.due_s() is not None:
-        taken.append(tray.take())
-    return np.array([s.command for s in taken]), np.array([s.speed_rad_s for s in taken])
-
-
 def test_a_tray_shows_a_blocked_rotor_no_power_and_a_loose_wire_of_their_fans_alone() -> None:
     texts = (
         "blocked:fan=0,start=20,stop=40",
         "no-power:fan=1,start=20,stop=40",
         "tacho-dropout:fan=2,start=20,size=0.35",
     )
-    _, healthy = samples(RACK, duty=0.6)
-    _, speed = samples(replace(RACK, faults=tuple(map(parse_fault, texts))), duty=0.6)
+    healthy, speed = (
+        run_of(each, 0.6).speed_rad_s for each in (RACK, replace(RACK, faults=tuple(map(parse_fault, texts))))
+    )
     assert np.array_equal(speed[:200], healthy[:200])
     assert np.array_equal(speed[:, 3], healthy[:, 3]) is False  # the load on the supply is another
     assert np.all(speed[215:400, 0] == 0.0)  # a window and the braking later

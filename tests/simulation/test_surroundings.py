@@ -8,34 +8,28 @@ import numpy as np
 import pytest
 
 from fantwin.schemas.device_sample import DeviceSample
+from bench.detection.tray_run import samples_of
 from fantwin.simulation.errors import SimulationError
 from fantwin.simulation.faults import Fault
 from fantwin.simulation.plant import Surroundings
 from fantwin.simulation.tacho import NoisyTacho, TachoSettings
 from fantwin.simulation.tray import SimulatedTray, TraySettings
 
+DUTY = 0.7
 ALL = ("supply_voltage_v", "current_a", "temperature_c")
 STILL = TraySettings(
     fans=2, rate_hz=20.0, duration_s=12.0, tacho=TachoSettings(noise=NoisyTacho(0.0)), fan_variation=0.0
 )
 
 
-def samples(settings: TraySettings, duty: float = 0.7) -> list[DeviceSample]:
-    tray, found = SimulatedTray(settings), []
-    tray.command(np.full(settings.fans, duty))
-    while tray.due_s() is not None:
-        found.append(tray.take())
-    return found
-
-
 def last(settings: TraySettings) -> DeviceSample:
-    return samples(settings)[-1]
+    return samples_of(settings, DUTY)[-1]
 
 
 def test_without_surroundings_samples_are_as_before_and_have_no_columns() -> None:
-    plain = samples(STILL)
+    plain = samples_of(STILL, DUTY)
     assert all(not sample.auxiliary for sample in plain)
-    measured = samples(replace(STILL, surroundings=Surroundings(measured=ALL)))
+    measured = samples_of(replace(STILL, surroundings=Surroundings(measured=ALL)), DUTY)
     for one, other in zip(plain, measured, strict=True):
         np.testing.assert_array_equal(one.speed_rad_s, other.speed_rad_s)
     assert list(measured[0].auxiliary) == [*ALL]

@@ -7,6 +7,7 @@ from bench.training import published_fan
 from bench.training.published_fan import DRAG, INERTIA, NOISE_RAD_S, RATE_HZ, ROUGH_RANGE, VISCOUS
 from fantwin.schemas.tacho import Tacho
 from fantwin.twin.fitting.balance_fit import balance_of, filtered_terms
+from fantwin.twin.models.physics import PARAMETER_NAMES
 from fantwin.twin.runs import Array, Run
 
 __all__ = [
@@ -14,6 +15,8 @@ __all__ = [
     "PUBLISHED_PARAMETERS",
     "RATE_HZ",
     "counted_run",
+    "parameters_of",
+    "published_parameters",
     "published_run",
     "rough_run",
     "stairs",
@@ -21,6 +24,16 @@ __all__ = [
 ]
 
 PUBLISHED_PARAMETERS = np.array([INERTIA, VISCOUS, DRAG])
+
+
+def parameters_of(fans: int = 1, **values: float) -> Array:
+    """(fans, 4) parameters of equal fans; 0 for those that are not given."""
+    return np.tile([values.get(name, 0.0) for name in PARAMETER_NAMES], (fans, 1))
+
+
+def published_parameters(fans: int = 1, **others: float) -> Array:
+    """(fans, 4) those of the published fan, but for some."""
+    return parameters_of(fans, **{"J": INERTIA, "alpha": VISCOUS, "C_D": DRAG} | others)
 
 
 def stairs(

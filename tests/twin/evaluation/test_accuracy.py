@@ -15,19 +15,10 @@ from fantwin.twin.models.model import TwinModel
 from fantwin.twin.models.narx import PARAMETER_COUNT, Narx
 from fantwin.twin.models.network import Scaling
 from fantwin.twin.models.physical import PhysicalModel
-from fantwin.twin.models.physics import PARAMETER_NAMES
 from fantwin.twin.runs import Array, Run
 from tests.support import fan_data
 
-
-def parameters_of(**values: float) -> Array:
-    return np.array([[values.get(name, 0.0) for name in PARAMETER_NAMES]])
-
-
-PUBLISHED = dict(zip(("J", "alpha", "C_D"), fan_data.PUBLISHED_PARAMETERS.tolist(), strict=True))
-
-PARAMETERS = parameters_of(**PUBLISHED)
-
+PARAMETERS = fan_data.published_parameters()
 SIGMA = np.array([fan_data.NOISE_RAD_S])
 
 
@@ -50,7 +41,7 @@ def test_the_true_model_leaves_the_noise_and_two_sigma_cover_95_percent(run: Run
 
 
 def test_r2_is_zero_for_a_model_as_good_as_the_mean() -> None:
-    still = parameters_of(J=1.0, alpha=1e-9)
+    still = fan_data.parameters_of(J=1.0, alpha=1e-9)
     speed = np.tile([5.0, 5.0, 5.0, 5.0, 5.0, 4.0, 6.0], 10)
     run = Run("flat", np.arange(70) / 100.0, np.zeros(70), speed)
     figures = figures_on(run, still, np.ones(1))
@@ -106,7 +97,7 @@ def test_the_one_step_error_takes_speeds_from_the_fan_and_past_commands_from_the
     model: TwinModel, lag_s: float
 ) -> None:
     run = lossy_and_irregular()
-    parameters = np.tile(parameters_of(**PUBLISHED, lag_s=lag_s), (2, 1))
+    parameters = fan_data.published_parameters(2, lag_s=lag_s)
     expected = np.full_like(run.speed_rad_s, np.nan)
     speeds = model.state_layout.speed
     state = model.state_layout.initial_state(np.zeros(2), run.command[0])
@@ -123,7 +114,7 @@ def test_the_one_step_error_takes_speeds_from_the_fan_and_past_commands_from_the
 
 
 def test_a_diverging_free_run_is_infinite_not_an_exception(run: Run) -> None:
-    runaway = parameters_of(J=0.001, C_D=-1.0)
+    runaway = fan_data.parameters_of(J=0.001, C_D=-1.0)
     figures = figures_on(run, runaway)
     assert figures.rmse_rad_s == np.inf
     assert figures.r2 == -np.inf

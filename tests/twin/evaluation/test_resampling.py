@@ -10,7 +10,6 @@ from fantwin.twin.models.hybrid import UNITS, Hybrid
 from fantwin.twin.models.model import TwinModel
 from fantwin.twin.models.network import Scaling, TanhNetwork
 from fantwin.twin.models.physical import PhysicalModel
-from fantwin.twin.models.physics import PARAMETER_NAMES
 from fantwin.twin.runs import Array, Run
 from tests.support import fan_data
 
@@ -86,13 +85,6 @@ def test_a_run_that_cannot_be_resampled_is_refused_in_one_line() -> None:
         on_grid([run.rows(0, 3)], "irregular")
 
 
-def parameters_of(**values: float) -> Array:
-    return np.array([[values.get(name, 0.0) for name in PARAMETER_NAMES]])
-
-
-PUBLISHED = dict(zip(("J", "alpha", "C_D"), fan_data.PUBLISHED_PARAMETERS.tolist(), strict=True))
-
-
 def simulated(model: TwinModel, parameters: Array, seed: int = 8) -> Run:
     """40 s at 100 Hz of a fan that is as the model says, integrated in steps of 1 ms, with noise."""
     rng = np.random.default_rng(seed)
@@ -120,7 +112,7 @@ def random_hybrid() -> Hybrid:
     ("model", "lag_s"), [(PhysicalModel(), 0.05), (random_hybrid(), 0.0)], ids=["physical", "hybrid"]
 )
 def test_a_twin_is_as_good_on_every_grid(model: TwinModel, lag_s: float) -> None:
-    parameters = parameters_of(**PUBLISHED, lag_s=lag_s)
+    parameters = fan_data.published_parameters(lag_s=lag_s)
     # 800 samples at 20 Hz: their root mean square scatters by 2.5 %.
     for error in errors_in_noise(model, parameters, simulated(model, parameters)).values():
         assert error == pytest.approx(1.0, abs=0.06)
