@@ -45,13 +45,7 @@ def resampled(run: Run, rate_hz: float) -> Run:
         raise TwinError(f"run {run.name!r}: {run.duration_s:.3g} s are shorter than one step at {rate_hz:g} Hz")
     t_s = run.t_s[0] + np.arange(steps + 1) / rate_hz
     held = np.clip(np.searchsorted(run.t_s, t_s, "right") - 1, 0, None)
-    return replace(
-        run,
-        t_s=t_s,
-        command=_mean_command(run, t_s),
-        speed_rad_s=_speed_rad_s(run, t_s),
-        auxiliary=run.auxiliary_in(held),
-    )
+    return _at_times(run, t_s, _speed_rad_s(run, t_s), held)
 
 
 def irregular(run: Run, seed: int = 0) -> Run:
@@ -65,7 +59,7 @@ def irregular(run: Run, seed: int = 0) -> Run:
     kept = kept[kept < run.samples]
     if len(kept) < 2:
         raise TwinError(f"run {run.name!r}: {run.samples} samples are too few to thin; give a longer run")
-    return _with_samples(run, kept)
+    return _at_times(run, run.t_s[kept], run.speed_rad_s[kept], kept)
 
 
 def thinned(run: Run, every: int) -> Run:
@@ -74,18 +68,13 @@ def thinned(run: Run, every: int) -> Run:
     Also for tachos that count: their readings are compared with the mean of a free run over the window, at any times.
     """
     kept = np.arange(0, run.samples, every)
-    return run if every == 1 or len(kept) < 2 else _with_samples(run, kept)
+    return run if every == 1 or len(kept) < 2 else _at_times(run, run.t_s[kept], run.speed_rad_s[kept], kept)
 
 
-def _with_samples(run: Run, kept: NDArray[np.intp]) -> Run:
-    t_s = run.t_s[kept]
-    return replace(
-        run,
-        t_s=t_s,
-        command=_mean_command(run, t_s),
-        speed_rad_s=run.speed_rad_s[kept],
-        auxiliary=run.auxiliary_in(kept),
-    )
+def _at_times(run: Run, t_s: Array, speed_rad_s: Array, rows: NDArray[np.intp]) -> Run:
+    """The run at other times. rows: of the run, whose auxiliary columns it has."""
+    command = _mean_command(run, t_s)
+    return replace(run, t_s=t_s, command=command, speed_rad_s=speed_rad_s, auxiliary=run.auxiliary_in(rows))
 
 
 def on_grid(runs: Sequence[Run], grid: Grid, seed: int = 0) -> list[Run]:

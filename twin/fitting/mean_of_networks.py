@@ -22,7 +22,7 @@ def mean_model(trained: Sequence[tuple[NetworkOde, Array]]) -> tuple[NetworkOde,
     """The model of the mean acceleration, and its parameters (fans, 4). trained: models and their parameters."""
     model, parameters = trained[0]
     if any(np.any(one.theta) for one, _ in trained[1:]):
-        model = model.with_network(_mean_network([one.network for one, _ in trained]))
+        model = replace(model, network=_mean_network([one.network for one, _ in trained]))
     if any(np.any(own != parameters) for _, own in trained[1:]):  # equal ones stay equal to the bit
         parameters = _mean_physics(np.array([own for _, own in trained]))
     return model, parameters

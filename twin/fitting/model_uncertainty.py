@@ -14,6 +14,7 @@ motion get less weight than held ones.
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from scipy.linalg import cholesky, get_lapack_funcs, solve_triangular
@@ -85,24 +86,18 @@ def model_uncertainty(
     offsets_rad_s = scale.speed_scale_rad_s * np.array((*(-each for each in reversed(OFFSETS)), 0.0, *OFFSETS))
     reach = np.linspace(-2.0 * REACH, 2.0 * REACH, SETTLING_SPEEDS)
     reach_rad_s = scale.speed_offset_rad_s + scale.speed_scale_rad_s * reach
-    settled_rad_s, std_rad_s = [], []
-
-    @lru_cache(maxsize=1)
-    def settling(lost: float) -> Settling:
-        return Settling(model, commands - lost, reach_rad_s)
-
+    settled_rad_s, std_rad_s = _settled_rad_s(model, commands, reach_rad_s, parameters, friction), []
     roots = _roots([each.squares for each in evidence])
-    for own, lost, root in zip(parameters, friction.tolist(), roots, strict=True):
-        settled_rad_s.append(settling(lost).of_fan(own))
-        speeds_rad_s = settled_rad_s[-1][:, np.newaxis] + offsets_rad_s
+    for own, settled, root in zip(parameters, settled_rad_s, roots, strict=True):
+        speeds_rad_s = settled[:, np.newaxis] + offsets_rad_s
         held_s = _held_s(own, speeds_rad_s, SLOWEST * typical_s)
         std_rad_s.append(_left_rad_s2(root, basis, speeds_rad_s, commands) * held_s)
     table = ModelUncertainty(
-        tuple(significant(offsets_rad_s)),
-        tuple(significant(commands)),
-        tuple(tuple(tuple(significant(row, 4)) for row in each) for each in std_rad_s),
+        significant(offsets_rad_s),
+        significant(commands),
+        significant(np.array(std_rad_s), 4),
         seen_std_rad_s=(0.0,) * len(std_rad_s),  # found below
-        settled_speed_rad_s=tuple(tuple(significant(each)) for each in settled_rad_s),
+        settled_speed_rad_s=significant(settled_rad_s),
     )
     seen_rad_s = [
         _seen_std_rad_s(table.of_fans([fan]), its.held_command, settled, stands_below_rad_s)
@@ -112,9 +107,11 @@ def model_uncertainty(
     return replace(table, seen_std_rad_s=tuple(of_others if each is None else each for each in seen_rad_s))
 
 
-def significant(values: Array, digits: int = 7) -> list[float]:
-    """Values with so many significant digits: commands and speeds may be of any size."""
-    return [float(f"{value:.{digits}g}") for value in values.tolist()]
+def significant(values: Array, digits: int = 7) -> tuple[Any, ...]:
+    """Values with so many significant digits, row by row: commands and speeds may be of any size."""
+    if values.ndim > 1:
+        return tuple(significant(row, digits) for row in values)
+    return tuple(float(f"{value:.{digits}g}") for value in values.tolist())
 
 
 def _commands(evidence: Sequence[FanEvidence], scale: Scaling) -> Array:
@@ -145,21 +142,26 @@ def _seen_std_rad_s(
     return float(f"{np.quantile(std_rad_s, SEEN_QUANTILE):.4g}")
 
 
-class Settling:
-    """The speeds at which fans with one network settle under acting commands, between the given ones, which rise."""
+def _settled_rad_s(model: FanOde, commands: Array, speeds_rad_s: Array, parameters: Array, friction: Array) -> Array:
+    """(fans, commands) the speeds at which fans with one network settle, between the given ones, which rise.
 
-    def __init__(self, model: FanOde, commands: Array, speeds_rad_s: Array) -> None:
-        self._model, self._commands, self._speeds_rad_s = model, len(commands), speeds_rad_s
-        command, speed_rad_s = np.meshgrid(commands, speeds_rad_s, indexing="ij")
-        self._command, self._speed_rad_s = command.ravel(), speed_rad_s.ravel()
+    parameters: (fans, 4). friction: (fans,) what a drive takes off the command before it acts.
+    """
+
+    @lru_cache(maxsize=1)
+    def of_network(lost: float) -> tuple[Array, Array, Array | float]:
+        """Speed, acting command and the acceleration that the network gives, for each pair of the two."""
+        command, speed_rad_s = (each.ravel() for each in np.meshgrid(commands - lost, speeds_rad_s, indexing="ij"))
         network = model.network
-        self._learned = 0.0 if network is None else network.acceleration(self._speed_rad_s, self._command)
+        return speed_rad_s, command, 0.0 if network is None else network.acceleration(speed_rad_s, command)
 
-    def of_fan(self, own: Array) -> Array:
-        """(commands,) rad/s, of the fan with the physics own (4,)."""
-        known = acceleration(self._speed_rad_s[:, np.newaxis], self._command[:, np.newaxis], own[np.newaxis])[:, 0]
-        braking = -np.minimum.accumulate((self._learned + known).reshape(self._commands, -1), axis=1)
-        return np.array([np.interp(0.0, of_command, self._speeds_rad_s) for of_command in braking])
+    settled = []
+    for own, lost in zip(parameters, friction.tolist(), strict=True):
+        speed_rad_s, command, learned = of_network(lost)
+        known = acceleration(speed_rad_s[:, np.newaxis], command[:, np.newaxis], own[np.newaxis])[:, 0]
+        braking = -np.minimum.accumulate((learned + known).reshape(len(commands), -1), axis=1)
+        settled.append([np.interp(0.0, of_command, speeds_rad_s) for of_command in braking])
+    return np.array(settled)
 
 
 def _left_rad_s2(root: Array, basis: Basis, speeds_rad_s: Array, commands: Array) -> Array:
@@ -232,22 +234,16 @@ def placed_uncertainty(
     """
     speeds_rad_s = SETTLES_TO * top_speed_rad_s * np.linspace(-1.0, 1.0, SETTLING_SPEEDS)
     commands, largest = np.array(of_type.commands), np.max(np.array(of_type.std_rad_s), axis=0)
-    settled, tables = [], []
-
-    @lru_cache(maxsize=1)
-    def settling(lost: float) -> Settling:
-        return Settling(model, commands - lost, speeds_rad_s)
-
-    for own, spread, lost in zip(parameters, covariance, friction.tolist(), strict=True):
-        own_rad_s, *moved_rad_s = (settling(lost).of_fan(each) for each in (own, *_moved(own, spread, top_speed_rad_s)))
-        unknown_rad_s = np.sqrt(np.sum(np.square(np.array(moved_rad_s) - own_rad_s), axis=0))
-        settled.append(own_rad_s)
-        tables.append(np.hypot(largest, unknown_rad_s[:, np.newaxis]))
+    cases = [(own, *_moved(own, its, top_speed_rad_s)) for own, its in zip(parameters, covariance, strict=True)]
+    of_all = np.repeat(friction, len(cases[0]))
+    settled = _settled_rad_s(model, commands, speeds_rad_s, np.concatenate(cases), of_all)
+    settled = settled.reshape(len(parameters), -1, len(commands))
+    unknown_rad_s = np.sqrt(np.sum(np.square(settled[:, 1:] - settled[:, :1]), axis=1))
     seen = max(of_type.seen_std_rad_s, default=0.0)
     return replace(
         of_type,
-        std_rad_s=tuple(tuple(tuple(significant(row, 4)) for row in table) for table in tables),
-        settled_speed_rad_s=tuple(tuple(significant(each)) for each in settled),
+        std_rad_s=significant(np.hypot(largest, unknown_rad_s[:, :, np.newaxis]), 4),
+        settled_speed_rad_s=significant(settled[:, 0]),
         seen_std_rad_s=(seen,) * len(parameters),
     )
 

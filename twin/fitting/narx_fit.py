@@ -25,6 +25,12 @@ from fantwin.twin.models.recursion import dtbtrs
 from fantwin.twin.runs import Array, Run, starting_speed_rad_s
 
 TOLERANCE = 1e-3
+# Older samples say less about the next one; a factor of 0.7 per lag leaves about 0.03 for the oldest of ten.
+LAG_DECAY = 0.7
+LAG_SCALE = np.concatenate(
+    [np.repeat(LAG_DECAY ** np.concatenate((np.arange(ORDER), np.arange(ORDER + 1))), UNITS), np.ones(2 * UNITS + 1)]
+)
+"""(1151,) relative size that is expected of each weight: it decays with the lag of its input"""
 
 IterationDone = Callable[[float], None]
 """Called after every iteration with the free-run rmse in rad/s over the samples that count."""
@@ -42,32 +48,29 @@ class Candidate:
 class OutputErrorFit:
     """Fits theta to stretches: runs of one fan each, every one started from its first measured speeds.
 
-    prior_mean, prior_weight: (1151,) the mean of the prior of each weight, and its relative strength.
+    prior_mean: (1151,) the mean of the prior of each weight, whose relative strength follows from LAG_SCALE.
     """
 
     groups = 1
 
-    def __init__(self, stretches: Sequence[Run], scaling: Scaling, prior_mean: Array, prior_weight: Array) -> None:
-        self.stretches = stretches
-        self.scaling = scaling
-        self.prior_mean = prior_mean
-        self.prior_weight = prior_weight
+    def __init__(self, stretches: Sequence[Run], scaling: Scaling, prior_mean: Array) -> None:
+        self.stretches, self.scaling, self.prior_mean = stretches, scaling, prior_mean
         self.measured = [np.isfinite(stretch.speed_rad_s[:, 0]) for stretch in stretches]
-        self.precision, self.scale_rad_s = prior_weight, 1.0
+        self.precision, self.scale_rad_s = LAG_SCALE**-2, 1.0
 
     def minimise(
         self, theta: Array, prior_precision: float, max_iterations: int, iteration_done: IterationDone
     ) -> Array:
         """The weights after max_iterations at most, or when one lowers the cost by less than a thousandth.
 
-        prior_precision: inverse variance of a weight of prior_weight one, residuals having variance one.
+        prior_precision: inverse variance of a weight of LAG_SCALE one, residuals having variance one.
         """
 
         def accepted(_iteration: int, point: Candidate) -> bool:
             iteration_done(float(np.sqrt(np.mean(self._residual(point.speeds) ** 2))))
             return False
 
-        self.precision = prior_precision * self.prior_weight
+        self.precision = prior_precision * LAG_SCALE**-2
         self.scale_rad_s = self._robust_scale(self._free_run(theta))
         point, _, _ = minimise(self, self._candidate(theta), max_iterations, TOLERANCE, accepted)
         return point.theta

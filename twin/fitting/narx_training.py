@@ -26,7 +26,7 @@ from scipy.signal import lfilter
 
 from fantwin.twin.errors import TwinError
 from fantwin.twin.evaluation.accuracy import evaluation_pieces, free_run_residuals, pooled_rmse_rad_s
-from fantwin.twin.fitting.narx_fit import OutputErrorFit, forgets_its_start
+from fantwin.twin.fitting.narx_fit import LAG_SCALE, OutputErrorFit, forgets_its_start
 from fantwin.twin.models.narx import INPUTS, ORDER, UNITS, Narx, regressor_rows
 from fantwin.twin.models.network import Scaling
 from fantwin.twin.models.physics import PARAMETER_NAMES
@@ -34,19 +34,11 @@ from fantwin.twin.progress import Progress, unreported
 from fantwin.twin.runs import STARTING_SAMPLES, Array, Run
 
 TIME_CONSTANTS_SAMPLES = np.geomspace(0.5, 2000.0, 40)
-# Older samples say less about the next one; a factor of 0.7 per lag leaves about 0.03 for the oldest of ten.
-LAG_DECAY = 0.7
 # Standard deviation of a unit's input when all its regressors have standard deviation one.
 UNIT_SLOPE = 0.2
 # Regressors of a linear filter lie in a plane. Scatter around it makes the layer linear off the plane as well.
 SCATTER = 0.1
 MAX_ROWS = 4000
-
-
-def lag_scale() -> Array:
-    """(1151,) relative size that is expected of each weight: it decays with the lag of its input."""
-    lags = np.concatenate((np.arange(ORDER), np.arange(ORDER + 1)))
-    return np.concatenate((np.repeat(LAG_DECAY**lags, UNITS), np.ones(2 * UNITS + 1)), dtype=np.float64)
 
 
 def starting_weights(
@@ -65,7 +57,7 @@ def starting_weights(
     regressors = np.concatenate([regressor_rows(*pair) for pair in zip(smooth, commands, strict=True)])
     regressors = rng.choice(regressors, min(len(regressors), MAX_ROWS), replace=False)
     regressors = regressors + rng.normal(scale=SCATTER, size=regressors.shape)
-    input_weights = rng.normal(size=(INPUTS, UNITS)) * lag_scale()[: INPUTS * UNITS].reshape(INPUTS, UNITS)
+    input_weights = rng.normal(size=(INPUTS, UNITS)) * LAG_SCALE[: INPUTS * UNITS].reshape(INPUTS, UNITS)
     input_weights *= UNIT_SLOPE / np.linalg.norm(input_weights, axis=0).mean()
     bias = rng.uniform(-1.0, 1.0, UNITS)
     layer = np.column_stack((np.tanh(regressors @ input_weights + bias), np.ones(len(regressors))))
@@ -134,7 +126,7 @@ def train_narx(
     parted = [(pieces, evaluation_pieces(validation_runs))] if validation_runs else leave_out(runs)
     folds = [_Fold(*parts, start, scaling, rng) for parts in parted]
     chosen = _relax_prior(folds, count, round(CHOOSING_SHARE * max_iterations))
-    whole = OutputErrorFit(stretches, scaling, start, lag_scale() ** -2)
+    whole = OutputErrorFit(stretches, scaling, start)
     model = Narx(start, scaling)
     for precision, theta in reversed(chosen):
         limit = min(max_iterations - count.iterations, ITERATIONS_A_PRECISION)
@@ -197,7 +189,7 @@ class _Fold:
     def __init__(
         self, fitted: Sequence[Run], judged: Sequence[Run], start: Array, scaling: Scaling, rng: np.random.Generator
     ) -> None:
-        self.fit = OutputErrorFit(draw_stretches(fitted, rng), scaling, start, lag_scale() ** -2)
+        self.fit = OutputErrorFit(draw_stretches(fitted, rng), scaling, start)
         self.judged = judged
         self.theta = start
 

@@ -40,15 +40,8 @@ class _FanSeries:
     reach_s: float
     mean_delay_s: float
 
-    def lowest_command(self, seconds: float) -> Array:
-        """(n,) the lowest command of the last seconds; NaN before so many have passed."""
-        return self._of_past(minimum_filter1d, seconds)
-
-    def highest_command(self, seconds: float) -> Array:
-        """(n,) the highest command of the last seconds; NaN before so many have passed."""
-        return self._of_past(maximum_filter1d, seconds)
-
-    def _of_past(self, extreme: Callable[..., Array], seconds: float) -> Array:
+    def of_past(self, extreme: Callable[..., Array], seconds: float) -> Array:
+        """(n,) the lowest or the highest command of the last seconds; NaN before so many have passed."""
         size = round((seconds + self.reach_s) / self.period_s) + 1
         found = extreme(self.command, size, origin=(size - 1) // 2)
         found[: size - 1] = np.nan
@@ -58,38 +51,39 @@ class _FanSeries:
 def find_standstill(runs: Sequence[Run]) -> Standstill | None:
     """What the runs show; None where they do not show at which commands fans turn, or drive them both ways."""
     series = [one for run in runs for one in _series(run)]
-    speeds = [one.speed_rad_s[np.isfinite(one.speed_rad_s)] for one in series]
-    if not any(len(one) for one in speeds) or any((one.command < 0.0).any() for one in series):
-        return None
-    top = max(float(one.max()) for one in speeds if len(one))
-    if top <= 0.0:
+    top = max((float(np.nanmax(one.speed_rad_s, initial=0.0)) for one in series), default=0.0)
+    if top <= 0.0 or any((one.command < 0.0).any() for one in series):
         return None
     at_rest_below = LOWEST_SHARE_OF_TOP * top
     rests = [rest for one in series for rest in _rests(one, at_rest_below)]
-    off = max((rest.stopping for rest in rests if rest.stopping is not None), default=None)
-    stood = max((rest.stood for rest in rests if rest.stood is not None), default=-np.inf)
+    stood, off = (max((rest[which] for rest in rests), default=-np.inf) for which in (0, 1))
     turning = _turning_command(series, at_rest_below, stood)
     if turning is None:
         return None
-    steady = [_steady_speeds(one, turning, at_rest_below) for one in series]
-    lowest = float(np.quantile(np.concatenate(steady), LOWEST_QUANTILE)) if any(map(len, steady)) else 0.0
+    driven = [one.of_past(minimum_filter1d, STEADY_S) >= turning for one in series]
+    speeds = [
+        one.speed_rad_s[its & (one.speed_rad_s >= at_rest_below)] for one, its in zip(series, driven, strict=True)
+    ]
+    lowest = float(np.quantile(np.concatenate(speeds), LOWEST_QUANTILE)) if any(map(len, speeds)) else 0.0
     standing_below = max(at_rest_below, STANDING_SHARE * lowest)
     turning = _turning_command(series, standing_below, stood)
     if turning is None:
         return None
-    found = Standstill(turning_command=turning, standing_below_rad_s=standing_below, off_command=off)
-    starts_s = [start_s for one in series for start_s in _starts(one, found)]
+    found = Standstill(
+        turning_command=turning, standing_below_rad_s=standing_below, off_command=off if np.isfinite(off) else None
+    )
+    start_s = max((seconds for one in series for seconds in _starts(one, found)), default=None)
     coasts = [coast for one in series for coast in _coasts(one, found)]
-    constants_s = [coast.time_constant_s for coast in coasts if coast.time_constant_s > 0.0]
-    log_fall = float(np.log(top / standing_below))
-    from_top_s = [coast.seconds + coast.time_constant_s * max(log_fall - coast.log_fall, 0.0) for coast in coasts]
+    constants_s = [constant_s for _, constant_s, _, _ in coasts if constant_s > 0.0]
+    from_top = float(np.log(top / standing_below))
+    from_top_s = [seconds + constant_s * max(from_top - fall, 0.0) for seconds, constant_s, fall, _ in coasts]
     return found.model_copy(
         update={
-            "start_s": max(starts_s, default=None),
+            "start_s": start_s,
             "coast_s": max(from_top_s, default=None),
-            "slowing_s": max((coast.slowing_s for coast in coasts), default=None),
+            "slowing_s": max((slowing_s for _, _, _, slowing_s in coasts), default=None),
             "coast_time_constant_s": float(np.median(constants_s)) if constants_s else None,
-            "lapse_s": _longest_lapse_s(series, found, max(starts_s, default=STEADY_S)),
+            "lapse_s": _longest_lapse_s(series, found, STEADY_S if start_s is None else start_s),
         }
     )
 
@@ -105,22 +99,23 @@ def _series(run: Run) -> Iterator[_FanSeries]:
 
 def _turning_command(series: Sequence[_FanSeries], standing_below: float, above: float) -> float | None:
     """The lowest command that turns the fans, above one under which a fan stood."""
-    found = [_turning_commands(one, standing_below, above) for one in series]
-    return min((float(commands.min()) for commands in found if len(commands)), default=None)
+    found: list[float] = []
+    for one in series:
+        highest = one.of_past(maximum_filter1d, STEADY_S)
+        ago = max(1, round(STEADY_S / 2 / one.period_s))
+        before = np.concatenate((np.full(ago, np.nan), one.speed_rad_s))[: len(one.speed_rad_s)]
+        steady = (one.speed_rad_s >= standing_below) & (one.speed_rad_s >= STEADY_SHARE * before)
+        found += highest[steady & (highest > above)].tolist()
+    return min(found, default=None)
 
 
-@dataclass(frozen=True)
-class _Rest:
-    """Of a fan at rest, None if it did not last. stood: the highest command under which it stood. stopping: the highest
-    that stops a fan: not above the command under which this one came to rest."""
+def _rests(one: _FanSeries, at_rest_below: float) -> Iterator[tuple[float, float]]:
+    """Of each rest the highest command under which the fan stood, and the highest that stops a fan, which is not above
+    the command under which this one came to rest; minus infinity where it did not last.
 
-    stood: float | None
-    stopping: float | None
-
-
-def _rests(one: _FanSeries, at_rest_below: float) -> Iterator[_Rest]:
-    """A fan that still slows down is not at rest: it may come to turn steadily. A few readings end no rest."""
-    lowest = one.lowest_command(STOOD_S)
+    A fan that still slows down is not at rest: it may come to turn steadily. A few readings end no rest.
+    """
+    lowest = one.of_past(minimum_filter1d, STOOD_S)
     least, reach = (round(seconds / one.period_s) for seconds in (AT_REST_S + one.reach_s, one.reach_s))
     increases = np.flatnonzero(np.diff(one.command, prepend=one.command[:1]) > 0.0)
     stands = _last_known(one.speed_rad_s) < at_rest_below
@@ -133,11 +128,8 @@ def _rests(one: _FanSeries, at_rest_below: float) -> Iterator[_Rest]:
         came_under = one.command[max(first - reach, 0) : first + 1].max() if first else 0.0
         above = np.flatnonzero(one.command[first:end] > came_under)
         to = first + int(above[0]) if len(above) else end
-        yield _Rest(_highest(lowest[first + least : end]), _highest(lowest[first + least : to]))
-
-
-def _highest(commands: Array) -> float | None:
-    return float(np.nanmax(commands)) if np.isfinite(commands).any() else None
+        stood, stopping = (np.nanmax(lowest[first + least : until], initial=-np.inf) for until in (end, to))
+        yield float(stood), float(stopping)
 
 
 def _last_known(speed_rad_s: Array) -> Array:
@@ -157,18 +149,6 @@ def _without_glitches(stands: NDArray[np.bool_], least: int, longest: int) -> ND
     return filled
 
 
-def _turning_commands(one: _FanSeries, standing_below: float, above: float) -> Array:
-    highest = one.highest_command(STEADY_S)
-    ago = max(1, round(STEADY_S / 2 / one.period_s))
-    before = np.concatenate((np.full(ago, np.nan), one.speed_rad_s))[: len(one.speed_rad_s)]
-    steady = (one.speed_rad_s >= standing_below) & (one.speed_rad_s >= STEADY_SHARE * before)
-    return highest[steady & (highest > above)]
-
-
-def _steady_speeds(one: _FanSeries, turning: float, standing_below: float) -> Array:
-    return one.speed_rad_s[(one.lowest_command(STEADY_S) >= turning) & (one.speed_rad_s >= standing_below)]
-
-
 def _starts(one: _FanSeries, found: Standstill) -> Iterator[float]:
     """Times from a command to turn, given to a fan that stood, to the first reading of a fan that turns, s."""
     turns = found.turns(one.speed_rad_s)
@@ -177,33 +157,21 @@ def _starts(one: _FanSeries, found: Standstill) -> Iterator[float]:
             yield float(turns[first:last].argmax()) * one.period_s
 
 
-@dataclass(frozen=True)
-class _Coast:
-    """From a command to stop to the first reading of a fan that stands.
-
-    seconds: its length. time_constant_s: 0 where it is too short to show it. log_fall: of its readings, the logarithm.
-    slowing_s: until the reading is below `SLOWED_SHARE` of the highest one since the command, less the mean delay of
-    readings.
+def _coasts(one: _FanSeries, found: Standstill) -> Iterator[tuple[float, float, float, float]]:
+    """From each command to stop to the first reading of a fan that stands: its seconds, the time constant in s (0 where
+    it is too short to show it), the logarithm of the fall of its readings, and the seconds until the reading is below
+    `SLOWED_SHARE` of the highest one since the command, less the mean delay of readings.
     """
-
-    seconds: float
-    time_constant_s: float
-    log_fall: float
-    slowing_s: float
-
-
-def _coasts(one: _FanSeries, found: Standstill) -> Iterator[_Coast]:
     stands = one.speed_rad_s < found.standing_below_rad_s
     for first, last in _stretches(found.stops(one.command, one.speed_rad_s)):
         if first and found.turns(one.speed_rad_s[first]) and stands[first:last].any():
             rows = int(stands[first:last].argmax())
             seconds = rows * one.period_s
-            log = float(np.log(one.speed_rad_s[first] / found.standing_below_rad_s))
-            constant_s = max(seconds - one.mean_delay_s, 0.0) / log if log >= MIN_LOG_FALL else 0.0
+            fall = float(np.log(one.speed_rad_s[first] / found.standing_below_rad_s))
+            constant_s = max(seconds - one.mean_delay_s, 0.0) / fall if fall >= MIN_LOG_FALL else 0.0
             readings = np.nan_to_num(one.speed_rad_s[first : first + rows + 1])
             slowed = np.flatnonzero(readings > SLOWED_SHARE * readings.max())[-1] + 1
-            slowing_s = max(float(slowed) * one.period_s - one.mean_delay_s, 0.0)
-            yield _Coast(seconds, constant_s, log, slowing_s)
+            yield seconds, constant_s, fall, max(float(slowed) * one.period_s - one.mean_delay_s, 0.0)
 
 
 def _longest_lapse_s(series: Sequence[_FanSeries], found: Standstill, start_s: float) -> float:

@@ -76,7 +76,3 @@ class NetworkOde(FanOde):
     """One network for all fans, beside the physics of each fan or alone."""
 
     network: TanhNetwork = field()
-
-    def with_network(self, network: TanhNetwork) -> Self:
-        """The same model with another network."""
-        return replace(self, network=network)

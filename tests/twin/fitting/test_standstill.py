@@ -41,12 +41,17 @@ def _counted(speed: Array, tacho: Tacho) -> Array:
     return np.concatenate((np.zeros(window), shown))[: len(speed)]
 
 
+def shown_by(*runs: Run) -> Standstill:
+    found = find_standstill(runs)
+    assert found is not None
+    return found
+
+
 STOPS = ((100.0, 30.0), (0.0, 40.0), (40.0, 30.0), (10.0, 40.0), (30.0, 40.0), (80.0, 20.0))
 
 
 def test_stops_and_starts_are_found_with_their_times() -> None:
-    found = find_standstill([measured(*STOPS)])
-    assert found is not None
+    found = shown_by(measured(*STOPS))
     assert (found.off_command, found.turning_command) == (10.0, 30.0)
     assert 0.4 * PER_COMMAND * 30.0 < found.standing_below_rad_s < 0.6 * PER_COMMAND * 30.0
     assert found.start_s is not None
@@ -67,8 +72,7 @@ def test_a_fan_that_stood_under_a_rising_command_does_not_stop_under_it() -> Non
     started, then = measured(*up, (100.0, 30.0)), [(40.0, 30.0), (15.0, 30.0), (0.0, 30.0)]
     turning = measured((100.0, 30.0), *[(max(level, 20.1), seconds) for level, seconds in then[:2]], then[2])
     commands = np.concatenate([np.full(round(seconds / PERIOD_S), level) for level, seconds in [(100.0, 30.0), *then]])
-    found = find_standstill([started, replace(turning, command=commands[:, np.newaxis])])
-    assert found is not None
+    found = shown_by(started, replace(turning, command=commands[:, np.newaxis]))
     assert (found.off_command, found.turning_command) == (0.0, 40.0), "under 15 it may stand or turn"
     assert found.start_s is not None
     assert found.start_s < 5.0
@@ -87,14 +91,12 @@ def test_a_command_that_only_a_standing_fan_has_seen_does_not_stop_it(disturbed:
         speed[row] = 90.0
     if disturbed == "gap":
         t_s[row:] += 5.0
-    found = find_standstill([replace(standing, speed_rad_s=speed, t_s=t_s), turning])
-    assert found is not None
+    found = shown_by(replace(standing, speed_rad_s=speed, t_s=t_s), turning)
     assert (found.off_command or 0.0) == 0.0
 
 
 def test_a_fan_that_never_stopped_shows_what_turns_it_and_nothing_else() -> None:
-    found = find_standstill([measured((100.0, 30.0), (40.0, 30.0), (60.0, 30.0))])
-    assert found is not None
+    found = shown_by(measured((100.0, 30.0), (40.0, 30.0), (60.0, 30.0)))
     assert found == Standstill(turning_command=40.0, standing_below_rad_s=found.standing_below_rad_s)
     command, standing, turning = np.array([0.0, 0.0, 40.0, 5.0]), np.zeros(4), np.full(4, 100.0)
     assert found.stops(command, standing).tolist() == [True, True, False, False]
@@ -103,15 +105,13 @@ def test_a_fan_that_never_stopped_shows_what_turns_it_and_nothing_else() -> None
 
 def test_a_command_is_not_taken_to_stop_a_fan_that_turns_under_it_slowly_or_unread() -> None:
     slow = measured((300.0, 30.0), (25.0, 13.0), (150.0, 20.0), coast_s=6.0, tacho=Tacho())
-    found = find_standstill([slow])
-    assert found is not None
+    found = shown_by(slow)
     assert 100.0 < slow.speed_rad_s[420] < found.standing_below_rad_s, "near the end it reads as one that stands"
     assert (found.off_command, found.turning_command) == (None, 150.0)
     run = measured((100.0, 30.0), (0.0, 20.0), (100.0, 30.0), tacho=Tacho())
     speed = run.speed_rad_s.copy()
     speed[-7:] = 0.0
-    found = find_standstill([replace(run, speed_rad_s=speed)])
-    assert found is not None
+    found = shown_by(replace(run, speed_rad_s=speed))
     assert (found.off_command, found.turning_command) == (0.0, 100.0)
 
 
@@ -119,8 +119,7 @@ def test_lapses_of_the_tacho_are_measured() -> None:
     run = measured((100.0, 60.0), (0.0, 40.0), (100.0, 60.0), tacho=Tacho())
     speed = run.speed_rad_s.copy()
     speed[300:307] = 0.0
-    found = find_standstill([replace(run, speed_rad_s=speed)])
-    assert found is not None
+    found = shown_by(replace(run, speed_rad_s=speed))
     assert found.lapse_s == pytest.approx(0.7)
 
 
