@@ -76,7 +76,10 @@ def train_twin(
     fans = common_fans([*runs, *validation_runs])
     numbers = tuple(range(fans) if fan_numbers is None else fan_numbers)
     if model_kind.predicts == "readings":
-        runs, validation_runs = _as_if_instantaneous(runs), _as_if_instantaneous(validation_runs)
+        # A model whose output is compared with the readings as they are.
+        runs, validation_runs = (
+            [replace(run, tacho=INSTANTANEOUS) for run in each] for each in (runs, validation_runs)
+        )
     tacho = common_tacho([*runs, *validation_runs])
     started_s = time.monotonic()
     found = identify_at_reference(runs, validation_runs, progress=progress)
@@ -202,11 +205,6 @@ def free_run_of(twin: OnnxTwin, runs: Sequence[Run]) -> tuple[Array, Array, Arra
     residual = free_run_residuals(twin, twin.parameters[rows], pieces)
     measured = np.concatenate([compared_readings(piece) for piece in pieces])
     return residual, measured, np.concatenate([piece.command for piece in pieces])
-
-
-def _as_if_instantaneous(runs: Sequence[Run]) -> list[Run]:
-    """The runs for a model whose output is compared with the readings as they are."""
-    return [replace(run, tacho=INSTANTANEOUS) for run in runs]
 
 
 def _require_possible(kind: ModelKind, trainer: str, networks: int) -> None:

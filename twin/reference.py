@@ -32,11 +32,9 @@ def at_reference(runs: Sequence[Run], reference: ReferenceConditions | None) -> 
 
     Raises TwinError when a run does not have a quantity that is needed.
     """
-    return [_converted(run, reference) if reference and reference.needed else _without_auxiliary(run) for run in runs]
-
-
-def _without_auxiliary(run: Run) -> Run:
-    return replace(run, auxiliary={}) if run.auxiliary else run
+    if reference and reference.needed:
+        return [_converted(run, reference) for run in runs]
+    return [replace(run, auxiliary={}) if run.auxiliary else run for run in runs]
 
 
 def ratios_of(run: Run, reference: ReferenceConditions) -> tuple[Array, Array, NDArray[np.bool_]]:

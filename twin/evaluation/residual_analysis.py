@@ -12,7 +12,7 @@ summed one by one (ResidualSums), wherever they are.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import reduce
 from operator import add
 
@@ -40,7 +40,7 @@ SIGNIFICANCE = 0.05
 QUANTILES = (0.95, 0.99, 0.999)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class ResidualAnalysis:
     """One fan's free-run residual. NaN where undefined: too few samples, a diverged run, a constant command.
 
@@ -57,17 +57,17 @@ class ResidualAnalysis:
 
     samples: int
     period_s: float
-    mean_rad_s: float
-    independent_samples: float
-    autocorrelation_time_s: float
+    mean_rad_s: float = np.nan
+    independent_samples: float = np.nan
+    autocorrelation_time_s: float = np.nan
     lags_s: Array
     autocorrelation: Array
-    bound_95: float
-    ljung_box_lags: int
-    ljung_box_p: float
+    bound_95: float = np.nan
+    ljung_box_lags: int = 0
+    ljung_box_p: float = np.nan
     cross_lags_s: Array
     cross_correlation: Array
-    cross_bound_95: float
+    cross_bound_95: float = np.nan
 
     @property
     def white(self) -> bool | None:
@@ -246,14 +246,17 @@ def _of_fan(sums: ResidualSums, fan: int, grid: ResidualGrid) -> ResidualAnalysi
     samples = int(sums.count[fan])
     lags_s = grid.period_s * np.arange(1, grid.lags + 1, dtype=np.float64)
     cross_lags_s = grid.period_s * np.arange(-grid.lags, grid.lags + 1, dtype=np.float64)
+    undefined = ResidualAnalysis(
+        samples=samples,
+        period_s=grid.period_s,
+        lags_s=lags_s,
+        autocorrelation=np.full_like(lags_s, np.nan),
+        cross_lags_s=cross_lags_s,
+        cross_correlation=np.full_like(cross_lags_s, np.nan),
+    )
     lowest, highest = sums.lowest[0, fan], sums.highest[0, fan]
     if samples < MIN_SAMPLES or not np.isfinite(highest) or highest == lowest:
-        nothing = np.full_like(lags_s, np.nan)
-        nothing_cross = np.full_like(cross_lags_s, np.nan)
-        return ResidualAnalysis(
-            samples, grid.period_s, np.nan, np.nan, np.nan, lags_s, nothing, np.nan, 0, np.nan,
-            cross_lags_s, nothing_cross, np.nan,
-        )  # fmt: skip
+        return undefined
     mean = float(sums.error[fan] / samples)
     products, pairs = _about_mean(sums.auto[:, fan], mean), np.rint(sums.auto[2, fan])
     autocorrelation = _ratio(products, pairs) / (products[0] / samples)
@@ -263,18 +266,15 @@ def _of_fan(sums: ResidualSums, fan: int, grid: ResidualGrid) -> ResidualAnalysi
     squares = tested[seen] * autocorrelation[1 : len(tested) + 1][seen] ** 2
     portmanteau = (samples + 2.0) / samples * squares.sum()
     cross_correlation, cross_bound = _cross(sums, fan, mean, products, grid)
-    return ResidualAnalysis(
-        samples=samples,
-        period_s=grid.period_s,
+    return replace(
+        undefined,
         mean_rad_s=mean,
         independent_samples=samples / inflation,
         autocorrelation_time_s=grid.period_s * time_in_steps,
-        lags_s=lags_s,
         autocorrelation=autocorrelation[1 : grid.lags + 1],
         bound_95=float(NORMAL_95 / np.sqrt(_typical(pairs[1 : grid.lags + 1]))),
         ljung_box_lags=int(np.count_nonzero(seen)),
         ljung_box_p=float(chdtrc(np.count_nonzero(seen), portmanteau)) if seen.any() else np.nan,
-        cross_lags_s=cross_lags_s,
         cross_correlation=cross_correlation,
         cross_bound_95=cross_bound,
     )

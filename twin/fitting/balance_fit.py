@@ -116,11 +116,6 @@ class _Stretch:
     grid: Run
     terms: Array
 
-    def counted(self, fan: int) -> Array:
-        """(m, 5) terms of a fan that count."""
-        terms = self.terms[:, fan]
-        return terms[np.isfinite(terms[:, 0])]
-
 
 def fit_balance(runs: Sequence[Run], held_out: Sequence[Run], identification: Identification) -> BalanceCard:
     """The balance of each fan in units of its command, fitted and chosen on the runs.
@@ -252,7 +247,8 @@ def _by_run(stretches: Sequence[_Stretch], fan: int) -> list[Array]:
     """(m, 5) terms of a fan that count, for each run that has some. Raises TwinError where there are too few."""
     of_runs: dict[int, list[Array]] = {}
     for stretch in stretches:
-        of_runs.setdefault(stretch.run, []).append(stretch.counted(fan))
+        terms = stretch.terms[:, fan]
+        of_runs.setdefault(stretch.run, []).append(terms[np.isfinite(terms[:, 0])])
     runs = [run for parts in of_runs.values() if len(run := np.concatenate(parts)) >= GROUPS]
     if not runs:
         raise TwinError(

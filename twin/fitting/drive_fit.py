@@ -17,7 +17,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fantwin.schemas.standstill import Standstill
 from fantwin.schemas.twin_card import DriveCard
@@ -98,7 +97,8 @@ def find_drive(
     if not of_pulses or standstill is None or standstill.off_command is None:
         return None
     turning = (standstill.off_command + standstill.turning_command) / 2.0
-    starts = np.sum([_starts(run, turning) for run in runs], axis=0)
+    turns = [run.command >= turning for run in runs]
+    starts = np.sum([np.count_nonzero(~is_on[:-1] & is_on[1:], axis=0) for is_on in turns], axis=0)
     if starts.min() == 0 or starts.sum() < FEWEST_STARTS:
         return None
     try:
@@ -153,12 +153,6 @@ def find_drive(
     if not with_drive.mean_square(final) < (1.0 - LEAST_GAIN) ** 2 * friction_alone.mean_square(of_friction):
         return None
     return FoundDrive(drive, final[:, LAG:])
-
-
-def _starts(run: Run, turning_command: float) -> NDArray[np.intp]:
-    """(fans,) how often the command goes from one that stops the fan to one that turns it."""
-    is_on = run.command >= turning_command
-    return np.count_nonzero(~is_on[:-1] & is_on[1:], axis=0)
 
 
 class _Runs:

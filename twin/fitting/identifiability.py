@@ -7,7 +7,7 @@ command to speed as if there were no loop, is biased unless its noise model is r
 not right once the load fluctuates, too (Ljung, System Identification, second edition, section 13.4).
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from scipy.stats import f as f_distribution
@@ -122,7 +122,10 @@ def feedback_share(pieces: Sequence[Run], fan: int) -> float:
     Of a tacho that counts, one sample of each count is looked at: those between repeat it, and a prediction from them
     leaves the next count as noise, which the command has caused.
     """
-    signals = [_of_each_count(piece, fan) for piece in pieces]
+    every = [max(1, round(piece.tacho[fan].held_s / piece.median_period_s)) for piece in pieces]
+    signals = [
+        (piece.command[::step, fan], piece.speed_rad_s[::step, fan]) for piece, step in zip(pieces, every, strict=True)
+    ]
     signals = [(command, speed_rad_s) for command, speed_rad_s in signals if len(command) > 4 * LAGS]
     if not signals:
         return 0.0
@@ -139,7 +142,9 @@ def feedback_share(pieces: Sequence[Run], fan: int) -> float:
     used = (move != 0.0) & np.isfinite(noise_now) & np.all(np.isfinite(noise_before), axis=1)
     if np.count_nonzero(used) < FEWEST_MOVES:
         return 0.0
-    move = _without_outliers(move[used])
+    move = move[used]
+    largest = LARGEST_MOVE * np.median(np.abs(move))
+    move = np.clip(move, -largest, largest)
     own_past = np.column_stack((np.ones(len(move)), own_past[used]))
     everything_before = np.column_stack((own_past, noise_before[used]))
     alone, rank_alone = _residual(own_past, move)
@@ -156,90 +161,75 @@ def feedback_share(pieces: Sequence[Run], fan: int) -> float:
     return share if probability < FALSE_ALARM_PROBABILITY else 0.0
 
 
-def _of_each_count(piece: Run, fan: int) -> tuple[Array, Array]:
-    """(n,) commands and speeds, as far apart as the readings of the tacho change."""
-    every = max(1, round(piece.tacho[fan].held_s / piece.median_period_s))
-    return piece.command[::every, fan], piece.speed_rad_s[::every, fan]
-
-
-def _poor_excitation(pieces: Sequence[Run], fan: int) -> list[str]:
+def _poor_excitation(pieces: Sequence[Run], fan: int) -> Iterator[str]:
     command = np.concatenate([piece.command[:, fan] for piece in pieces])
-    command_range, largest = float(np.ptp(command)), float(np.abs(command).max())
+    moves = float(np.ptp(command)) / max(float(np.abs(command).max()), np.finfo(float).tiny)
     low, high = _speed_range(pieces, fan)
-    noise = _noise(pieces, fan)
-    steps = _steps(pieces, fan)
-    levels = len(np.unique(_levels(command, command)))
-    reasons = []
-    if command_range < SMALL_COMMAND_RANGE * largest:
-        reasons.append(f"the command moves by {command_range / largest:.1%} of its largest value only")
-    if steps < FEWEST_STEPS:
-        reasons.append(f"the command changes {steps} time(s) only")
-    if levels < FEWEST_LEVELS:
-        reasons.append(f"the command has {levels} level(s) only")
-    if high - low < SMALL_SPEED_RANGE_IN_NOISE * noise:
-        reasons.append(f"the speed moves by {high - low:.3g} rad/s, hardly more than its noise of {noise:.2g} rad/s")
-    if not reasons:
-        return []
-    return [
-        f"little excitation: {', and '.join(reasons)}; J, alpha and C_D rest on that alone: "
-        "record steps between three or more levels, from low to full command"
-    ]
+    noise, steps, levels = _noise(pieces, fan), _steps(pieces, fan), len(np.unique(_levels(command, command)))
+    hardly = f"the speed moves by {high - low:.3g} rad/s, hardly more than its noise of {noise:.2g} rad/s"
+    reasons = {
+        f"the command moves by {moves:.1%} of its largest value only": moves < SMALL_COMMAND_RANGE,
+        f"the command changes {steps} time(s) only": steps < FEWEST_STEPS,
+        f"the command has {levels} level(s) only": levels < FEWEST_LEVELS,
+        hardly: high - low < SMALL_SPEED_RANGE_IN_NOISE * noise,
+    }
+    if any(reasons.values()):
+        yield (
+            f"little excitation: {', and '.join(reason for reason, holds in reasons.items() if holds)}; "
+            "J, alpha and C_D rest on that alone: record steps between three or more levels, from low to full command"
+        )
 
 
-def _feedback(pieces: Sequence[Run], fan: int) -> list[str]:
-    share = feedback_share(pieces, fan)
-    if share == 0.0:
-        return []
-    return [
-        f"closed loop: {share:.0%} of the command's movement follows the noise of the measured speed; J and lag_s, "
-        "and at a single set-point alpha and C_D too, may be wrong by more than their intervals say: record with the "
-        "controller off, in steps between several commands, or at least in steps between several set-points"
-    ]
+def _feedback(pieces: Sequence[Run], fan: int) -> Iterator[str]:
+    if share := feedback_share(pieces, fan):
+        yield (
+            f"closed loop: {share:.0%} of the command's movement follows the noise of the measured speed; J and lag_s, "
+            "and at a single set-point alpha and C_D too, may be wrong by more than their intervals say: record with "
+            "the controller off, in steps between several commands, or at least in steps between several set-points"
+        )
 
 
-def _inertia(pieces: Sequence[Run], fan: int, parameters: Array, covariance: Array) -> list[str]:
+def _inertia(pieces: Sequence[Run], fan: int, parameters: Array, covariance: Array) -> Iterator[str]:
     inertia, error = parameters[J], np.sqrt(covariance[J, J])
-    if error <= UNCERTAIN_INERTIA * inertia:
-        return []
-    low, high = _speed_range(pieces, fan)
-    return [
-        f"J is poorly determined ({inertia:.3g} ± {REACH * error:.2g}): it shows in transients alone, and too few "
-        f"stand out; the speed moves by {high - low:.3g} rad/s, its noise is {_noise(pieces, fan):.2g} rad/s and "
-        f"samples are {_period_s(pieces):.2g} s apart: record more and larger steps, several samples in each transient"
-    ]
+    if error > UNCERTAIN_INERTIA * inertia:
+        low, high = _speed_range(pieces, fan)
+        yield (
+            f"J is poorly determined ({inertia:.3g} ± {REACH * error:.2g}): it shows in transients alone, and too few "
+            f"stand out; the speed moves by {high - low:.3g} rad/s, its noise is {_noise(pieces, fan):.2g} rad/s and "
+            f"samples are {_period_s(pieces):.2g} s apart: record more and larger steps, several samples in each "
+            "transient"
+        )
 
 
-def _drag(pieces: Sequence[Run], fan: int, parameters: Array, covariance: Array) -> list[str]:
+def _drag(pieces: Sequence[Run], fan: int, parameters: Array, covariance: Array) -> Iterator[str]:
     """alpha and C_D: they trade off; or one has the wrong sign, or is not distinguishable from zero."""
     low, high = _speed_range(pieces, fan)
-    viscous, drag, errors = parameters[ALPHA], parameters[C_D], np.sqrt(np.diag(covariance))
-    distinct = viscous > REACH * errors[ALPHA] and drag > REACH * errors[C_D]
-    well_distinct = viscous > WELL_DISTINCT * errors[ALPHA] and drag > WELL_DISTINCT * errors[C_D]
+    both, errors = parameters[[ALPHA, C_D]], np.sqrt(np.diag(covariance))
+    distinct, well_distinct = (np.all(both > reach * errors[[ALPHA, C_D]]) for reach in (REACH, WELL_DISTINCT))
     product = errors[ALPHA] * errors[C_D]
     correlation = covariance[ALPHA, C_D] / product if product > 0.0 else 0.0
     on_edge = _on_edge(pieces, fan, parameters)
     narrow = high - low < NARROW_SPEED_RANGE * high
     if narrow and (on_edge or (correlation < TRADE_OFF_CORRELATION and not well_distinct)):
-        return [
+        yield (
             f"alpha and C_D cannot be distinguished: the speed keeps between {low:.3g} and {high:.3g} rad/s; "
             f"{_determined(low, high, parameters, covariance)}; record speeds from a third of the largest up to it"
-        ]
+        )
+        return
     if distinct and not on_edge:
-        return []
-    lines = []
+        return
     for which in (ALPHA, C_D):
         name, value, reach = PARAMETER_NAMES[which], parameters[which], REACH * errors[which]
         if value + reach < 0.0:
-            lines.append(
+            yield (
                 f"{name} is negative ({value:.3g} ± {reach:.2g}): the physical model does not describe this data "
                 "(friction, dead zone or offset, for which it has no term); do not trust it outside the recorded "
                 "speeds; a hybrid learns the difference"
             )
-        elif on_edge and which == ALPHA and drag > 0.0:
-            lines.append(f"{name} is not distinguishable from zero (the fit drove it there): {MORE_OF[which]}")
+        elif on_edge and which == ALPHA and parameters[C_D] > 0.0:
+            yield f"{name} is not distinguishable from zero (the fit drove it there): {MORE_OF[which]}"
         elif value - reach <= 0.0:
-            lines.append(f"{name} is not distinguishable from zero ({value:.3g} ± {reach:.2g}): {MORE_OF[which]}")
-    return lines
+            yield f"{name} is not distinguishable from zero ({value:.3g} ± {reach:.2g}): {MORE_OF[which]}"
 
 
 def _on_edge(pieces: Sequence[Run], fan: int, parameters: Array) -> bool:
@@ -264,16 +254,14 @@ def _determined(low_rad_s: float, high_rad_s: float, parameters: Array, covarian
     return f"what is known is alpha + C_D w = {direction @ parameters:.4g} ± {reach:.1g} at w = {speed:.3g} rad/s"
 
 
-def _lag(pieces: Sequence[Run], parameters: Array, covariance: Array) -> list[str]:
+def _lag(pieces: Sequence[Run], parameters: Array, covariance: Array) -> Iterator[str]:
     lag_s, reach_s, period_s = parameters[LAG_S], REACH * np.sqrt(covariance[LAG_S, LAG_S]), _period_s(pieces)
-    if reach_s == 0.0 or lag_s > max(reach_s, period_s):
-        return []
-    return [
-        f"lag_s ({1e3 * lag_s:.3g} ± {1e3 * reach_s:.2g} ms) is not determined by samples every "
-        f"{1e3 * period_s:.3g} ms: "
-        "no lag, a delay, and clocks of command and speed that differ look the same; record with several samples in a "
-        "lag, or take it as the twin's and not as the fan's"
-    ]
+    if reach_s > 0.0 and lag_s <= max(reach_s, period_s):
+        yield (
+            f"lag_s ({1e3 * lag_s:.3g} ± {1e3 * reach_s:.2g} ms) is not determined by samples every "
+            f"{1e3 * period_s:.3g} ms: no lag, a delay, and clocks of command and speed that differ look the same; "
+            "record with several samples in a lag, or take it as the twin's and not as the fan's"
+        )
 
 
 def _predictors(command: Array, speed_rad_s: Array) -> Array:
@@ -293,11 +281,6 @@ def _residual(regressors: Array, target: Array) -> tuple[Array, int]:
     size = np.linalg.norm(regressors[whole], axis=0) + np.finfo(float).tiny
     coefficients, _, rank, _ = np.linalg.lstsq(regressors[whole] / size, target[whole], rcond=1e-10)
     return target - regressors @ (coefficients / size), int(rank)
-
-
-def _without_outliers(move: Array) -> Array:
-    reach = LARGEST_MOVE * np.median(np.abs(move))
-    return np.clip(move, -reach, reach)
 
 
 def _levels(command: Array, all_commands: Array) -> Array:

@@ -183,7 +183,8 @@ def _filtered_start(pieces: Sequence[Run], top_speed_rad_s: Array, progress: Pro
     for rung, lambda_per_s in enumerate(ladder):
         progress("identification: first estimate", rung, len(ladder), np.nan)
         filtered = np.array([filtering_operator(alike, fan, lambda_per_s) for fan in range(fans)])
-        candidates[rung] = _stable(filtered, top_speed_rad_s)
+        # Damping is made positive up to the top speed.
+        candidates[rung] = physical_parameters(fitted_unknowns(filtered, top_speed_rad_s), top_speed_rad_s)
     together = max(1, COLUMNS_AT_ONCE // len(trajectories.fan))
     errors = np.concatenate(
         [
@@ -214,11 +215,6 @@ def _why_not(pieces: Sequence[Run], fan: int) -> str:
             "its count of pulses begins? Give it the time at which the count ends"
         )
     return "the speed does not follow the command; check which columns are command and speed"
-
-
-def _stable(parameters: Array, top_speed_rad_s: Array) -> Array:
-    """The parameters (fans, 4) with their damping made positive up to the top speed."""
-    return physical_parameters(fitted_unknowns(parameters, top_speed_rad_s), top_speed_rad_s)
 
 
 def _free_run_errors(candidates: Array, trajectories: Trajectories) -> Array:

@@ -42,14 +42,16 @@ def identify_at_reference(
     notes: list[str] = []
     for name in conditions.needed if conditions else ():
         assert conditions is not None
-        if not _varies(runs, conditions, name):
+        which = 0 if name == "supply_voltage_v" else 1
+        ratios = np.concatenate([ratios_of(run, conditions)[which] for run in runs])
+        if np.std(ratios, axis=0).max() <= LEAST_VARIATION:
             continue
         fewer = replace(conditions, **{name: None})
         try:
             without = identify(at_reference(runs, fewer), progress=within(f"without {BY_NAME[name].title}", progress))
         except TwinError:  # they cannot be identified without it
             continue
-        with_rad_s, without_rad_s = (_rmse_rad_s(each) for each in (identification, without))
+        with_rad_s, without_rad_s = (float(np.sqrt(np.mean(each.rmse_rad_s**2))) for each in (identification, without))
         if without_rad_s < (1.0 - LEAST_GAIN) * with_rad_s:
             conditions, identification = fewer, without
             notes.append(
@@ -66,12 +68,3 @@ def behind_a_drive(found: AtReference) -> tuple[str, ...]:
         return found.notes
     unused = " and ".join(BY_NAME[name].title for name in found.conditions.needed)
     return (*found.notes, f"{unused}: not used, because these fans control their own speed")
-
-
-def _varies(runs: Sequence[Run], conditions: ReferenceConditions, name: str) -> bool:
-    ratios = np.concatenate([ratios_of(run, conditions)[0 if name == "supply_voltage_v" else 1] for run in runs])
-    return bool(np.std(ratios, axis=0).max() > LEAST_VARIATION)
-
-
-def _rmse_rad_s(identification: Identification) -> float:
-    return float(np.sqrt(np.mean(identification.rmse_rad_s**2)))

@@ -74,15 +74,8 @@ class Trajectories:
 
     def of_columns(self, chosen: NDArray[np.intp]) -> "Trajectories":
         """The stretches with these indices."""
-        return Trajectories(
-            self.fan[chosen],
-            self.command_before[chosen],
-            self.command[:, chosen],
-            self.speed_rad_s[:, chosen],
-            self.step_s[:, chosen],
-            self.tacho,
-            self.lead_in[chosen],
-        )
+        names = ("fan", "command_before", "command", "speed_rad_s", "step_s", "lead_in")
+        return replace(self, **{name: getattr(self, name)[..., chosen] for name in names})
 
     def first_samples(self, count: int) -> "Trajectories":
         """The first samples of all stretches, so many of each."""

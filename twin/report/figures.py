@@ -90,13 +90,11 @@ def around_the_largest_error(content: Content, fan: FanContent) -> str:
     end = int(line.starts[piece + 1]) if piece + 1 < len(line.starts) else len(line.t_s)
     part = slice(first, min(end, peak + AROUND_PEAK_SAMPLES))
     t_s, twin, half = line.t_s[part], fan.predicted_rad_s[part] / each, 2.0 * fan.sigma_rad_s / each
-    with _small_figure() as (figure, axes):
+    with _small_figure("time (s)", f"speed ({content.unit.name})") as (figure, axes):
         axes.fill_between(t_s, twin - half, twin + half, color=BAND, lw=0, label="twin ± 2σ")
         axes.plot(t_s, fan.measured_rad_s[part] / each, **{**LINE, "lw": 0.8}, label="measured")
         axes.plot(t_s, twin, color=TWIN, lw=1.4, label="free run")
         axes.plot(line.t_s[peak], fan.measured_rad_s[peak] / each, "o", color=OUTSIDE, ms=4, label="largest error")
-        axes.set_xlabel("time (s)")
-        axes.set_ylabel(f"speed ({content.unit.name})")
         _legend_above(axes, 2)
         return _svg(figure, f"fan{fan.number}-peak", "Measured speed and free run around the largest error")
 
@@ -106,24 +104,17 @@ def histogram(content: Content, fan: FanContent) -> str:
     sigma = fan.sigma_rad_s / content.unit.rad_s
     error = fan.error_rad_s[np.isfinite(fan.error_rad_s)] / content.unit.rad_s
     reach = HISTOGRAM_SIGMAS * max(sigma, float(np.sqrt(np.mean(error**2))) if error.size else 0.0)
-    with _small_figure() as (figure, axes):
+    unit = content.unit.name
+    with _small_figure(f"measured minus free run ({unit})", f"share per {unit}") as (figure, axes):
         axes.axvspan(-2.0 * sigma, 2.0 * sigma, color=BAND, lw=0, alpha=0.6, label="± 2σ of the card")
         if error.size and reach > 0.0:
-            inside = np.clip(error, -reach, reach)
-            axes.hist(
-                inside,
-                np.linspace(-reach, reach, HISTOGRAM_BINS + 1).tolist(),
-                density=True,
-                color="#8a8a8a",
-                label="errors",
-            )
+            edges = np.linspace(-reach, reach, HISTOGRAM_BINS + 1).tolist()
+            axes.hist(np.clip(error, -reach, reach), edges, density=True, color="#8a8a8a", label="errors")
         if sigma > 0.0:
             x = np.linspace(-reach, reach, 201)
             normal = np.exp(-0.5 * (x / sigma) ** 2) / (sigma * np.sqrt(2.0 * np.pi))
             axes.plot(x, normal, color=TWIN, lw=1.4, label="normal, σ of the card")
         axes.set_xlim(-reach or -1.0, reach or 1.0)
-        axes.set_xlabel(f"measured minus free run ({content.unit.name})")
-        axes.set_ylabel(f"share per {content.unit.name}")
         _legend_above(axes, 2)
         return _svg(figure, f"fan{fan.number}-histogram", "Histogram of the errors with the normal curve")
 
@@ -131,49 +122,43 @@ def histogram(content: Content, fan: FanContent) -> str:
 def autocorrelation(fan: FanContent) -> str:
     """Of the error, with the bound that white noise keeps at 95 % of the lags."""
     its = fan.residual
-    with _small_figure() as (figure, axes):
+    with _small_figure("lag (s)", "autocorrelation") as (figure, axes):
         _draw_correlation(axes, its.lags_s, its.autocorrelation, its.bound_95, "bound of white noise, 95 %")
         axes.set_xlim(0.0, its.lags_s[-1])
-        axes.set_xlabel("lag (s)")
-        axes.set_ylabel("autocorrelation")
         return _svg(figure, f"fan{fan.number}-autocorrelation", "Autocorrelation of the error with its bound")
 
 
 def cross_correlation(fan: FanContent) -> str:
     """Of the error with the command, with the bound that unrelated signals keep at 95 % of the lags."""
     its = fan.residual
-    with _small_figure() as (figure, axes):
+    with _small_figure("lag of the error behind the command (s)", "cross-correlation") as (figure, axes):
         bound = "bound of unrelated signals, 95 %"
         _draw_correlation(axes, its.cross_lags_s, its.cross_correlation, its.cross_bound_95, bound)
         axes.axvline(0.0, color="#888888", lw=0.6)
         axes.set_xlim(its.cross_lags_s[0], its.cross_lags_s[-1])
-        axes.set_xlabel("lag of the error behind the command (s)")
-        axes.set_ylabel("cross-correlation")
         return _svg(figure, f"fan{fan.number}-cross", "Cross-correlation of the error with the command, with its bound")
 
 
 def static_curve(content: Content, fan: FanContent, curve: StaticCurve) -> str:
     """Steady speeds over the command: the twin's, and the measured ones."""
-    each, unit = content.unit.rad_s, content.card.command_unit
-    with _small_figure() as (figure, axes):
+    each = content.unit.rad_s
+    with _small_figure(_command_label(content), f"speed ({content.unit.name})") as (figure, axes):
         axes.plot(curve.twin[:, 0], curve.twin[:, 1] / each, color=TWIN, lw=1.4, label="twin, settled")
         if len(curve.measured):
             command, speed = curve.measured.T
             axes.plot(command, speed / each, "o", ms=3.5, mfc="none", color=MEASURED, label="measured, settled")
-        axes.set_xlabel(f"command ({unit})" if unit else "command")
-        axes.set_ylabel(f"speed ({content.unit.name})")
         _legend_above(axes, 2)
         return _svg(figure, f"fan{fan.number}-static", "Steady speed over command")
 
 
 def what_is_known(content: Content, fan: FanContent, uncertainty: ModelUncertainty) -> str:
     """How far the twin itself may be wrong over speed and command, and where the recordings were."""
-    each, unit = content.unit.rad_s, content.card.command_unit
+    each = content.unit.rad_s
     commands = _around(content.card.command_range, fan.raised_command)
     speeds_rad_s = _around(content.card.speed_range_rad_s, fan.measured_rad_s)
     speeds, std = speeds_rad_s / each, uncertainty.over(speeds_rad_s, commands) / each
     kept = slice(None, None, max(1, len(fan.command) // MOST_MARKS))
-    with _small_figure() as (figure, axes):
+    with _small_figure(_command_label(content), f"speed ({content.unit.name})") as (figure, axes):
         filled = axes.contourf(commands, speeds, std, levels=CONTOURS, cmap="Greens", vmin=0.0)
         axes.plot(
             fan.raised_command[kept], fan.measured_rad_s[kept] / each, ".", ms=1.5, color=COMMAND, label="measured"
@@ -188,8 +173,6 @@ def what_is_known(content: Content, fan: FanContent, uncertainty: ModelUncertain
         if content.card.speed_range_rad_s[0] >= 0.0:
             axes.set_ylim(bottom=0.0)
         axes.grid(visible=False)
-        axes.set_xlabel(f"command ({unit})" if unit else "command")
-        axes.set_ylabel(f"speed ({content.unit.name})")
         _legend_above(axes, 2)
         return _svg(figure, f"fan{fan.number}-known", "How far the twin may be wrong over speed and command")
 
@@ -204,9 +187,9 @@ def _around(trained: tuple[float, float], measured: Array) -> Array:
 
 def error_over_speed(content: Content, fan: FanContent) -> str:
     """Mean and standard deviation of the error over the twin's speed: over the range of the twin."""
-    each = content.unit.rad_s
+    each, unit = content.unit.rad_s, content.unit.name
     half = 2.0 * fan.sigma_rad_s / each
-    with _small_figure() as (figure, axes):
+    with _small_figure(f"speed of the free run ({unit})", f"error ({unit})") as (figure, axes):
         axes.axhspan(-half, half, color=BAND, lw=0, alpha=0.6, label="± 2σ of the card")
         axes.axhline(0.0, color="#888888", lw=0.6)
         middle, mean, deviation = (
@@ -215,8 +198,6 @@ def error_over_speed(content: Content, fan: FanContent) -> str:
         )
         reach = [2.0 * value for value in deviation]
         axes.errorbar(middle, mean, reach, fmt="o", ms=3, lw=0.8, capsize=2, color=MEASURED, label="mean ± 2 std")
-        axes.set_xlabel(f"speed of the free run ({content.unit.name})")
-        axes.set_ylabel(f"error ({content.unit.name})")
         _legend_above(axes, 2)
         return _svg(figure, f"fan{fan.number}-speed", "Mean and standard deviation of the error over the speed")
 
@@ -241,8 +222,7 @@ def _draw_over_time(content: Content, fan: FanContent, panels: tuple[Axes, Axes,
     speed.plot([], [], color=OUTSIDE, label="error outside the band")
     error.set_ylabel(f"error ({content.unit.name})")
     command.step(t_s, given, where="post", color=COMMAND, lw=0.8)
-    unit = content.card.command_unit
-    command.set_ylabel(f"command\n({unit})" if unit else "command")
+    command.set_ylabel(_command_label(content, "\n"))
     command.set_xlim(line.t_s[0], line.t_s[-1])
 
 
@@ -276,6 +256,11 @@ def _draw_correlation(axes: Axes, lags_s: Array, values: Array, bound: float, na
         axes.text(0.5, 0.6, "undefined", transform=axes.transAxes, ha="center", color="#666666")
 
 
+def _command_label(content: Content, between: str = " ") -> str:
+    unit = content.card.command_unit
+    return f"command{between}({unit})" if unit else "command"
+
+
 def _legend_above(axes: Axes, columns: int) -> None:
     """Outside the axes, where it covers nothing."""
     axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.01), ncols=columns, borderaxespad=0.0, columnspacing=1.2)
@@ -290,10 +275,12 @@ def _figure(size_in: tuple[float, float]) -> Iterator[Figure]:
 
 
 @contextmanager
-def _small_figure() -> Iterator[tuple[Figure, Axes]]:
-    """With so few ticks along x that labels of five digits and a sign stay apart."""
+def _small_figure(along: str, up: str) -> Iterator[tuple[Figure, Axes]]:
+    """With labels along x and up y, and so few ticks along x that those of five digits and a sign stay apart."""
     with _figure(SMALL_IN) as figure:
         axes = figure.subplots()
+        axes.set_xlabel(along)
+        axes.set_ylabel(up)
         axes.locator_params(axis="x", nbins=MOST_TICKS)
         yield figure, axes
 

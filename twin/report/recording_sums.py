@@ -12,12 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from fantwin.schemas.twin_card import TwinCard
 from fantwin.twin.build import RunsOfTwin
 from fantwin.twin.errors import TwinError
 from fantwin.twin.evaluation.accuracy import (
     FigureSums,
-    Flags,
     FreeRun,
     evaluation_pieces,
     figure_sums,
@@ -126,18 +124,14 @@ def common_extent(extents: Sequence[Extent]) -> Extent:
     fans = {extent.range_rad_s.shape[1] for extent in extents}
     if len(fans) > 1:
         raise TwinError(f"runs of {sorted(fans)} fans are mixed; give runs of one fan count")
+    ranges_rad_s = np.array([extent.range_rad_s for extent in extents])
     ordered = sorted(extents, key=lambda extent: extent.median_step_s)
     up_to = np.cumsum([extent.steps for extent in ordered])
     return Extent(
         median_step_s=ordered[int(np.searchsorted(up_to, up_to[-1] / 2))].median_step_s,
         steps=int(up_to[-1]),
         longest_s=max(extent.longest_s for extent in extents),
-        range_rad_s=np.stack(
-            (
-                np.fmin.reduce([extent.range_rad_s[0] for extent in extents]),
-                np.fmax.reduce([extent.range_rad_s[1] for extent in extents]),
-            )
-        ),
+        range_rad_s=np.stack((np.fmin.reduce(ranges_rad_s[:, 0]), np.fmax.reduce(ranges_rad_s[:, 1]))),
     )
 
 
@@ -163,6 +157,8 @@ class RecordingSums:
 def sums_of_free_run(of: RunsOfTwin, free_run: FreeRun, extent: Extent) -> RecordingSums:
     """The sums over one piece."""
     piece, error = free_run.piece, free_run.residual_rad_s
+    low, high = of.card.command_range
+    reach = RANGE_TOLERANCE * (high - low)
     return RecordingSums(
         figures=figure_sums(of.model, of.parameters, of.sigma_rad_s, free_run, of.unseen_std),
         residual=residual_sums(error, [piece], extent.grid),
@@ -170,7 +166,7 @@ def sums_of_free_run(of: RunsOfTwin, free_run: FreeRun, extent: Extent) -> Recor
         samples=piece.samples,
         fastest_rad_s=np.fmax.reduce(np.abs(piece.speed_rad_s)),
         missing=np.isnan(piece.speed_rad_s).sum(axis=0, dtype=np.float64),
-        outside=_is_outside(of.card, piece.command).sum(axis=0, dtype=np.float64),
+        outside=((piece.command < low - reach) | (piece.command > high + reach)).sum(axis=0, dtype=np.float64),
     )
 
 
@@ -178,9 +174,3 @@ def recording_sums(of: RunsOfTwin, extent: Extent) -> RecordingSums:
     """The sums over all runs, one piece in memory at a time. Raises TwinError when there is nothing to evaluate."""
     free_runs = (free_run_of_piece(of.model, of.parameters, piece) for piece in evaluation_pieces(of.runs))
     return reduce(add, (sums_of_free_run(of, each, extent) for each in free_runs))
-
-
-def _is_outside(card: TwinCard, command: Array) -> Flags:
-    low, high = card.command_range
-    reach = RANGE_TOLERANCE * (high - low)
-    return (command < low - reach) | (command > high + reach)

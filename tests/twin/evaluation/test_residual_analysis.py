@@ -9,7 +9,6 @@ from scipy import signal
 from fantwin.twin.evaluation.accuracy import free_run_residuals
 from fantwin.twin.evaluation.residual_analysis import ResidualAnalysis, analyse_residual, healthy_residual
 from fantwin.twin.models.physical import PhysicalModel
-from fantwin.twin.models.physics import PARAMETER_NAMES
 from fantwin.twin.runs import Array, Run
 from tests.support import fan_data
 
@@ -107,8 +106,7 @@ def test_a_model_too_weak_or_too_slow_is_seen_in_its_residual() -> None:
     run = fan_data.published_run(7)
 
     def judged(**wrong: float) -> ResidualAnalysis:
-        true = dict(zip(PARAMETER_NAMES, fan_data.PUBLISHED_PARAMETERS.tolist(), strict=False)) | {"lag_s": 0.0}
-        parameters = np.array([[(true | wrong)[name] for name in PARAMETER_NAMES]])
+        parameters = fan_data.published_parameters(**wrong)
         return analyse_residual(free_run_residuals(PhysicalModel(), parameters, [run]), [run])[0]
 
     good, draggy, heavy = judged(), judged(C_D=0.0027), judged(J=0.18)
