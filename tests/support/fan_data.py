@@ -26,12 +26,12 @@ __all__ = [
 PUBLISHED_PARAMETERS = np.array([INERTIA, VISCOUS, DRAG])
 
 
-def parameters_of(fans: int = 1, **values: float) -> Array:
+def parameters_of(fans: int = 1, /, **values: float) -> Array:
     """(fans, 4) parameters of equal fans; 0 for those that are not given."""
     return np.tile([values.get(name, 0.0) for name in PARAMETER_NAMES], (fans, 1))
 
 
-def published_parameters(fans: int = 1, **others: float) -> Array:
+def published_parameters(fans: int = 1, /, **others: float) -> Array:
     """(fans, 4) those of the published fan, but for some."""
     return parameters_of(fans, **{"J": INERTIA, "alpha": VISCOUS, "C_D": DRAG} | others)
 
