@@ -1,20 +1,18 @@
 """Several models trained on the same recordings and evaluated on the same other recordings."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
-from fantwin.schemas.twin_card import DataCard
-from fantwin.twin.build import evaluate, train_twin
+from fantwin.twin.build import evaluate
 from fantwin.twin.errors import TwinError
 from fantwin.twin.evaluation.accuracy import Evaluation, evaluation_pieces, free_run_residuals, pooled_rmse_rad_s
 from fantwin.twin.export.fan_rows import measured_as_in_card
 from fantwin.twin.finishing import TrainedTwin
 from fantwin.twin.kinds import ModelKind
 from fantwin.twin.models.physics import LAG, PARAMETER_NAMES
-from fantwin.twin.progress import Progress, unreported
 from fantwin.twin.runs import Run
 
 Source = Literal["test", "held-out", "training"]
@@ -58,46 +56,29 @@ def source_of(validation_runs: Sequence[Run], test_runs: Sequence[Run]) -> Sourc
 
 def contend(
     kind: ModelKind,
+    train: Callable[[], TrainedTwin],
     runs: Sequence[Run],
-    validation_runs: Sequence[Run],
     test_runs: Sequence[Run],
-    *,
-    seed: int = 0,
-    max_iterations: int | None = None,
-    command_unit: str = "",
     fan_numbers: Sequence[int] | None = None,
-    data: Sequence[DataCard] = (),
-    validation_data: Sequence[DataCard] = (),
-    progress: Progress = unreported,
 ) -> Contender:
-    """Train one kind and evaluate it. Arguments as of build.train_twin; test_runs take no part in training.
+    """Train one kind on the runs by `train` and evaluate it. test_runs take no part in training; fan_numbers: as of
+    build.train_twin.
 
     A kind that cannot be trained, while others can, is a result and not an error.
     """
     try:
-        trained = train_twin(
-            runs,
-            validation_runs,
-            kind.name,
-            name=kind.title,
-            seed=seed,
-            max_iterations=max_iterations,
-            command_unit=command_unit,
-            fan_numbers=fan_numbers,
-            data=data,
-            validation_data=validation_data,
-            progress=progress,
-        )
+        trained = train()
     except TwinError as error:
         return Contender(kind, invalid_reason=str(error))
     pieces = evaluation_pieces(measured_as_in_card(trained.card, range(trained.card.fans), runs))
     residual = free_run_residuals(trained.model, trained.parameters, pieces)
+    is_held_out = trained.card.validation.source == "held-out"
     return Contender(
         kind,
         trained,
         training_rmse_rad_s=pooled_rmse_rad_s(residual),
-        training=None if validation_runs else trained.validation,
-        held_out=trained.validation if validation_runs else None,
+        training=None if is_held_out else trained.validation,
+        held_out=trained.validation if is_held_out else None,
         test=evaluate(trained, test_runs, fan_numbers) if test_runs else None,
     )
 
@@ -107,12 +88,7 @@ def best(contenders: Sequence[Contender]) -> Contender:
 
     Raises TwinError when none could be trained, with the reason of the first.
     """
-    able = [contender for contender in contenders if contender.judged is not None]
+    able = [(each.judged.pooled.rmse_rad_s, each) for each in contenders if each.judged]
     if not able:
         raise TwinError(contenders[0].invalid_reason)
-
-    def rmse(contender: Contender) -> float:
-        assert contender.judged is not None
-        return contender.judged.pooled.rmse_rad_s
-
-    return min(able, key=rmse)
+    return min(able, key=lambda pair: pair[0])[1]

@@ -12,9 +12,9 @@ from typing import Annotated, Any
 import typer
 
 from bench.printing import JsonOption, progress, show
-from bench.training.four_models import held_out_figures, trained_in_s
+from bench.training.four_models import held_out_figures, trained, trained_in_s
 from bench.training.measured_sets import Split, splits
-from fantwin.twin.comparison import Contender, contend
+from fantwin.twin.comparison import Contender
 from fantwin.twin.kinds import KINDS
 
 
@@ -32,7 +32,7 @@ def main(
         learned = []
         for kind in KINDS:
             progress(f"{split.name} ({split.how}): {kind.title}")
-            learned.append(contend(kind, split.training, [], [], seed=seed))
+            learned.append(trained(kind, split.training, seed))
         rows[split.covered] += _rows(split, learned)
         notes.append(f"{split.name}, held out: {split.how}")
         notes += [

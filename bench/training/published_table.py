@@ -14,7 +14,7 @@ import numpy as np
 import typer
 
 from bench.printing import JsonOption, progress, show
-from bench.training.four_models import held_out_figures
+from bench.training.four_models import held_out_figures, trained
 from bench.training.published_fan import (
     DRAG,
     INERTIA,
@@ -24,7 +24,7 @@ from bench.training.published_fan import (
     published_test,
     published_training,
 )
-from fantwin.twin.comparison import Contender, contend
+from fantwin.twin.comparison import Contender
 from fantwin.twin.kinds import KINDS
 from fantwin.twin.models.physics import PARAMETER_NAMES
 
@@ -51,9 +51,7 @@ def main(
     learned: dict[str, list[Contender]] = {}
     for kind in KINDS:
         progress(kind.title)
-        learned[kind.title] = [
-            contend(kind, [training.run], [], [], seed=seed) for seed, (training, _) in enumerate(pairs)
-        ]
+        learned[kind.title] = [trained(kind, [training.run], seed) for seed, (training, _) in enumerate(pairs)]
     tables = {
         f"test error, {runs} pairs of runs": [_error_row(label, found, pairs) for label, found in learned.items()],
         f"parameters recovered, {runs} training runs": [_parameter_row(name, learned["physical"]) for name in TRUE],

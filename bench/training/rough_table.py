@@ -13,12 +13,12 @@ import numpy as np
 import typer
 
 from bench.printing import JsonOption, progress, show
-from bench.training.four_models import held_out_figures, trained_in_s
+from bench.training.four_models import held_out_figures, trained, trained_in_s
 from bench.training.published_fan import RATE_HZ, SimulatedRun, random_stairs
 from fantwin.simulation.excitation import Manual
 from fantwin.simulation.plant import FanParameters, advance, at_rest
 from fantwin.simulation.tacho import NoisyTacho
-from fantwin.twin.comparison import Contender, contend
+from fantwin.twin.comparison import Contender
 from fantwin.twin.kinds import KINDS
 from fantwin.twin.runs import Array, Run
 
@@ -42,7 +42,7 @@ def main(
         learned = []
         for kind in KINDS:
             progress(f"repetition {seed + 1} of {runs}: {kind.title}")
-            learned.append(contend(kind, [training.run], [], [], seed=seed))
+            learned.append(trained(kind, [training.run], seed))
         for how, test in tests.items():
             tables[f"held out: {how}, seed {seed}"] = _rows(learned, test)
     notes = [

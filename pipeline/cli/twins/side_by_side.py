@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -16,7 +18,8 @@ from fantwin.pipeline.cli.progress import training_progress
 from fantwin.pipeline.cli.twins.figures import figures_in, shown
 from fantwin.pipeline.errors import UsageError
 from fantwin.pipeline.files import make_folder, write_whole
-from fantwin.pipeline.learning.training_data import TrainingData, data_cards
+from fantwin.pipeline.learning.fitting import TrainingSettings, fit_twin
+from fantwin.pipeline.learning.training_data import TrainingData
 
 if TYPE_CHECKING:
     from fantwin.twin.comparison import Contender
@@ -37,13 +40,13 @@ def train_side_by_side(
     read: Callable[[], Data],
     folder: Path,
     pool: RecordingsInParallel,
+    settings: TrainingSettings,
     *,
-    seed: int,
-    iterations: int | None,
-    command_unit: str,
     json_output: bool,
 ) -> None:
     """Train several models on the same recordings, print them side by side, and write the twins and comparison.json.
+
+    settings: of each, but for the kind of model.
 
     Raises:
         UserError: the recordings cannot be used, or the folder cannot be written.
@@ -56,23 +59,12 @@ def train_side_by_side(
     training_data, *others = read()
     make_folder(folder)
     validation_runs, test_runs = (part.runs if part else [] for part in others)
-    data, validation_data = data_cards(training_data), data_cards(others[0]) if others[0] else ()
     contenders = []
     with training_progress(training_data) as start:
         for kind in chosen:
-            contender = contend(
-                kind,
-                training_data.runs,
-                validation_runs,
-                test_runs,
-                seed=seed,
-                max_iterations=iterations,
-                command_unit=command_unit,
-                fan_numbers=training_data.fans,
-                data=data,
-                validation_data=validation_data,
-                progress=start(kind.title),
-            )
+            own = replace(settings, model=kind.name, networks=1)
+            train = partial(fit_twin, training_data, others[0], kind.title, own, start(kind.title))
+            contender = contend(kind, train, training_data.runs, test_runs, training_data.fans)
             if contender.twin:
                 write_whole(_file(folder, kind), contender.twin.onnx())
             contenders.append(contender)

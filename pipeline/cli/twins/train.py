@@ -133,8 +133,7 @@ def train(
                     "--networks and --trainer are for one model: models are compared with one network each, "
                     "trained alike"
                 )
-            how = {"seed": seed, "iterations": iterations, "command_unit": command_unit}
-            train_side_by_side(chosen, data, output, pool, **how, json_output=json_output)
+            train_side_by_side(chosen, data, output, pool, given, json_output=json_output)
             return
         if test:
             raise UsageError("--test is for several models; `fantwin evaluate` judges one: fantwin evaluate TWIN.onnx")

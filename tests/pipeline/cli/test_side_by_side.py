@@ -87,7 +87,7 @@ def test_the_table_fits_a_terminal_marks_the_best_and_has_a_row_for_a_model_that
             raise TwinError("the narx model diverges")
         return train_twin(runs, validation_runs, kind, **options)
 
-    monkeypatch.setattr("fantwin.twin.comparison.train_twin", train_or_diverge)
+    monkeypatch.setattr("fantwin.twin.build.train_twin", train_or_diverge)
     validate = ("--validate", folder / "held-out.mcap", "--test", folder / "untouched.mcap")
     chosen = ("--model", "hybrid-w,physical,narx", "--iterations", 1, "-o", tmp_path)
     shown = fantwin("train", folder / "healthy.mcap", *validate, *chosen)
