@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from fantwin.simulation.tray import SimulatedTray, TraySample, TraySettings
+from fantwin.schemas.device_sample import DeviceSample
+from fantwin.simulation.tray import SimulatedTray, TraySettings
 from fantwin.twin.runs import Run
 
 
-def samples_of(settings: TraySettings, duty: float | None = None) -> list[TraySample]:
+def samples_of(settings: TraySettings, duty: float | None = None) -> list[DeviceSample]:
     """All samples until the end. duty: of all fans, instead of the profile."""
     tray, samples = SimulatedTray(settings), []
     if duty is not None:

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fantwin.schemas.device_sample import DeviceSample
 from bench.detection.tray_run import samples_of
+from fantwin.schemas.device_sample import DeviceSample
 from fantwin.simulation.errors import SimulationError
 from fantwin.simulation.faults import Fault
 from fantwin.simulation.plant import Surroundings
