@@ -4,21 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
 from functools import partial
-from itertools import accumulate, cycle, pairwise, takewhile
 from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
-from fantwin.pipeline.tray_scoring.scorer_core import ScorerCore
 from fantwin.schemas.blocks import cut
 from fantwin.schemas.enums import Action, FanState, InvalidReason, Severity, Statistic, Transition
-from fantwin.schemas.fields import columns
-from fantwin.schemas.messages import Alarm, Prediction, Request, Score, ScorerSnapshot
+from fantwin.schemas.messages import Alarm, Prediction, ScorerSnapshot
 from fantwin.schemas.units import NS_PER_S
 from fantwin.scoring.unseen_error import UnseenError
 from tests.support import scored_blocks
@@ -30,12 +24,10 @@ from tests.support.scored_blocks import (
     STEP_NS,
     TIME_CONSTANT_S,
     core_of,
-    eventful_prediction,
     feed,
     noise_of,
     prediction_of,
     request_of,
-    snapshot_of,
     with_step,
 )
 from tests.support.uncertainty_tables import by_speed
@@ -230,39 +222,8 @@ def test_commissioning_forgets_the_fan_that_it_is_asked_for_and_ends_its_alarm()
     assert abs(score.expected_residual_rad_s[-1, 0]) < 6.0
 
 
-# blocks
-
-
-def judged(core: ScorerCore, items: Iterable[Prediction | Request]) -> tuple[Any, ...]:
-    """All columns, to the bit, the counters, problem and snapshot of the core, and the repr of each alarm."""
-    with np.errstate(all="ignore"):
-        scores, alarms = feed(core, items)
-    bits = {name: np.concatenate([getattr(s, name) for s in scores]).tobytes() for name in columns(Score) if scores}
-    return bits, [repr(alarm) for alarm in alarms], core.counters(), core.problem(), snapshot_of(core).state_json
-
-
 def parts(whole: Prediction, marks: Iterable[int]) -> list[Prediction]:
     return [cut(whole, *part) for part in pairwise(marks)]
-
-
-@settings(max_examples=8, deadline=None)
-@given(
-    seed=st.integers(0, 10_000),
-    samples=st.integers(1, 120),
-    sizes=st.lists(st.integers(1, 100), min_size=1, max_size=3),
-    period_ns=st.sampled_from([STEP_NS, 3 * STEP_NS, 25 * STEP_NS]),
-    change_s=st.sampled_from([0.0, 0.1]),
-)
-def test_blocks_of_any_size_are_judged_the_same_to_the_bit(
-    seed: int, samples: int, sizes: list[int], period_ns: int, change_s: float
-) -> None:
-    whole = eventful_prediction(seed, samples, change_s)
-    whole = replace(whole, t_ns=EPOCH_NS + (whole.t_ns - EPOCH_NS) // STEP_NS * period_ns, period_ns=period_ns)
-    ends = [0, *takewhile(lambda end: end < samples, accumulate(cycle(sizes))), samples]
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("fantwin.pipeline.tray_scoring.scorer_core.NOT_JUDGED_S", 0.1)
-        single, blocks = (judged(core_of(3), parts(whole, marks)) for marks in (range(samples + 1), ends))
-    assert single == blocks
 
 
 # other output

@@ -18,7 +18,6 @@ from fantwin.pipeline.tray_scoring.scorer_core import ScorerCore
 from fantwin.pipeline.tray_scoring.snapshot_store import SnapshotStore
 from fantwin.schemas.blocks import cut
 from fantwin.schemas.enums import Action, FanState, Transition
-from fantwin.schemas.fields import columns
 from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Alarm, Score, ScorerSnapshot
 from fantwin.schemas.units import NS_PER_S
@@ -29,13 +28,13 @@ from fantwin.scoring.wear.wear_monitor import WearMonitor
 from tests.support.scored_blocks import (
     EPOCH_NS,
     core_of,
-    eventful_prediction,
     feed,
     learned,
     prediction_of,
     request_of,
     snapshot_of,
     twin_of,
+    with_step,
 )
 
 HOUR = 360_000  # samples
@@ -43,36 +42,29 @@ HOUR = 360_000  # samples
 
 STEP = -30.0
 IN_ALARM = (FanState.ALARM, FanState.RETURNING)
-OF_SMALL_EVIDENCE = ("score", "state", "statistic")
-"""columns that tell of evidence below half of an alarm, which no snapshot keeps"""
-
-
-def numbers(scores: Sequence[Score], from_t_ns: int = 0) -> dict[str, np.ndarray]:
-    rows = [score.t_ns >= from_t_ns for score in scores]
-    return {
-        name: np.concatenate([getattr(s, name)[r] for s, r in zip(scores, rows, strict=True)])
-        for name, column in columns(Score).items()
-        if column.by_sample and not column.optional and name not in OF_SMALL_EVIDENCE
-    }
 
 
 def test_after_a_kill_the_samples_that_producers_still_keep_are_scored(tmp_path: Path) -> None:
-    blocks = [cut(eventful_prediction(3, 600, 0.0), k, k + 10) for k in range(0, 600, 10)]
-    with np.errstate(all="ignore"):
-        unbroken, alarms = feed(core_of(3), blocks)
-        killed = core_of(3, snapshot_store=SnapshotStore(tmp_path / "m"))
-        feed(killed, blocks[:40])
-        kept = SnapshotStore(tmp_path / "m").load()
-        assert kept
-        assert kept.t_ns < blocks[39].t_ns[-1], "it was not closed: the last alarm was the last note"
-        successor = core_of(3)
-        successor.restore(kept)
-        scores, again = feed(successor, blocks[10:])
-    expected = numbers([s for s in unbroken if s.t_ns[-1] > kept.t_ns], kept.t_ns + 1)
-    for name, column in numbers(scores, kept.t_ns + 1).items():
-        np.testing.assert_allclose(column, expected[name], rtol=1e-9, atol=1e-9, err_msg=name)
-    later = [(each.t_ns, each.fan, each.transition) for each in alarms if each.t_ns > kept.t_ns]
-    assert [(each.t_ns, each.fan, each.transition) for each in again] == later
+    residual = with_step(6.0, 3.8, fans=3, size=2.0 * STEP)
+    residual[500:, 1] += 2.0 * STEP
+    whole = prediction_of(residual)
+    blocks = [cut(whole, k, k + 10) for k in range(0, 600, 10)]
+    unbroken, alarms = feed(core_of(3), blocks)
+    killed = core_of(3, snapshot_store=SnapshotStore(tmp_path / "m"))
+    feed(killed, blocks[:45])
+    kept = SnapshotStore(tmp_path / "m").load()
+    assert kept
+    assert kept.t_ns < blocks[44].t_ns[-1], "it was not closed: the last alarm was the last note"
+    successor = core_of(3)
+    successor.restore(kept)
+    scores, again = feed(successor, blocks[10:])
+    for name in ("expected_residual_rad_s", "band_variance", "valid"):
+        expected, found = (
+            np.concatenate([getattr(each, name)[each.t_ns > kept.t_ns] for each in of]) for of in (unbroken, scores)
+        )
+        np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9, err_msg=name)
+    later = [(each.t_ns, each.fan, each.transition) for each in alarms if each.t_ns > blocks[44].t_ns[-1]]
+    assert [(each.t_ns, each.fan, each.transition) for each in again] == later != []
 
 
 def test_every_alarm_and_answer_is_in_the_file_and_in_a_published_snapshot_before_it_is_emitted(tmp_path: Path) -> None:

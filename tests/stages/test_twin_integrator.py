@@ -33,6 +33,7 @@ from tests.support.integrated_twins import (
     split,
     stairs,
     twin_with_friction,
+    unstable_twin,
 )
 from tests.support.twin_files import write_twin
 
@@ -157,6 +158,15 @@ def test_an_unknown_command_of_one_fan_never_reaches_the_graph_and_leaves_the_ot
     np.testing.assert_array_equal(prediction.predicted_speed_rad_s[:, 1], whole.predicted_speed_rad_s[:, 1])
     assert not prediction.valid[100:170, 0].any()
     assert np.isnan(prediction.predicted_speed_rad_s[151:170, 0]).all()
+
+
+def test_a_fan_that_diverges_within_a_block_restarts_from_the_next_reading() -> None:
+    command = np.full((40, 2), 40.0)
+    command[10, 0] = command[25, 0] = 90.0
+    core = core_of(unstable_twin(2))
+    prediction = feed(core, [grid_of(command)])
+    assert (core.counters()["diverged"], core.counters()["free_runs"]) == (2, 2 + 2)
+    assert prediction.valid.all()
 
 
 def test_a_discrete_twin_at_another_rate_says_so_and_judges_nothing() -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from copy import deepcopy
-from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -175,36 +174,6 @@ def snapshot_of(core: ScorerCore) -> ScorerSnapshot:
     """The snapshot that it saves at the end."""
     (snapshot,) = core.close()
     return snapshot
-
-
-def eventful_prediction(seed: int, samples: int, change_s: float) -> Prediction:
-    """Three fans: residuals that cross the limits, NaN, invalid stretches, repeats, jumps."""
-    rng = np.random.default_rng(seed)
-    shape = (samples, 3)
-    k = np.arange(samples)
-
-    def levels(*of: float) -> Floats:
-        return rng.choice(of, (samples // 5 + 1, 3)).repeat(5, axis=0)[:samples]
-
-    prediction = prediction_of(
-        levels(0.0, 0.0, 9.0, 30.0, -60.0) + rng.normal(0, 1, shape),
-        balance=levels(0.0, 0.0, 1.0, 8.0) + rng.normal(0, 0.3, shape),
-    )
-    measured = np.where(rng.random(shape) < 0.02, np.nan, prediction.measured_speed_rad_s)
-    measured = np.where(levels(0.0, 0.0, 0.0, 1.0) > 0, measured[0], measured)  # stuck for a while
-    predicted = np.where(rng.random(shape) < 0.01, rng.choice([np.nan, np.inf, 1e308, -1e308]), 300.0)
-    why = (InvalidReason.GAP, InvalidReason.NO_SPEED, InvalidReason.WARMING_UP, InvalidReason.OUT_OF_RANGE)
-    valid = (rng.random((samples // 7 + 1, 3)) > 0.2).repeat(7, axis=0)[:samples] & (rng.random(shape) > 0.02)
-    steps = rng.choice([1, 1, 1, 1, 1, 0, -2, 40], samples) if change_s else np.ones(samples, int)
-    return replace(
-        prediction,
-        t_ns=EPOCH_NS + (steps.cumsum() + k // 50 * round(change_s * 100)) * STEP_NS,
-        measured_speed_rad_s=measured,
-        predicted_speed_rad_s=predicted,
-        valid=valid,
-        invalid_reason=np.where(valid, InvalidReason.NONE, levels(*map(float, why))).astype(np.uint8),
-        torque_balance_command=np.where(rng.random(shape) < 0.02, np.nan, prediction.torque_balance_command),
-    )
 
 
 SECOND = 100
