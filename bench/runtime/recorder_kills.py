@@ -19,7 +19,7 @@ from bench.printing import JsonOption, progress, show
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
-from tests.support.killed_recorder import FLUSH_S, Kills
+from bench.runtime.killed_recorder import FLUSH_S, Kills
 
 LOADS = {"8 fans": (1, 8), "200 fans": (4, 50)}
 """Trays, and fans of each; 100 Hz, four topics a tray."""

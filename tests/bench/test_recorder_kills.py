@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import pytest
 
-from tests.support.killed_recorder import Kills
+from bench.runtime.killed_recorder import Kills
 
 pytestmark = [pytest.mark.slow, pytest.mark.real_time]
 

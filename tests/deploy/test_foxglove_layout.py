@@ -8,8 +8,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from google.protobuf.descriptor import Descriptor, FieldDescriptor
-
 from fantwin.schemas import fan_pb2
 from fantwin.schemas.codec import type_name
 from fantwin.schemas.topics import BY_NAME, tray_key
@@ -39,33 +37,22 @@ def paths(value: Any) -> Iterator[str]:
             yield from paths(inner)
 
 
-def resolve(path: str, variables: set[str]) -> FieldDescriptor | Descriptor:
-    """What a message path leads to.
-
-    Raises:
-        LookupError: it leads nowhere.
-    """
+def resolve(path: str, variables: set[str]) -> Any:
+    """The message or the field that a path leads to; a LookupError names the first part that is not there."""
     match = PATH.fullmatch(path)
-    if match is None:
-        raise LookupError(f"{path}: not a message path")
+    assert match, f"{path}: not a message path"
     topic = match["topic"].rpartition("/")[2]
-    if topic not in BY_NAME or match["topic"] != tray_key("demo", "tray1", topic):
-        raise LookupError(f"{path}: no such topic")
-    message: Descriptor = fan_pb2.DESCRIPTOR.message_types_by_name[type_name(BY_NAME[topic].message).rpartition(".")[2]]
-    if match["filter"] and (match[3] not in message.fields_by_name or match[4] not in variables):
-        raise LookupError(f"{path}: nothing to filter by")
-    found: FieldDescriptor | Descriptor = message
+    assert match["topic"] == tray_key("demo", "tray1", topic)
+    message: Any = fan_pb2.DESCRIPTOR.message_types_by_name[type_name(BY_NAME[topic].message).rpartition(".")[2]]
+    if match["filter"]:
+        assert match[3] in message.fields_by_name and match[4] in variables, f"{path}: nothing to filter by"
+    found = message
     for name, index in re.findall(r"\.(\w+)(\[[^\]]*\])?", match["fields"]):
-        inside = found if isinstance(found, Descriptor) else found.message_type
-        if inside is None:
-            raise LookupError(f"{path}: {found.name} has no fields")
-        if name not in inside.fields_by_name:
-            raise LookupError(f"{path}: {inside.name} has no field {name}")
-        found = inside.fields_by_name[name]
-        if found.is_repeated != bool(index) or (index.startswith("[$") and index[2:-1] not in variables):
-            raise LookupError(f"{path}: {name}{index}: not an index of it")
-    if unknown := set(re.findall(r"@(\w+)", match["functions"])) - FUNCTIONS:
-        raise LookupError(f"{path}: unknown functions {unknown}")
+        found = message.fields_by_name[name]
+        assert found.is_repeated == bool(index), f"{path}: {name}{index}: not an index of it"
+        assert not index.startswith("[$") or index[2:-1] in variables
+        message = found.message_type
+    assert set(re.findall(r"@(\w+)", match["functions"])) <= FUNCTIONS
     return found
 
 
@@ -77,8 +64,7 @@ def test_every_path_leads_to_a_field_of_the_schema() -> None:
     fields = {field.name for field in leads_to.values()}
     assert {"measured_speed_rad_s", "predicted_speed_rad_s", "band_variance", "score", "state", "severity"} <= fields
     for path in paths(document["configById"]["StateTransitions!states"]):
-        field = leads_to[path]
-        assert isinstance(field, FieldDescriptor) and field.enum_type is not None, "shown by its name"
+        assert leads_to[path].enum_type is not None, "shown by its name"
 
 
 def panels(node: Any) -> list[str]:

@@ -7,7 +7,6 @@ import math
 from ctypes import byref, c_uint8, c_uint16
 
 import pytest
-from cobs import cobs
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -15,9 +14,6 @@ from fantwin.schemas.channels import SUPPLY_VOLTAGE
 from fantwin.schemas.wire import DEVICE_COUNTERS, CommandFrame, Decoder, DeviceCounters, Sample, SetPointFrame, encode
 from tests.support.firmware_build import parts_library
 from tests.support.firmware_parts import (
-    BAD_CRC,
-    BAD_LENGTH,
-    BAD_VALUE,
     COMMAND,
     COUNTERS,
     COUNTERS_LINE_BYTES,
@@ -27,7 +23,6 @@ from tests.support.firmware_parts import (
     PWM_STEPS,
     SAMPLE_LINE_BYTES,
     SET_POINT,
-    WRONG_KIND,
     Fan,
     Receiver,
     SampleStruct,
@@ -45,10 +40,6 @@ def parts() -> ctypes.CDLL:
     return firmware_parts(parts_library())
 
 
-def octets(data: bytes, room: int = 0) -> ctypes.Array[c_uint8]:
-    return (c_uint8 * max(len(data), room)).from_buffer_copy(data.ljust(room, b"\0"))
-
-
 # ---- frames
 
 float32 = st.floats(width=32, allow_nan=True, allow_infinity=True)
@@ -58,25 +49,6 @@ rpm = st.one_of(st.just(math.nan), st.floats(0.0, SPEED_MAX_RPM, width=32))
 
 def of_each_fan(values: st.SearchStrategy[float]) -> st.SearchStrategy[tuple[float, ...]]:
     return st.lists(values, min_size=FANS, max_size=FANS).map(tuple)
-
-
-@given(data=st.binary(max_size=253))
-def test_stuffed_bytes_are_those_of_cobs(parts: ctypes.CDLL, data: bytes) -> None:
-    out = (c_uint8 * (len(data) + 2))()
-    length = parts.cobs_encode(octets(data, 1), len(data), out)
-    assert bytes(out[:length]) == cobs.encode(data)
-
-
-@given(piece=st.one_of(st.binary(min_size=1, max_size=60), st.binary(max_size=200).map(cobs.encode)))
-def test_a_piece_is_unstuffed_or_refused_as_cobs_does(parts: ctypes.CDLL, piece: bytes) -> None:
-    inside = octets(piece)
-    length = parts.cobs_decode(inside, len(piece))
-    try:
-        expected = cobs.decode(piece)
-    except cobs.DecodeError:
-        assert length == -1
-    else:
-        assert bytes(inside[:length]) == expected
 
 
 @given(
@@ -155,19 +127,6 @@ def test_the_firmware_takes_those_frames_that_the_protocol_takes(parts: ctypes.C
         assert values == pytest.approx(wanted, abs=0, nan_ok=True)
 
 
-def test_what_is_no_frame_for_this_board_is_named(parts: ctypes.CDLL) -> None:
-    good = encode("binary", CommandFrame((0.5,) * FANS))
-    wrong_crc = good[:-3] + bytes([good[-3] ^ 1]) + good[-2:]
-    sample = encode("binary", Sample(1, 1, (0.5,), (1.0,)))
-    one_fan = encode("binary", CommandFrame((0.5,)))
-    too_much = encode("binary", CommandFrame((0.5, 0.5, 1.01, 0.5)))
-    infinite = encode("binary", SetPointFrame((math.inf,) * FANS))
-    pieces = (good, wrong_crc, sample, one_fan, too_much, infinite, b"\5\1\0", b"\1" * 500 + b"\0", good)
-    kinds = [kind for kind, _ in received(parts, b"".join(pieces))]
-    refused = [BAD_CRC, WRONG_KIND, WRONG_KIND, BAD_VALUE, BAD_VALUE, BAD_LENGTH, BAD_LENGTH]
-    assert kinds == [COMMAND, *refused, COMMAND]
-
-
 # ---- tachos
 
 
@@ -194,15 +153,6 @@ class Turning:
         self.now_us += after_us
         self._parts.tacho_settle(byref(self.tacho), self.now_us % UINT32)
         return self._parts.tacho_period_rpm(byref(self.tacho), self.now_us % UINT32)
-
-
-def test_uneven_pulses_do_not_show(parts: ctypes.CDLL) -> None:
-    fan, readings = Turning(parts), []
-    for to_next_us in (9_000, 11_000) * 10:
-        fan.edge(False, to_next_us - 5_000)
-        fan.edge(True, 5_000 - GLITCH_US)
-        readings.append(fan.read(GLITCH_US))
-    assert readings[3:] == pytest.approx([3000.0] * 17)
 
 
 def test_a_pulse_that_fails_to_come_lowers_the_speed_and_standstill_is_zero(parts: ctypes.CDLL) -> None:

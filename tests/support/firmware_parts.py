@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ctypes
-from ctypes import POINTER, Structure, c_bool, c_float, c_int, c_int16, c_uint8, c_uint16, c_uint32
+from ctypes import POINTER, Structure, c_bool, c_float, c_int, c_uint8, c_uint16, c_uint32
 from pathlib import Path
 
 FANS = 4
@@ -12,7 +12,7 @@ PWM_STEPS = 640
 COUNTERS = 12
 COUNTERS_LINE_BYTES = 7 + 2 * COUNTERS + 4 + 3
 SAMPLE_LINE_BYTES = 11 + 1 + 4 * FANS * 3 + 4 + 3
-NOTHING, COMMAND, SET_POINT, BAD_LENGTH, BAD_CRC, WRONG_KIND, BAD_VALUE = range(7)
+NOTHING, COMMAND, SET_POINT = range(3)
 Values = c_float * FANS
 
 
@@ -61,9 +61,6 @@ def firmware_parts(library: Path) -> ctypes.CDLL:
     parts = ctypes.CDLL(str(library))
     tacho, fan, octets = POINTER(TachoStruct), POINTER(Fan), POINTER(c_uint8)
     for name, result, arguments in (
-        ("cobs_encode", c_uint8, (octets, c_uint8, octets)),
-        ("cobs_decode", c_int16, (octets, c_uint8)),
-        ("crc32", c_uint32, (octets, c_uint8)),
         ("sample_encode", c_uint8, (POINTER(SampleStruct), octets)),
         ("counters_encode", c_uint8, (c_uint32, POINTER(c_uint16), octets)),
         ("receiver_take", c_int, (POINTER(Receiver), c_uint8, POINTER(c_float))),

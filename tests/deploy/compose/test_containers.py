@@ -37,35 +37,6 @@ END
 fantwin certs init -c own.toml >/dev/null
 fantwin certs issue -c own.toml >/dev/null
 """
-ZENOH = """python - <<END
-import json, zenoh
-settings = zenoh.Config()
-for path, value in {
-    "mode": "client",
-    "connect/endpoints": ["ENDPOINT"],
-    "connect/timeout_ms": 2000,
-    "scouting/multicast/enabled": False,
-    "transport/link/tls": TLS,
-}.items():
-    settings.insert_json5(path, json.dumps(value))
-zenoh.open(settings)
-print("joined")
-END
-"""
-"""a program that does without fantwin's own checks"""
-NO_TLS: dict[str, object] = {}
-NO_CERTIFICATE: dict[str, object] = {"root_ca_certificate": "/certs/ca/ca.pem"}
-FOREIGN: dict[str, object] = {
-    **NO_CERTIFICATE,
-    "enable_mtls": True,
-    "connect_certificate": "/tmp/certs/operator.pem",
-    "connect_private_key": "/tmp/certs/operator.key",
-}
-GENUINE: dict[str, object] = {
-    **FOREIGN,
-    "connect_certificate": "/certs/operator/certificate.pem",
-    "connect_private_key": "/certs/operator/key.pem",
-}
 CUT_S = 3.0
 WITHIN_S = 120.0
 
@@ -112,19 +83,6 @@ def test_fantwin_without_the_certificates_of_the_site_cannot_join():
     for each in (without, foreign):
         print(each.stderr.strip())
         assert (each.returncode, each.stdout) == (1, "")
-
-
-@pytest.mark.parametrize(
-    ("transport", "tls", "joins"),
-    [("tcp", NO_TLS, False), ("tls", NO_CERTIFICATE, False), ("tls", FOREIGN, False), ("tls", GENUINE, True)],
-    ids=["without TLS", "without a certificate", "of another authority", "of the site"],
-)
-def test_a_program_joins_with_a_certificate_of_the_site_only(transport: str, tls: dict[str, object], joins: bool):
-    program = ZENOH.replace("ENDPOINT", f"{transport}/router:7447").replace("TLS", repr(tls))
-    volumes = ["ca:/certs/ca:ro", "operator_key:/certs/operator:ro"]
-    tried = site.in_new_container(OWN_CERTIFICATES + program, volumes=volumes)
-    assert ("joined" in tried.stdout) == joins, tried.stderr
-    assert joins or "ZError" in tried.stderr
 
 
 @pytest.mark.parametrize("service", ["router", *ENABLED])

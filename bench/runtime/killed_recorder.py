@@ -16,11 +16,11 @@ from pathlib import Path
 
 from mcap.reader import make_reader
 
+from bench.runtime.recorder_feed import PRODUCER, SITE, TOPICS
 from fantwin.pipeline.recordings.contents import contents_of
 from fantwin.pipeline.recordings.reading import RecordingError, read_recording
 from fantwin.pipeline.recordings.scan import Contents, scan
 from fantwin.schemas.enums import StageStatus
-from tests.support.recorder_feed import PRODUCER, SITE, TOPICS
 from tests.support.running_chain import DEADLINE_S, FANTWIN, eventually
 
 FLUSH_S = 1.0
