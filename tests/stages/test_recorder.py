@@ -330,8 +330,7 @@ def test_a_recording_says_which_topics_were_left_out_on_purpose(tmp_path):
     core = STAGE.build(run).core
     for number in range(2):
         outputs = tuple(Output(key=tray_key("plant", "tray1", name), published=3 * number) for name in SAMPLES)
-        said = health("scorer", producer="scorer-1", sequence=number, outputs=outputs)
-        core.step(envelope(said, "health"))
+        core.step(envelope(health("scorer", producer="scorer-1", sequence=number, outputs=outputs), "health"))
     assert core.notes()[-1] == "not recorded: grid, prediction, score (recorder.topics)"
     core.close()
     path = run.run_folder / "recording.mcap"

@@ -17,10 +17,10 @@ from fantwin.pipeline.recordings.parts import RecordingParts
 from fantwin.pipeline.recordings.reading import read_recording
 from fantwin.pipeline.recordings.recorder import Recorder
 from fantwin.pipeline.recordings.recorder_config import RecorderConfig
-from fantwin.schemas.enums import Severity, Transition
-from fantwin.schemas.header import Header
+from fantwin.schemas.enums import Transition
 from fantwin.schemas.messages import Alarm
 from tests.support.clipped_recordings import record
+from tests.support.made_messages import alarm
 from tests.support.offline_replay import recorded, recording_of
 from tests.support.stub_disk import NOW_NS, SECOND_NS, Disk, envelope
 
@@ -80,9 +80,7 @@ def tick_until_cut(core: Recorder, clips: AlarmClips, now_ns: int) -> None:
 
 
 def raised(fan: int, t_ns: int, **more: Any) -> Alarm:
-    fields: dict[str, Any] = {"transition": Transition.RAISED, "active": True, "severity": Severity.ALARM} | more
-    about: dict[str, Any] = {"residual_rad_s": 0.0, "residual_std_rad_s": 0.0, "message": ""}
-    return Alarm(header=Header("scorer-1", fan, "tray1"), fan=fan, t_ns=t_ns, onset_t_ns=t_ns, **about, **fields)
+    return alarm(fan, t_ns, sequence=fan, **({"transition": Transition.RAISED} | more))
 
 
 def crash(core: Recorder) -> None:

@@ -5,13 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.outputs.rerun.viewer_core import ViewerCore
 from fantwin.pipeline.runtime.stage import Context
 from fantwin.schemas.messages import Alarm, Score
-from fantwin.stages.viewer import ViewerConfig
+from tests.support import drawn_views
 from tests.support.drawn_views import sent
-from tests.support.score_data import START_NS, made_up_tray
+from tests.support.score_data import made_up_tray
 
 TRAYS = ("tray1", "tray2", "tray3")
 
@@ -38,11 +37,4 @@ def play(core: ViewerCore, messages: list[Score | Alarm]) -> None:
 
 
 def context(folder: Path, trays: int, fans: int, **config: Any) -> Context:
-    return Context(
-        site="site",
-        trays=tuple(TrayConfig(name=f"tray{number}", fans=fans) for number in range(1, trays + 1)),
-        config=ViewerConfig(**{"file": "view.rrd", "grpc_port": 0, **config}),
-        folder=folder,
-        run_folder=folder,
-        started_t_ns=START_NS,
-    )
+    return drawn_views.context(folder, fans=fans, trays=TRAYS[:trays], **config)

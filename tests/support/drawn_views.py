@@ -94,15 +94,12 @@ def play(core: Core, scores: Sequence[Score]) -> None:
         core.tick(int(score.t_ns[-1]))
 
 
-def context(folder: Path, *, fans: int = 3, speed_unit: Any = "rad/s", **config: Any) -> Context:
-    return Context(
-        site="site",
-        trays=(TrayConfig(name="tray1", fans=fans, speed_unit=speed_unit),),
-        config=ViewerConfig(**{"file": "view.rrd", "grpc_port": 0, **config}),
-        folder=folder,
-        run_folder=folder,
-        started_t_ns=START_NS,
-    )
+def context(
+    folder: Path, *, fans: int = 3, speed_unit: Any = "rad/s", trays: Sequence[str] = ("tray1",), **config: Any
+) -> Context:
+    configs = tuple(TrayConfig(name=name, fans=fans, speed_unit=speed_unit) for name in trays)
+    viewer = ViewerConfig(**{"file": "view.rrd", "grpc_port": 0, **config})
+    return Context("site", configs, viewer, folder, folder, started_t_ns=START_NS)
 
 
 def chunks_of(path: Path) -> list[Any]:

@@ -2,15 +2,30 @@
 
 from __future__ import annotations
 
-from typing import Any, get_args
+from typing import Any, TypeVar, get_args
+
+import numpy as np
 
 from fantwin.schemas.enums import Severity, StageStatus
+from fantwin.schemas.fields import columns
 from fantwin.schemas.header import Header
 from fantwin.schemas.health import Health
 from fantwin.schemas.messages import Alarm, Message
 
 MESSAGE_TYPES: tuple[type[Message], ...] = get_args(Message)
 """every type of message"""
+MessageType = TypeVar("MessageType", bound=Message)
+
+
+def filled(kind: type[MessageType], samples: int, fans: int, **given: Any) -> MessageType:
+    """A message whose columns are zero, and valid, but for what is given: numbers, or arrays of the column's shape."""
+    shapes = {"samples": (samples,), "samples x fans": (samples, fans), "fans": (fans,)}
+    values: dict[str, Any] = {
+        name: np.broadcast_to(np.asarray(given.pop(name, name == "valid"), column.dtype), shapes[column.shape]).copy()
+        for name, column in columns(kind).items()
+        if name in given or not column.optional
+    }
+    return kind(fans=fans, **values, **given)
 
 
 def health(stage: str, instance: str = "all", producer: str = "", sequence: int = 0, **more: Any) -> Health:

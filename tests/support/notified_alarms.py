@@ -10,10 +10,10 @@ from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.outputs.notify.config import NotifierConfig
 from fantwin.pipeline.runtime.stage import Context
 from fantwin.schemas.enums import Severity, Transition
-from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Alarm, Diagnosis
 from fantwin.schemas.units import NS_PER_S
 from fantwin.stages.notifier import NotifierCore, build
+from tests.support import made_messages
 
 SITE, TRAY = "hall", "tray1"
 START_NS = 1_790_000_000 * NS_PER_S
@@ -35,20 +35,14 @@ def alarm(
 ) -> Alarm:
     """A transition; without `sequence` a later one than all before."""
     values: dict[str, Any] = {
-        "fan": fan,
-        "active": True,
-        "severity": Severity.WARNING,
-        "t_ns": START_NS,
-        "onset_t_ns": START_NS + round(onset_s * NS_PER_S),
         "residual_rad_s": 9.0,
         "residual_std_rad_s": 5.0,
         "message": f"fan {fan}: 90 rpm below the twin (limit 50); more drag, 80 %: drag +20 %",
-        "transition": transition,
-        "causes": CAUSES,
-        **more,
+        **{"severity": Severity.WARNING, "transition": transition, "causes": CAUSES},
+        **{"t_ns": START_NS, "onset_t_ns": START_NS + round(onset_s * NS_PER_S)},
     }
     number = next(_sequences) if sequence is None else sequence
-    return Alarm(header=Header(producer, number, tray), **values)
+    return made_messages.alarm(fan, tray=tray, producer=producer, sequence=number, **(values | more))
 
 
 def cleared(fan: int = 2, **more: Any) -> Alarm:

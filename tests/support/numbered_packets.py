@@ -4,31 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from fantwin.schemas.enums import Severity, StageStatus
 from fantwin.schemas.envelope import Envelope
-from fantwin.schemas.header import Header
 from fantwin.schemas.health import Health, Output
-from fantwin.schemas.messages import Alarm
 from fantwin.schemas.topics import tray_key
+from tests.support import made_messages
 
 KEY = tray_key("site", "tray", "alarm")
 PRODUCER = "scorer-all-p"
 
 
 def packet(sequence: int, producer: str = PRODUCER) -> Envelope:
-    header = Header(producer, sequence, "tray")
-    alarm = Alarm(
-        header=header,
-        fan=0,
-        active=True,
-        severity=Severity.ALARM,
-        t_ns=0,
-        onset_t_ns=0,
-        residual_rad_s=0,
-        residual_std_rad_s=0,
-        message="",
-    )
-    return Envelope(KEY, "alarm", b"", 0, alarm)
+    return Envelope(KEY, "alarm", b"", 0, made_messages.alarm(tray="tray", producer=producer, sequence=sequence))
 
 
 def sequences(packets: Iterable[Envelope]) -> list[int]:
@@ -36,12 +22,4 @@ def sequences(packets: Iterable[Envelope]) -> list[int]:
 
 
 def health(published: int, producer: str = PRODUCER) -> Health:
-    return Health(
-        header=Header(producer, 0, ""),
-        stage="s",
-        instance="all",
-        status=StageStatus.OK,
-        t_ns=0,
-        uptime_s=0,
-        outputs=(Output(key=KEY, published=published),),
-    )
+    return made_messages.health("s", producer=producer, outputs=(Output(key=KEY, published=published),))

@@ -16,6 +16,7 @@ from fantwin.schemas.enums import FanState
 from fantwin.schemas.messages import Message, NewTwin, Raw, Score
 from fantwin.schemas.units import NS_PER_S
 from tests.support.learned_versions import version
+from tests.support.made_messages import filled
 
 START_NS = 1_800_000_000 * NS_PER_S
 TRAY = TrayConfig.model_validate({"name": "tray1", "fans": 1})
@@ -120,26 +121,12 @@ class Learner:
 
 def raw(second: int, *, moves: bool) -> Raw:
     level = (second // 30) % 5 * 0.2 + 0.1 if moves else 0.5
-    return Raw(
-        fans=1,
-        host_receive_t_ns=START_NS + (second + np.arange(10, dtype=np.int64)) * NS_PER_S,
-        command=np.full((10, 1), level),
-        speed_rad_s=np.full((10, 1), 100.0),
-    )
+    t_ns = START_NS + (second + np.arange(10)) * NS_PER_S
+    return filled(Raw, 10, 1, host_receive_t_ns=t_ns, command=level, speed_rad_s=100.0)
 
 
 def score(second: int, state: FanState) -> Score:
-    one = np.zeros((1, 1))
-    arrays = ("command", "measured_speed_rad_s", "predicted_speed_rad_s", "band_variance")
-    return Score(
-        fans=1,
-        period_ns=NS_PER_S,
-        t_ns=np.array([START_NS + second * NS_PER_S]),
-        state=np.full((1, 1), int(state), np.uint8),
-        valid=one.astype(bool),
-        invalid_reason=one.astype(np.uint8),
-        **dict.fromkeys(arrays, one),
-    )
+    return filled(Score, 1, 1, period_ns=NS_PER_S, t_ns=START_NS + second * NS_PER_S, state=state, valid=False)
 
 
 def restarted(first: Learner) -> Learner:

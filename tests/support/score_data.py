@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
-from fantwin.schemas.enums import FanState, InvalidReason, Severity, Statistic, Transition
-from fantwin.schemas.fields import columns as columns_of
+from fantwin.schemas.blocks import cut
+from fantwin.schemas.enums import FanState, InvalidReason, Statistic, Transition
 from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Alarm, Score
+from tests.support.made_messages import alarm, filled
 
 START_NS = 1_700_000_000_000_000_000
 STEP_NS = 10_000_000
@@ -49,67 +52,38 @@ def made_up_tray(
         state[gap, gap_fan], invalid_reason[gap, gap_fan] = FanState.UNKNOWN, InvalidReason.GAP
     valid = state != FanState.UNKNOWN
     residual = measured - predicted
-    columns = {
-        "command": np.full(predicted.shape, 0.5),
-        "measured_speed_rad_s": measured,
-        "predicted_speed_rad_s": predicted,
-        "band_variance": np.full(predicted.shape, (2 * SIGMA) ** 2),
-        "state": state,
-        "valid": valid,
-        "invalid_reason": invalid_reason,
-        "torque_balance_command": np.where(np.isfinite(measured), -residual / 100, np.nan),
-        "expected_residual_rad_s": np.zeros(predicted.shape),
-        "expected_balance_command": np.zeros(predicted.shape),
-        "score": np.abs(residual) / (2 * SIGMA),
-        "statistic": np.where(valid, Statistic.DEVIATION, Statistic.NONE).astype(np.uint8),
-    }
-    columns = {name: values.astype(columns_of(Score)[name].dtype) for name, values in columns.items()}
-    t_ns = START_NS + np.arange(len(t_s)) * STEP_NS
-    scores = [
-        Score(
-            header=Header("test", number, tray),
-            fans=fans,
-            period_ns=STEP_NS,
-            t_ns=t_ns[first : first + block],
-            **{name: column[first : first + block] for name, column in columns.items()},
-        )
-        for number, first in enumerate(range(0, len(t_s), block))
-    ]
-    return scores, alarms
+    whole = filled(
+        Score,
+        len(t_s),
+        fans,
+        period_ns=STEP_NS,
+        t_ns=START_NS + np.arange(len(t_s)) * STEP_NS,
+        command=0.5,
+        measured_speed_rad_s=measured,
+        predicted_speed_rad_s=predicted,
+        band_variance=(2 * SIGMA) ** 2,
+        state=state,
+        valid=valid,
+        invalid_reason=invalid_reason,
+        torque_balance_command=np.where(np.isfinite(measured), -residual / 100, np.nan),
+        score=np.abs(residual) / (2 * SIGMA),
+        statistic=np.where(valid, Statistic.DEVIATION, Statistic.NONE),
+    )
+    blocks = (cut(whole, first, min(first + block, len(t_s))) for first in range(0, len(t_s), block))
+    return [replace(each, header=Header("test", number, tray)) for number, each in enumerate(blocks)], alarms
 
 
 def _alarm(tray: str, fan: int, at_s: float, onset_s: float, active: bool) -> Alarm:
-    return Alarm(
-        header=Header("test", 0, tray),
-        fan=fan,
-        active=active,
-        severity=Severity.ALARM,
-        t_ns=START_NS + round(at_s * 1e9),
-        onset_t_ns=START_NS + round(onset_s * 1e9),
-        residual_rad_s=-30.0 if active else -1.0,
-        residual_std_rad_s=2 * SIGMA,
-        message="slower than its twin" if active else "back in the band",
-        transition=Transition.RAISED if active else Transition.CLEARED,
-        statistic=Statistic.DEVIATION,
-        score=3.75 if active else 0.1,
-        torque_balance_command=0.3 if active else 0.01,
-    )
+    fields = {"active": active, "onset_t_ns": START_NS + round(onset_s * 1e9), "residual_std_rad_s": 2 * SIGMA}
+    fields |= {"statistic": Statistic.DEVIATION, "residual_rad_s": -30.0 if active else -1.0}
+    fields |= {"score": 3.75 if active else 0.1, "torque_balance_command": 0.3 if active else 0.01}
+    fields["transition"] = Transition.RAISED if active else Transition.CLEARED
+    fields["message"] = "slower than its twin" if active else "back in the band"
+    return alarm(fan, START_NS + round(at_s * 1e9), tray, "test", **fields)
 
 
 def one_sample(fans: int, *reasons: InvalidReason) -> Score:
     """A score of one sample. reasons: why the fans are not judged, beginning with fan 0; the rest are judged."""
     invalid = np.array([[*reasons, *[InvalidReason.NONE] * (fans - len(reasons))]], np.uint8)
-    valid, column = invalid == InvalidReason.NONE, np.zeros(invalid.shape)
-    measured = ("command", "measured_speed_rad_s", "predicted_speed_rad_s")
-    derived = ("band_variance", "torque_balance_command", "score")
-    expected = ("expected_residual_rad_s", "expected_balance_command")
-    return Score(
-        fans=fans,
-        period_ns=STEP_NS,
-        t_ns=np.array([START_NS]),
-        state=invalid * 0,
-        statistic=invalid * 0,
-        valid=valid,
-        invalid_reason=invalid,
-        **dict.fromkeys((*measured, *derived, *expected), column),
-    )
+    valid = invalid == InvalidReason.NONE
+    return filled(Score, 1, fans, period_ns=STEP_NS, t_ns=START_NS, state=0, valid=valid, invalid_reason=invalid)

@@ -22,7 +22,7 @@ from fantwin.schemas.header import Header
 from fantwin.schemas.health import Health, Output
 from fantwin.schemas.messages import Raw
 from fantwin.schemas.topics import BY_NAME, health_key, tray_key
-from tests.support.made_messages import health
+from tests.support.made_messages import filled, health
 from tests.support.running_chain import eventually
 from tests.support.secured_site import SITE, SecuredSite
 
@@ -105,8 +105,7 @@ class Sender:
 def samples(began_ns: int, number: int) -> Raw:
     """Message `number` of a tray of two fans."""
     t_ns = began_ns + STEP_NS * (SAMPLES * number + np.arange(SAMPLES))
-    column = np.full((SAMPLES, 2), 0.5)
-    return Raw(fans=2, host_receive_t_ns=t_ns, command=column, speed_rad_s=200 * column)
+    return filled(Raw, SAMPLES, 2, host_receive_t_ns=t_ns, command=0.5, speed_rad_s=100.0)
 
 
 def counter(health: Health | None, name: str) -> int:

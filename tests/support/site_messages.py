@@ -8,10 +8,12 @@ from pathlib import Path
 import numpy as np
 
 from fantwin.pipeline.recordings.indexed import rare_messages
-from fantwin.schemas.enums import FanState, Feedback, InvalidReason, Severity, Transition
+from fantwin.schemas.enums import FanState, Feedback, InvalidReason, Transition
 from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Alarm, Diagnosis, ModelCard, Request, Score
 from fantwin.schemas.units import RAD_S_PER_UNIT
+from tests.support import made_messages
+from tests.support.made_messages import filled
 from tests.support.running_core import FANS, TRAY
 
 NOW_NS = 1_790_000_000_000_000_000
@@ -22,46 +24,38 @@ SCRIPT = "<script>alert(1)</script>"
 
 def score(seconds: float = 0.0, *, state: FanState = FanState.NORMAL, samples: int = 5) -> Score:
     """A score of fans at 1000 rpm, 10 rpm below their twins; `state` is that of fan 2, and fan 3 is not judged."""
-    shape = (samples, FANS)
-    states = np.full(shape, FanState.NORMAL, np.uint8)
+    states = np.full((samples, FANS), FanState.NORMAL, np.uint8)
     states[:, 2], states[:, 3] = state, FanState.UNKNOWN
     valid = states != FanState.UNKNOWN
     rpm = RAD_S_PER_UNIT["rpm"]
-    return Score(
+    return filled(
+        Score,
+        samples,
+        FANS,
         header=Header("scorer-all-1", round(seconds * 100), TRAY),
-        fans=FANS,
         period_ns=STEP_NS,
         t_ns=NOW_NS + round(seconds * 1e9) + STEP_NS * np.arange(samples),
-        command=np.full(shape, 0.5, np.float32),
-        measured_speed_rad_s=np.full(shape, 1000 * rpm, np.float32),
-        predicted_speed_rad_s=np.full(shape, 1010 * rpm, np.float32),
-        band_variance=np.full(shape, (20 * rpm) ** 2, np.float32),
+        command=0.5,
+        measured_speed_rad_s=1000 * rpm,
+        predicted_speed_rad_s=1010 * rpm,
+        band_variance=(20 * rpm) ** 2,
         state=states,
         valid=valid,
-        invalid_reason=np.where(valid, 0, InvalidReason.GAP).astype(np.uint8),
-        torque_balance_command=np.full(shape, 0.01, np.float32),
-        expected_residual_rad_s=np.zeros(shape, np.float32),
-        expected_balance_command=np.zeros(shape, np.float32),
-        score=np.full(shape, 0.5, np.float32),
-        statistic=np.zeros(shape, np.uint8),
+        invalid_reason=np.where(valid, 0, InvalidReason.GAP),
+        torque_balance_command=0.01,
+        score=0.5,
     )
 
 
 def alarm(transition: Transition = Transition.RAISED, sequence: int = 0, **more: object) -> Alarm:
     values = {
-        "fan": 2,
-        "active": True,
-        "severity": Severity.ALARM,
-        "t_ns": NOW_NS,
-        "onset_t_ns": NOW_NS,
         "residual_rad_s": 9.0,
         "residual_std_rad_s": 5.0,
         "message": "fan 2: 90 rpm below the twin (limit 50)",
-        "transition": transition,
         "causes": (Diagnosis(cause="drag", probability=0.8, evidence="drag +20 %"),),
-        **more,
+        **{"fan": 2, "t_ns": NOW_NS, "onset_t_ns": NOW_NS, "transition": transition},
     }
-    return Alarm(header=Header("scorer-all-1", sequence, TRAY), **values)
+    return made_messages.alarm(tray=TRAY, producer="scorer-all-1", sequence=sequence, **(values | more))
 
 
 def granted(request: Request) -> list[Alarm]:

@@ -7,8 +7,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NoReturn
 
-import numpy as np
-
 from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.recordings.disk import DiskError
 from fantwin.pipeline.recordings.parts import RecordingParts
@@ -24,6 +22,7 @@ from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Message, Raw
 from fantwin.schemas.topics import health_key, topic_of, tray_key
+from tests.support.made_messages import filled
 
 SECOND_NS = 1_000_000_000
 NOW_NS = 10 * SECOND_NS
@@ -52,13 +51,8 @@ def envelope(message: Message, topic: str, received_t_ns: int = 5) -> Envelope:
 
 
 def raw(sequence: int, samples: int = 1) -> Raw:
-    return Raw(
-        header=Header("acquisition-1", sequence, "tray1"),
-        fans=2,
-        host_receive_t_ns=np.full(samples, sequence),
-        command=np.ones((samples, 2)),
-        speed_rad_s=np.ones((samples, 2)),
-    )
+    header = Header("acquisition-1", sequence, "tray1")
+    return filled(Raw, samples, 2, header=header, host_receive_t_ns=sequence, command=1.0, speed_rad_s=1.0)
 
 
 class Part(RecordingWriter):

@@ -21,6 +21,7 @@ from fantwin.schemas.header import Header
 from fantwin.schemas.health import Health
 from fantwin.schemas.messages import Grid, Message, Raw
 from fantwin.schemas.topics import BY_NAME, health_key, tray_key
+from tests.support.made_messages import filled
 
 TRAY_A, TRAY_B = "a", "b"
 
@@ -49,10 +50,7 @@ class Passer(Core):
         return ""
 
     def grid(self, t_ns: Any) -> Grid:
-        t_ns = np.asarray(t_ns)
-        column = np.zeros((len(t_ns), self.fans))
-        states = {"valid": column == 0, "invalid_reason": column.astype(np.uint8)}
-        return Grid(fans=self.fans, period_ns=1, t_ns=t_ns, command=column, speed_rad_s=column, **states)
+        return filled(Grid, len(t_ns), self.fans, period_ns=1, t_ns=t_ns)
 
 
 class Silent(Passer):
@@ -83,7 +81,7 @@ def toy(build: Callable[[Context], BuiltStage] = lambda _context: BuiltStage(Pas
 
 
 def raw(t_ns: int) -> Raw:
-    return Raw(fans=1, host_receive_t_ns=np.array([t_ns]), command=np.zeros((1, 1)), speed_rad_s=np.zeros((1, 1)))
+    return filled(Raw, 1, 1, host_receive_t_ns=t_ns)
 
 
 class Bench:

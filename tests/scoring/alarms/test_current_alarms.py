@@ -7,10 +7,10 @@ import json
 from typing import Any
 
 from fantwin.schemas.enums import Severity, Transition
-from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Alarm, Diagnosis
 from fantwin.scoring.alarms.alarm_state import UNTIL_IT_CLEARS_T_NS
 from fantwin.scoring.alarms.current_alarms import CurrentAlarm, current_alarm
+from tests.support import made_messages
 
 _numbers = itertools.count()
 
@@ -18,13 +18,9 @@ _numbers = itertools.count()
 def alarm(
     transition: Transition = Transition.RAISED, t_ns: int = 1, *, tray: str = "a", producer: str = "p", **more: Any
 ) -> Alarm:
-    fields: dict[str, Any] = {"fan": 0, "active": True, "severity": Severity.WARNING, "onset_t_ns": 1}
-    fields |= {
-        "residual_rad_s": 0.0,
-        "residual_std_rad_s": 0.0,
-        "message": f"{transition.name} at {t_ns}",
-    }
-    return Alarm(header=Header(producer, next(_numbers), tray), t_ns=t_ns, transition=transition, **fields | more)
+    fields: dict[str, Any] = {"severity": Severity.WARNING, "onset_t_ns": 1}
+    fields |= {"transition": transition, "message": f"{transition.name} at {t_ns}", **more}
+    return made_messages.alarm(0, t_ns, tray, producer, next(_numbers), **fields)
 
 
 def one(*messages: Alarm) -> CurrentAlarm:
