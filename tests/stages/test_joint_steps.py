@@ -5,36 +5,24 @@ Matrices of more columns may be multiplied in another order, so numbers may diff
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
+from dataclasses import replace
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 
-from fantwin.pipeline.config.loading import parse_config
-from fantwin.pipeline.runtime.building import build_parts
-from fantwin.pipeline.runtime.stage import Context, Core, Joint, load_stage
+from fantwin.pipeline.prediction.twin_file import TwinFile
+from fantwin.pipeline.runtime.stage import Joint, load_stage
 from fantwin.pipeline.runtime.steps import step_together
-from fantwin.schemas.header import Header
-from fantwin.schemas.messages import Message, Raw
-from fantwin.schemas.units import NS_PER_S
-from fantwin.simulation.faults import Fault
-from fantwin.simulation.plant import Surroundings
-from fantwin.simulation.tray import SimulatedTray, TraySettings
+from fantwin.schemas.blocks import cut
+from fantwin.schemas.messages import Grid, Message
+from tests.support.integrated_twins import NAN, core_of, grid_of, stairs
 from tests.support.twin_files import small_hybrid, write_twin
 
-EPOCH_NS, SECONDS, BLOCK = 1_700_000_000 * NS_PER_S, 12.0, 25
+FANS, TRAYS, SAMPLES, BLOCK = 8, 4, 1200, 25
 CONDITIONS = {"supply_voltage_v": 12.0, "temperature_c": 20.0}
-FAULTS: tuple[tuple[Fault, ...], ...] = (
-    (Fault("tacho-dropout", 0, 3.0, 6.0, 0.6), Fault("tacho-dropout", 1, 2.0, 7.0, 1.0)),
-    (),
-    (),
-    (),
-)
-"""faults of each tray; the second loses samples, and the third is silent for 3 s"""
-LOSING, SILENT = 1, 2
 
 
 class Counting:
@@ -49,66 +37,20 @@ class Counting:
         return self._joint.process(cores, blocks)
 
 
-@pytest.fixture
-def twin(tmp_path: Path) -> Path:
-    return write_twin(tmp_path / "twin.onnx", small_hybrid(), conditions=CONDITIONS)
-
-
-def cores_of(stage: str, twin: Path) -> list[Core]:
-    table = '[[tray]]\nname = "tray{}"\nfans = 8\ntwin = "' + str(twin) + '"\n'
-    text = "[resampler]\nrate_hz = 100\n" + "".join(map(table.format, range(len(FAULTS))))
-    config = parse_config(text, Path("/nowhere/fantwin.toml"), (), ("resampler", "twin_integrator", "scorer"))
-    context = Context(
-        site=config.site,
-        trays=config.trays,
-        config=config.sections[stage],
-        folder=config.folder,
-        run_folder=config.run_folder,
-        started_t_ns=EPOCH_NS,
+def grids_of(number: int) -> list[Grid]:
+    """Tacho 0 of the first tray drops out and tacho 1 fails; the second loses samples, and the third is silent."""
+    rng = np.random.default_rng(number)
+    speed = rng.normal(100.0, 3.0, (SAMPLES, FANS))
+    if number == 0:
+        speed[300:600, 0] = np.where(rng.random(300) < 0.6, NAN, 100.0)
+        speed[200:700, 1] = NAN
+    whole = replace(
+        grid_of(stairs(SAMPLES, FANS, number), speed),
+        supply_voltage_v=(12.0 + 0.02 * rng.normal(size=(SAMPLES, FANS)).cumsum(axis=0)).astype(np.float32),
+        temperature_c=np.full((SAMPLES, FANS), 21.0, np.float32),
     )
-    return [parts.core for parts in build_parts(load_stage(stage), context).values()]
-
-
-def raws(number: int) -> Iterator[Raw]:
-    settings = TraySettings(
-        seed=number + 1,
-        duration_s=SECONDS,
-        faults=FAULTS[number],
-        lost=0.02 if number == LOSING else 0.0,
-        surroundings=Surroundings(supply_wander=0.02, measured=("supply_voltage_v", "temperature_c")),
-    )
-    tray, samples = SimulatedTray(settings), []
-    while tray.due_s() is not None:
-        samples.append(tray.take())
-    for sequence, first in enumerate(range(0, len(samples), BLOCK)):
-        block = samples[first : first + BLOCK]
-        if number == SILENT and 4.0 <= block[0].t_s < 7.0:
-            continue
-        yield Raw(
-            header=Header("source", sequence, f"tray{number}"),
-            fans=8,
-            host_receive_t_ns=np.array([EPOCH_NS + round(each.t_s * NS_PER_S) for each in block]),
-            device_clock_us=np.array([each.clock_us for each in block], np.uint32),
-            device_sequence=np.array([each.sequence for each in block], np.uint32),
-            command=np.array([100.0 * each.command for each in block]),
-            speed_rad_s=np.array([each.speed_rad_s for each in block]),
-            supply_voltage_v=np.array([each.auxiliary["supply_voltage_v"] for each in block], np.float32),
-            temperature_c=np.array([each.auxiliary["temperature_c"] for each in block], np.float32),
-        )
-
-
-def together(cores: Sequence[Core], items: Sequence[Sequence[Message]]) -> tuple[list[list[Message]], list[int]]:
-    """What the cores make of their messages in turns of one of each tray; and the number of trays in each pass."""
-    made: list[list[Message]] = [[] for _ in items]
-    joint_of = load_stage("twin_integrator").joint
-    assert joint_of
-    joint = Counting(joint_of())
-    for turn in zip_longest(*items):
-        present = [number for number, item in enumerate(turn) if item is not None]
-        of_turn = step_together(joint, [cores[number] for number in present], [turn[number] for number in present])
-        for number, messages in zip(present, of_turn, strict=True):
-            made[number] += messages
-    return made, joint.trays
+    blocks = [cut(whole, first, first + BLOCK - 5 * (number == 1)) for first in range(0, SAMPLES, BLOCK)]
+    return [block for k, block in enumerate(blocks) if number != 2 or not 16 <= k < 28]
 
 
 def assert_alike(one: Any, other: Any, where: str) -> None:
@@ -121,16 +63,24 @@ def assert_alike(one: Any, other: Any, where: str) -> None:
         assert one == other, where
 
 
-def test_trays_in_one_pass_are_predicted_as_each_alone(twin: Path) -> None:
-    resamplers, joint_cores = cores_of("resampler", twin), cores_of("twin_integrator", twin)
-    grids = [[grid for raw in raws(k) for grid in resampler.step(raw)] for k, resampler in enumerate(resamplers)]
-    joint_messages, trays = together(joint_cores, grids)
-    assert sum(count for count in trays if count > 1) / sum(trays) > 0.5, "of the blocks, most in one pass with others"
-    for number, core in enumerate(cores_of("twin_integrator", twin)):
-        alone = [made for grid in grids[number] for made in core.step(grid)]
-        assert len(alone) == len(joint_messages[number])
-        for place, (one, other) in enumerate(zip(alone, joint_messages[number], strict=True)):
+def test_trays_in_one_pass_are_predicted_as_each_alone(tmp_path: Path) -> None:
+    twin = TwinFile.load(write_twin(tmp_path / "twin.onnx", small_hybrid(), conditions=CONDITIONS), FANS)
+    grids, cores = [grids_of(number) for number in range(TRAYS)], [core_of(twin, 1.0) for _ in range(TRAYS)]
+    made: list[list[Message]] = [[] for _ in grids]
+    joint_of = load_stage("twin_integrator").joint
+    assert joint_of
+    joint = Counting(joint_of())
+    for turn in zip_longest(*grids):
+        present = [number for number, grid in enumerate(turn) if grid is not None]
+        of_turn = step_together(joint, [cores[number] for number in present], [turn[number] for number in present])
+        for number, messages in zip(present, of_turn, strict=True):
+            made[number] += messages
+    assert sum(count for count in joint.trays if count > 1) / sum(joint.trays) > 0.5, "most in one pass with others"
+    for number, grids_of_one in enumerate(grids):
+        core = core_of(twin, 1.0)
+        alone = [message for grid in grids_of_one for message in core.step(grid)]
+        for place, (one, other) in enumerate(zip(alone, made[number], strict=True)):
             assert type(one) is type(other)
             for name, values in vars(one).items():
                 assert_alike(values, getattr(other, name), f"message {place} of tray {number}: {name}")
-        assert core.counters() == joint_cores[number].counters()
+        assert core.counters() == cores[number].counters()

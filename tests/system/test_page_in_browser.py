@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Iterator
 from dataclasses import replace
-from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +13,6 @@ from playwright.sync_api import Browser, Route, expect
 from fantwin.schemas.enums import Action, FanState, Feedback, Transition
 from fantwin.schemas.messages import Alarm, Diagnosis, Request
 from tests.support.page_browser import DEADLINE_MS, inaccessible, opened, running_browser
-from tests.support.running_chain import eventually
 from tests.support.running_core import FANS, TRAY
 from tests.support.running_gateway import RunningGateway
 from tests.support.site_messages import NOW_NS, alarm, golden_twin, marked, score
@@ -194,31 +191,12 @@ def test_the_page_is_accessible_and_fits_a_phone(scheme, gateway, browser):
     assert errors == []
 
 
-def test_forged_sessions_other_sites_and_scripts_in_comments_get_nowhere(gateway, browser):
+def test_a_script_in_a_comment_is_shown_as_text(gateway, browser):
     errors: list[str] = []
-    url, path = f"http://127.0.0.1:{gateway.port}/", f"/api/v1/fans/{TRAY}/{FAULTY}/requests"
-    forged = opened(browser, url, errors)
-    forged.context.add_cookies([{"name": "fantwin", "value": "A" * 43, "url": url}])
-    post = """async (path) => (await fetch(path, {method: "POST", body: '{"action": "acknowledge"}',
-        headers: {"Content-Type": "application/json", "X-CSRF-Token": "A"}})).status"""
-    assert forged.evaluate(post, path) == 401
-
-    ann = opened(browser, url, errors, "ann")
-    assert ann.evaluate(post, path) == 403, "without the token of the session"
-    other = ann.context.new_page()
-    asked: list[str] = []
-    statuses: list[int] = []
-    other.on("request", lambda request: asked.append(request.resource_type) if path in request.url else None)
-    other.on("response", lambda response: statuses.append(response.status) if path in response.url else None)
-    with other_site(f"{url.rstrip('/')}{path}") as evil:
-        other.goto(evil)
-        eventually(lambda: statuses or other.wait_for_timeout(50), "the form is answered")
-    assert (asked, statuses) == (["fetch", "document"], [403]), "the browser keeps the answer to the script from it"
-    assert gateway.sent == []
-
     gateway.feed(
         alarm(Transition.ACKNOWLEDGED, 1, acknowledged=True, operator_name="ann", comment=SCRIPT, message=SCRIPT)
     )
+    ann = opened(browser, f"http://127.0.0.1:{gateway.port}/", errors, "ann")
     ann.get_by_role("link", name="History").click()
     expect(ann.locator("tbody")).to_contain_text(SCRIPT)
     assert ann.locator("tbody img").count() == 0
@@ -270,35 +248,3 @@ def test_a_stopped_fan_stays_in_alarm_filters_are_kept_and_all_alarms_of_a_tray_
     page.goto(f"{url}#/fan/{TRAY}/77")
     expect(page.locator("main")).to_contain_text(f"There is no fan 77 of {TRAY}")
     assert errors == []
-
-
-class other_site:  # noqa: N801  a context manager
-    """A page of another site, which posts to an address by a script and by a form."""
-
-    def __init__(self, target: str) -> None:
-        page = f"""<form method="post" enctype="text/plain" action="{target}">
-            <input name='{{"action":"acknowledge","a":"' value='"}}'></form>
-            <script>fetch("{target}", {{method: "POST", mode: "no-cors", credentials: "include",
-            body: '{{"action": "acknowledge"}}'}}).finally(() => document.forms[0].submit())</script>""".encode()
-
-        class Handler(BaseHTTPRequestHandler):
-            def do_GET(self) -> None:
-                self.send_response(200)
-                self.send_header("Content-Type", "text/html")
-                self.end_headers()
-                self.wfile.write(page)
-
-            def log_message(self, format: str, *args: object) -> None:
-                pass
-
-        self._server = HTTPServer(("127.0.0.1", 0), Handler)
-        self._thread = threading.Thread(target=self._server.serve_forever, daemon=True)
-
-    def __enter__(self) -> str:
-        self._thread.start()
-        return f"http://localhost:{self._server.server_port}/"
-
-    def __exit__(self, *_: object) -> None:
-        self._server.shutdown()
-        self._thread.join()
-        self._server.server_close()
