@@ -22,10 +22,11 @@ from fantwin.schemas.blocks import cut, join
 from fantwin.schemas.fields import columns
 from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Alarm, Grid, Prediction, Raw, Score, ScorerSnapshot
+from fantwin.schemas.tacho import Tacho
 from fantwin.stages.resampler import ResamplerConfig, ResamplerCore
 from tests.support import scored_blocks
 from tests.support.clockless_device import NAN, at, raw
-from tests.support.integrated_twins import core_of, twin_with_friction, unstable_twin
+from tests.support.integrated_twins import core_of, physical_twin, twin_with_friction, unstable_twin
 from tests.support.twin_files import small_hybrid, write_twin
 
 FANS, RATES_HZ = 8, (None, 7.0, 50.0, 100.0, 1000.0)
@@ -160,7 +161,9 @@ def twins(tmp_path_factory: pytest.TempPathFactory) -> list[TwinFile]:
         write_twin(folder / "hybrid.onnx", small_hybrid()),
         write_twin(folder / "air.onnx", conditions=CONDITIONS),
     )
-    return [unstable_twin(FANS), twin_with_friction(30.0, FANS), *(TwinFile.load(file, FANS) for file in files)]
+    counting = physical_twin(FANS, tacho=(Tacho(kind="count", window_s=1.0),))
+    made = [unstable_twin(FANS), twin_with_friction(30.0, FANS), counting]
+    return [*made, *(TwinFile.load(file, FANS) for file in files)]
 
 
 @settings(max_examples=15, deadline=None)
@@ -170,7 +173,7 @@ def twins(tmp_path_factory: pytest.TempPathFactory) -> list[TwinFile]:
     sizes=st.lists(st.integers(1, 64), min_size=1, max_size=4),
     clock_us=st.sampled_from([None, 0, 2**32 - 10_300_000]),
     rate_hz=st.sampled_from(RATES_HZ),
-    twin=st.integers(0, 4),
+    twin=st.integers(0, 5),
 )
 @example(  # a former producer becomes the line's again within a message, and its last sample counts
     [("regular", 1), ("another time", 8), ("regular", 160), ("another time", 8)], 1, [64], None, 7.0, 0

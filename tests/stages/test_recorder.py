@@ -281,12 +281,12 @@ def test_a_slow_line_is_flushed_every_two_minutes_what_happens_on_it_at_once_and
         core.tick(now_ns)
         flushed_at += [second] * (disk.parts[0].flushes - before)
     assert flushed_at == [121, 150]
-    core = Recorder(Disk(), RecorderConfig(), NOW_NS)
-    for tick in range(100):
-        for number in range(4):
-            core.step(envelope(raw(4 * tick + number, samples=50), "raw", NOW_NS + tick * TICK_NS))
-        core.tick(NOW_NS + tick * TICK_NS)
-        assert sum(len(each.payload) for each in core.unsaved()) < 2 * 24 * 4 * 50 * 20
+    for tick in range(200):
+        now_ns = NOW_NS + 181 * SECOND_NS + tick * TICK_NS
+        core.step(envelope(raw(tick, samples=200), "raw", now_ns))
+        core.tick(now_ns)
+    assert 8 <= disk.parts[0].flushes - 2 <= 12
+    assert sum(len(each.payload) for each in core.unsaved()) < 2 * 20 * len(encode(raw(0, samples=200)))
 
 
 def test_of_healths_those_that_report_something_new_are_recorded_and_no_other_is_missing(tmp_path):

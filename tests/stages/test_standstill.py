@@ -128,6 +128,13 @@ def runs() -> dict[str, tuple[Floats, Floats]]:
     healthy = speed_of(STOPPED_AND_STARTED)
     blocked = speed_of(AT_ITS_MINIMUM)
     blocked[round(8.0 / PERIOD_S) : round(20.0 / PERIOD_S)] = 0.0
+    since_s = np.arange(len(RUNNING)) * PERIOD_S - 10.0
+    courses = {
+        "held": 0.0 * since_s,
+        "slow, then held": 0.8 * (since_s < 6.0),
+        "at half speed, then held": 0.5 * (since_s < 6.0),
+        "held, and jerking": 0.2 * (since_s % 3.0 > 2.7),
+    }
     last = speed_of(slower)
     last[since(12.0)] *= 0.8
     last[since(22.0)] = 0.0
@@ -145,6 +152,10 @@ def runs() -> dict[str, tuple[Floats, Floats]]:
         "turns again": (STOPPED, speed_of(commands((80.0, 10.0), (0.0, 15.0), (40.0, 5.0), (0.0, 8.0)))),
         "coasts": coasting(2.5),
         "coasts for long": coasting(5.0),
+        **{
+            name: with_speed(RUNNING, 10.0, (speed_of(RUNNING) * shares)[since(10.0)])
+            for name, shares in courses.items()
+        },
         "loose contact": (loose, np.where(lost, np.nan, speed_of(loose))),
     }
 
@@ -176,6 +187,12 @@ def test_a_blocked_fan_at_its_minimum_is_an_alarm_that_a_stop_does_not_end(found
     (cleared_s,) = its.times(Transition.CLEARED)
     assert 33.0 <= cleared_s < 34.0, "ten seconds after it is compared with its twin again"
     assert current_alarm(its.alarms).causes[0].cause == "blocked"
+
+
+@pytest.mark.parametrize("name", ["held", "slow, then held", "at half speed, then held", "held, and jerking"])
+def test_a_fan_that_is_held_is_blocked_whatever_it_did_before(found: dict[str, Seen], name: str) -> None:
+    named = [alarm.causes[0].cause for alarm in found[name].alarms if alarm.causes]
+    assert named[-1] == "blocked", named
 
 
 @pytest.mark.parametrize("conditions", [None, ReferenceConditions(supply_voltage_v=12.0)])

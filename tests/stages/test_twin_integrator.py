@@ -10,7 +10,6 @@ import pytest
 
 from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.prediction import free_run
-from fantwin.pipeline.prediction.twin_file import TwinFile
 from fantwin.pipeline.runtime.stage import Context
 from fantwin.schemas.blocks import cut
 from fantwin.schemas.enums import InvalidReason
@@ -30,7 +29,6 @@ from tests.support.integrated_twins import (
     physical_twin,
     run_freely,
     silent,
-    split,
     stairs,
     twin_with_friction,
     unstable_twin,
@@ -270,32 +268,13 @@ def test_the_twin_starts_again_after_the_clock_of_the_device_has_restarted():
 COUNTING = Tacho(kind="count", window_s=1.0)
 
 
-def counted(speed: Floats, period_s: float, ends_s: float) -> Floats:
-    """(n,) means of a speed (n,) over one second, each shown until the next; windows end at ends_s + k s."""
-    rows, first = round(1.0 / period_s), round(ends_s / period_s)
-    ends = (np.arange(len(speed)) - first) // rows * rows + first
-    angle = np.concatenate((np.zeros(1), np.cumsum((speed[1:] + speed[:-1]) / 2)))
-    return (angle[np.maximum(ends, 0)] - angle[np.maximum(ends - rows, 0)]) / rows
-
-
-def test_a_healthy_fan_is_within_the_readings_of_a_counting_tacho_through_steps_and_not_without_one() -> None:
-    """Fans with windows that begin at different times; the reading is up to two seconds old."""
-    fans, period_s = 2, 0.1
-    command = np.repeat(stairs(600), fans, axis=1)
-    speed = run_freely(np.zeros((fans, 2)), command, np.full(600, period_s))[0]
-    readings = np.column_stack([counted(speed[:, fan], period_s, 0.3 * fan) for fan in range(fans)])
-    grid = grid_of(command, readings, period_ns=100_000_000)
-
-    def residual_of(twin: TwinFile, size: int) -> Floats:
-        prediction = feed(core_of(twin, warm_up_s=20.0), split(grid, size))
-        distance = np.abs(prediction.measured_speed_rad_s - prediction.predicted_speed_rad_s)
-        allowed = prediction.reading_range_rad_s if len(prediction.reading_range_rad_s) else 0.0
-        return np.where(prediction.valid, np.maximum(distance - allowed, 0.0), 0.0)
-
-    known, unknown = physical_twin(fans, tacho=(COUNTING,)), physical_twin(fans)
-    residual = residual_of(known, 600)
-    assert residual.max() < 0.05 * residual_of(unknown, 600).max()
-    np.testing.assert_array_equal(residual_of(known, 7), residual)
+def test_a_counting_tacho_has_a_range_of_readings_as_wide_as_the_twin_has_moved_in_its_window() -> None:
+    grid = grid_of(np.repeat([40.0, 80.0], 100), period_ns=100_000_000)
+    shown = feed(core_of(physical_twin(tacho=(COUNTING,))), [grid])
+    half_range = shown.reading_range_rad_s[:, 0]
+    assert half_range[90] < 1.0 < half_range[105] and half_range[199] < 1.0
+    assert np.ptp(shown.predicted_speed_rad_s[100:120]) > half_range.max()
+    assert not len(feed(core_of(), [grid]).reading_range_rad_s)
 
 
 def test_a_twin_of_another_tacho_is_refused_with_what_to_correct(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -170,3 +171,28 @@ def test_a_new_fault_is_a_row_and_is_named_even_without_one(monkeypatch: pytest.
     assert (likely_causes([found]), advice([found])) == ("toy_fault", "")
     monkeypatch.setattr(ranked_causes, "ROWS", (*ROWS, CauseRow("toy_fault", "a toy", "play", Size.READING)))
     assert words(toy)[0].evidence == "speed reading -12 % (95 %: -14 to -10)"
+
+
+SEEN = SeenSinceOnset(300.0, 300.0, FAN.needed(300.0), FAN.needed(300.0))
+
+
+def advised(advice: Advice, seen: SeenSinceOnset = SEEN) -> float:
+    found = re.fullmatch(
+        r"why: move the command to (\S+) V for ten seconds, and back", advice.added_to("why", seen, FAN)
+    )
+    assert found
+    return float(found[1])
+
+
+def test_the_command_makes_the_fan_a_third_slower_or_faster_where_that_would_not_turn_it() -> None:
+    assert advised(Advice("V")) == pytest.approx(FAN.needed(200.0), rel=0.05)
+    assert advised(Advice("V", lowest_command=0.3)) == pytest.approx(FAN.needed(400.0), rel=0.05)
+    assert advised(Advice("V", lowest_command=0.3, highest_command=0.5)) == 0.5
+    weak = replace(SEEN, lowest_command=2.0 * SEEN.lowest_command)
+    assert advised(Advice("V"), weak) == pytest.approx(2.0 * FAN.needed(200.0), rel=0.05), "of the command it takes now"
+
+
+def test_nothing_is_advised_where_no_other_command_is_known() -> None:
+    at_its_only_one = Advice("V", lowest_command=0.3, highest_command=SEEN.highest_command)
+    assert at_its_only_one.added_to("why", SEEN, FAN) == "why"
+    assert Advice("V").added_to("why", replace(SEEN, lowest_rad_s=float("nan")), FAN) == "why"

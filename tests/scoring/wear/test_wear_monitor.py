@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import json
 from typing import Any
 
@@ -10,7 +9,15 @@ import numpy as np
 import pytest
 
 from fantwin.schemas.messages import Array
-from fantwin.scoring.wear.slow_change import LIMIT_SHARE, MOST_FANS, WEAR_HINT
+from fantwin.scoring.wear.slow_change import (
+    LIMIT_SHARE,
+    MOST_FANS,
+    WEAR_HINT,
+    is_of_slow_change,
+    limit_ahead,
+    own_change,
+    shared_change,
+)
 from fantwin.scoring.wear.trend import NS_PER_DAY
 from fantwin.scoring.wear.wear_monitor import SETTLING_INTERVALS, WearMonitor
 from tests.support.wear_data import (
@@ -23,7 +30,6 @@ from tests.support.wear_data import (
     loss_of,
     slow_states,
     times_ns,
-    worn_monitor,
 )
 
 FANS, WORN = 4, 2
@@ -168,26 +174,6 @@ def test_points_are_taken_at_the_times_of_samples_whatever_comes_between() -> No
     assert run(2 * 10**9).snapshot() == coarse.snapshot()
 
 
-@pytest.mark.parametrize("earlier", [True, False])
-def test_a_damaged_snapshot_is_refused_and_changes_nothing(earlier: bool) -> None:
-    monitor = worn_monitor(FANS, WORN, days=2)
-    before, whole = monitor.snapshot(), worn_monitor(FANS, WORN, days=3).snapshot()
-    damaged: list[Any] = [{}, [], None, worn_monitor(FANS + 1, WORN, days=2).snapshot()]
-    for path in (("state",), ("fans",), ("state", "shift"), ("state", "t_ns"), ("fans", 1, "series")):
-        for other in (None, "x", [0] * FANS):
-            broken = copy.deepcopy(whole)
-            place: Any = broken
-            for key in path[:-1]:
-                place = place[key]
-            place[path[-1]] = other
-            damaged += [broken] if path != ("state", "shift") or other != [0] * FANS else []
-    restore = monitor.restore_of_earlier_twin if earlier else monitor.restore
-    for snapshot in damaged:
-        with pytest.raises((ValueError, LookupError, TypeError, AttributeError)):
-            restore(snapshot)
-        assert monitor.snapshot() == before
-
-
 def test_the_change_goes_on_with_another_twin() -> None:
     """It has taken the fan as it was on day 15 for healthy."""
     change = loss_of(WORN, FANS, 30)
@@ -215,3 +201,26 @@ def test_what_is_no_number_is_no_point() -> None:
     assert monitor.of(0) is not None and monitor.of(1) is None
     feed(monitor, times_ns(1, START_NS + NS_PER_DAY), np.zeros((PER_DAY, 2)), np.full(PER_DAY, 0.01))
     assert change_of(monitor, 1)[0] == 0.0
+
+
+def test_the_notices_are_told_from_other_notes() -> None:
+    alone = own_change(2, -0.0512, 30 * 3600 * 10**9, None)
+    assert alone == "fan 2: speed -5.1 % in 30 h: see fantwin wear"
+    beside = own_change(0, 0.04, 12 * 24 * 3600 * 10**9, -0.002)
+    assert beside == "fan 0: speed +4.0 % in 12 days, the fans beside it -0.2 %: see fantwin wear"
+    shared = shared_change(-0.042)
+    assert shared == (
+        "most fans turn 4 % slower than when they were commissioned: the air, the supply, or a filter in front of them "
+        "all"
+    )
+    assert all(is_of_slow_change(note) for note in (alone, beside, shared))
+    assert not is_of_slow_change("98.0 % of the fans' samples judged")
+
+
+def test_a_limit_ahead_names_the_first_fan_its_days_and_the_others() -> None:
+    line = limit_ahead(3, [], -0.001, [4.2, 2.6, 6.1])
+    assert line == "fan 3 is wearing: it will have lost 10 % of its speed in about 4 days (3 to 6); inspect it"
+    line = limit_ahead(3, [1, 5], 0.001, [1.2, 0.0, 2.0])
+    assert line == "fan 3 is wearing: it will turn 10 % faster in about 1 day (0 to 2); inspect it, and fan 1, 5"
+    assert "it turns faster by about 10 % of its speed; i" in limit_ahead(0, [], 0.1, [0.0, 0.0, 0.0])
+    assert "speed within a day; inspect it" in limit_ahead(0, [], -0.001, [0.3, 0.0, 2.0])
