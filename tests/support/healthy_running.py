@@ -7,10 +7,11 @@ import math
 import numpy as np
 from scipy.signal import lfilter
 
-from fantwin.schemas.enums import InvalidReason
 from fantwin.schemas.messages import Array, Prediction
 from fantwin.schemas.units import NS_PER_S
 from fantwin.scoring.model.operation import Fans
+from tests.support.made_messages import filled
+from tests.support.scored_blocks import model_fans
 
 RATE_HZ = 10
 TOP_RAD_S = 300.0
@@ -21,26 +22,16 @@ FIRST_T_NS = 1_790_000_000 * NS_PER_S
 
 def made_fans(count: int) -> Fans:
     """Fans whose command is a torque, with exact tachos."""
-    each = np.ones(count)
-    return Fans(
-        top_rad_s=TOP_RAD_S * each,
-        inertia=0.2 * each,
-        viscous=0.05 * each,
-        drag=0.0005 * each,
-        friction=0.0 * each,
-        noise_rad_s=NOISE_RAD_S * each,
-        pulse_rad_s=0.0 * each,
-        held_s=0.0 * each,
-        adjoins=np.ones(count, np.bool_),
-        timing_s=0.0 * each,
-        coasts_s=3.0 * each,
-        balance_noise=each,
+    return model_fans(
+        count,
+        top_rad_s=TOP_RAD_S,
+        inertia=0.2,
+        viscous=0.05,
+        drag=0.0005,
+        noise_rad_s=NOISE_RAD_S,
+        coasts_s=3.0,
+        balance_noise=1.0,
         balance_filter_per_s=20.0,
-        lowest_command=np.nan * each,
-        commands=100.0,
-        has_own_drive=np.zeros(count, np.bool_),
-        may_have_plateau=np.zeros(count, np.bool_),
-        prefers_balance=np.zeros(count, np.bool_),
     )
 
 
@@ -60,18 +51,18 @@ def running(
     step = np.arange(samples) // (600 * RATE_HZ) % 2
     predicted = np.repeat(TOP_RAD_S * (0.5 + 0.5 * step)[:, np.newaxis], fans, axis=1)
     measured = predicted * (1.0 + share) + rng.normal(0.0, NOISE_RAD_S, (samples, fans))
-    return Prediction(
-        fans=fans,
+    return filled(
+        Prediction,
+        samples,
+        fans,
         period_ns=NS_PER_S // RATE_HZ,
         t_ns=FIRST_T_NS + np.arange(samples) * (NS_PER_S // RATE_HZ),
         command=predicted / 3.0,
         measured_speed_rad_s=measured,
         predicted_speed_rad_s=predicted,
-        sigma_rad_s=np.full(fans, NOISE_RAD_S),
-        valid=np.ones((samples, fans), np.bool_),
-        invalid_reason=np.full((samples, fans), InvalidReason.NONE, np.uint8),
-        torque_balance_command=np.full((samples, fans), np.nan),
-        torque_balance_sigma_command=np.ones(fans),
+        sigma_rad_s=NOISE_RAD_S,
+        torque_balance_command=np.nan,
+        torque_balance_sigma_command=1.0,
     )
 
 

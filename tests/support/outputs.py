@@ -7,7 +7,7 @@ import json
 import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar
 
 from asyncua.client.client import Client as OpcuaClient
 from prometheus_client.parser import text_string_to_metric_families
@@ -28,54 +28,49 @@ from tests.support.running_gateway import Client, RunningGateway
 from tests.support.running_mqtt import ROOT, RunningMqtt
 from tests.support.running_opcua import RunningOpcua
 
+Alarms = dict[int, tuple[bool, bool]]
+"""fans with an active alarm: whether it is acknowledged, and whether it is silenced"""
 
-class Output(Protocol):
+
+class Output:
     """A running output of a site of one tray of `FANS` fans."""
 
     keeps_state = True
     """whether its reader sees acknowledgements and silenced fans; otherwise it hears events only"""
+    running: Any
 
     def feed(self, *messages: Message) -> None:
         """Pass messages, as the runner does."""
-        ...
+        self.running.feed(*messages)
 
-    def alarms(self) -> dict[int, tuple[bool, bool]]:
-        """Fans with an active alarm: whether it is acknowledged, and whether it is silenced."""
-        ...
+    def alarms(self) -> Alarms:
+        """What its reader sees."""
+        raise NotImplementedError
 
     def refused(self) -> int:
         """How many messages it has counted as not usable."""
-        ...
+        names = ("unknown_tray", "unknown_fan", "refused_scores", "wrong_fan_count", "undecodable")
+        counters = self.running.counters()
+        return sum(counters.get(name, 0) for name in names)
 
     def close(self) -> None:
-        """End it."""
-        ...
+        """End it; once, however often it is called."""
+        self.running.close()
 
 
-def _refused(counters: Mapping[str, int]) -> int:
-    names = ("unknown_tray", "unknown_fan", "refused_scores", "wrong_fan_count", "undecodable")
-    return sum(counters.get(name, 0) for name in names)
-
-
-class GatewayOutput:
+class GatewayOutput(Output):
     """The operators' page, by its API."""
-
-    keeps_state = True
 
     def __init__(self, folder: Path) -> None:
         self.running = RunningGateway(folder)
-        self.feed, self.close = self.running.feed, self.running.close
 
-    def alarms(self) -> dict[int, tuple[bool, bool]]:
+    def alarms(self) -> Alarms:
         """Alarms of the fans that the list of alarms and the list of fans agree on."""
         client = Client(self.running)
         found = client.ask("GET", "/api/v1/alarms?all=1")[1]["alarms"]
         groups = [client.ask("GET", f"/api/v1/fans?state={group}")[1]["fans"] for group in ("alarm", "silenced")]
         fans = {each["fan"] for group in groups for each in group}
         return {a["fan"]: (a["acknowledged"], _is_silenced(a)) for a in found if a["active"] and a["fan"] in fans}
-
-    def refused(self) -> int:
-        return _refused(self.running.counters())
 
 
 def _is_silenced(alarm: Mapping[str, Any]) -> bool:
@@ -87,7 +82,7 @@ class PrometheusOutput(GatewayOutput):
 
     keeps_state = False
 
-    def alarms(self) -> dict[int, tuple[bool, bool]]:
+    def alarms(self) -> Alarms:
         families = text_string_to_metric_families(Client(self.running).ask("GET", "/metrics")[1])
         samples = [sample for family in families for sample in family.samples if sample.value]
         fans = {
@@ -97,19 +92,16 @@ class PrometheusOutput(GatewayOutput):
         return {fan: (fan not in fans["unacknowledged"], False) for fan in fans["active"]}
 
 
-class OpcuaOutput:
+class OpcuaOutput(Output):
     """The OPC UA server, read by a client of the same library."""
-
-    keeps_state = True
 
     def __init__(self, folder: Path) -> None:
         self.running = RunningOpcua(folder)
-        self.feed, self.close = self.running.feed, self.running.close
 
-    def alarms(self) -> dict[int, tuple[bool, bool]]:
+    def alarms(self) -> Alarms:
         return asyncio.run(self._read())
 
-    async def _read(self) -> dict[int, tuple[bool, bool]]:
+    async def _read(self) -> Alarms:
         names = ("ActiveState/Id", "AckedState/Id", "SuppressedOrShelved")
         async with OpcuaClient(self.running.url, timeout=60) as client:
             nodes = [client.get_node(f"ns=2;s={TRAY}/{fan}/Alarm/{name}") for fan in range(FANS) for name in names]
@@ -117,35 +109,26 @@ class OpcuaOutput:
         fans = {fan: values[3 * fan : 3 * fan + 3] for fan in range(FANS)}
         return {fan: (acked, silenced) for fan, (active, acked, silenced) in fans.items() if active}
 
-    def refused(self) -> int:
-        return _refused(self.running.counters())
 
-
-class MqttOutput:
+class MqttOutput(Output):
     """What a real broker keeps."""
-
-    keeps_state = True
 
     def __init__(self, folder: Path) -> None:
         self.broker = Mosquitto(folder)
         self.broker.start()
         self.running = RunningMqtt(folder, self.broker.port)
-        self.feed = self.running.feed
 
-    def alarms(self) -> dict[int, tuple[bool, bool]]:
+    def alarms(self) -> Alarms:
         kept = retained_by(self.broker.port)
         texts = {fan: json.loads(kept.get(f"{ROOT}/{TRAY}/{fan}/alarm") or "null") for fan in range(FANS)}
         return {fan: (a["acknowledged"], _is_silenced(a)) for fan, a in texts.items() if a and a["active"]}
-
-    def refused(self) -> int:
-        return _refused(self.running.counters())
 
     def close(self) -> None:
         self.running.close()
         self.broker.stop()
 
 
-class NotifierOutput:
+class NotifierOutput(Output):
     """A webhook that is sent messages; its clock goes on by a minute with each look."""
 
     keeps_state = False
@@ -159,62 +142,54 @@ class NotifierOutput:
         url = secret(folder, "hook", f"json://127.0.0.1:{self._receiver.port}/")
         target = {"name": "hook", "url_file": url, "repeat_s": 0}
         config = NotifierConfig.model_validate({"target": [target]})
-        self.core = notifier_core(folder, config, {TRAY: FANS})
+        self.running = notifier_core(folder, config, {TRAY: FANS})
         self._now_ns = START_NS
         self._is_closed = False
 
     def feed(self, *messages: Message) -> None:
         for message in messages:
-            self.core.step(message)
+            self.running.step(message)
 
-    def alarms(self) -> dict[int, tuple[bool, bool]]:
+    def alarms(self) -> Alarms:
         for _ in range(20):
             self._now_ns += NS_PER_S
-            self.core.tick(self._now_ns)
-        active: dict[int, tuple[bool, bool]] = {}
+            self.running.tick(self._now_ns)
+        active: Alarms = {}
         for title in [posted["title"] for posted in self._receiver.received]:
             fan = int(re.findall(r"fan (\d+) of", title)[0])
             active.pop(fan, None) if title.startswith("Cleared") else active.update({fan: (False, False)})
         return active
 
-    def refused(self) -> int:
-        return _refused(self.core.counters())
-
     def close(self) -> None:
         if not self._is_closed:
             self._is_closed = True
-            self.core.close()
+            self.running.close()
             self._receiver.stop()
 
 
-class ViewerOutput:
+class ViewerOutput(Output):
     """The table of alarms in the viewer."""
-
-    keeps_state = True
 
     def __init__(self, _folder: Path) -> None:
         self._sink = FakeSink()
-        self._core = ViewerCore(SITE, [TrayConfig(name=TRAY, fans=FANS, speed_unit="rpm")], self._sink)
+        self.running = ViewerCore(SITE, [TrayConfig(name=TRAY, fans=FANS, speed_unit="rpm")], self._sink)
         self._ticks = 0
 
     def feed(self, *messages: Message) -> None:
         for each in messages:
             is_score = isinstance(each, Score)
-            self._core.step(Envelope.of(tray_key(SITE, TRAY, "score"), each, 0) if is_score else each)
+            self.running.step(Envelope.of(tray_key(SITE, TRAY, "score"), each, 0) if is_score else each)
 
-    def alarms(self) -> dict[int, tuple[bool, bool]]:
+    def alarms(self) -> Alarms:
         self._ticks += 1
-        self._core.tick(self._ticks * FLUSH_PERIOD_NS)
+        self.running.tick(self._ticks * FLUSH_PERIOD_NS)
         text = self._sink.tables[-1][1] if self._sink.tables else ""
         rows = re.findall(rf"^\| \*\*{TRAY}/(\d+)\*\* \| (.*?) \|.*\| (.*?) \|$", text, re.MULTILINE)
         return {int(fan): (seen_by != "nobody", "silenced" in words) for fan, words, seen_by in rows}
 
-    def refused(self) -> int:
-        return _refused(self._core.counters())
-
     def close(self) -> None:
         if not self._sink.closed:
-            self._core.close()
+            self.running.close()
 
 
 OUTPUTS: dict[str, Callable[[Path], Output]] = {

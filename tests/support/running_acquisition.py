@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,14 +12,13 @@ from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.config.loading import parse_config
 from fantwin.pipeline.config.settings import BusConfig, Config
 from fantwin.pipeline.config.shards import chosen_shard
-from fantwin.pipeline.runtime.runner import Runner
 from fantwin.schemas.codec import decode
 from fantwin.schemas.fields import Array
-from fantwin.schemas.health import Health
 from fantwin.schemas.messages import Raw
 from fantwin.schemas.topics import tray_key
 from fantwin.stages.acquisition import STAGE
 from tests.support.running_chain import eventually
+from tests.support.running_stage import RunningStage
 
 SITE, TRAY = "plant", "tray1"
 
@@ -45,29 +43,6 @@ source = {source}
 {more}
 """
     return parse_config(text, folder / "fantwin.toml")
-
-
-class RunningAcquisition:
-    """One session of acquisition."""
-
-    def __init__(self, config: Config) -> None:
-        self._stop = threading.Event()
-        self.runner = Runner(STAGE, config, chosen_shard("acquisition", config), self._stop, self._on_health)
-        self.healths: list[Health] = []
-        self._thread = threading.Thread(target=self.runner.run)
-        self._thread.start()
-
-    def _on_health(self, health: Health) -> None:
-        self.healths.append(health)
-
-    def counter(self, name: str) -> int:
-        """Count as of the last health."""
-        counters = self.healths[-1].counters if self.healths else ()
-        return next((counter.value for counter in counters if counter.name == name), 0)
-
-    def end(self) -> None:
-        self._stop.set()
-        self._thread.join(20)
 
 
 class Raws:
@@ -96,10 +71,7 @@ def raws_of(endpoint: str) -> Iterator[Raws]:
 
 
 @contextmanager
-def acquisition(config: Config) -> Iterator[RunningAcquisition]:
+def acquisition(config: Config) -> Iterator[RunningStage]:
     """A session of acquisition that ends with the block."""
-    running = RunningAcquisition(config)
-    try:
+    with RunningStage(STAGE, config, chosen_shard("acquisition", config)) as running:
         yield running
-    finally:
-        running.end()

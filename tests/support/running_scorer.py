@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import threading
 from dataclasses import replace
 from typing import Any
 
 from fantwin.pipeline.config.loading import load_config
 from fantwin.pipeline.config.registry import STAGES
-from fantwin.pipeline.runtime.runner import Runner
 from fantwin.pipeline.runtime.stage import BuiltStage, Core, Stage
 from fantwin.pipeline.tray_scoring.scorer_config import ScorerConfig
 from tests.support.running_chain import DEMO
+from tests.support.running_stage import RunningStage
 
 
-class RunningScorer:
+class RunningScorer(RunningStage):
     """The one of the demo's tray; it runs until `end`."""
 
     def __init__(self, endpoint: str, core: Core) -> None:
@@ -27,16 +26,9 @@ class RunningScorer:
             config=ScorerConfig,
             build=lambda _context: BuiltStage(core),
         )
-        self._stop = threading.Event()
-        self.runner = Runner(stage, self.config, None, self._stop)
-        self.last: Any = None
-        """its health at the end"""
-        self._thread = threading.Thread(target=self._run)
-        self._thread.start()
+        super().__init__(stage, self.config)
 
-    def _run(self) -> None:
-        self.last = self.runner.run()
-
-    def end(self) -> None:
-        self._stop.set()
-        self._thread.join(20)
+    @property
+    def last(self) -> Any:
+        """Its last health."""
+        return self.newest

@@ -38,6 +38,15 @@ FRICTION, VISCOUS = 5.0, 0.05
 DRAG = (NEEDED - FRICTION - VISCOUS * TWIN_SPEED) / TWIN_SPEED**2
 
 
+def model_fans(count: int, *, balance_filter_per_s: float, **given: Any) -> Fans:
+    """Fans whose command, of 0 to 100, is a torque, with exact tachos but for what is given, of each or of all."""
+    zeros = dict.fromkeys(("friction", "pulse_rad_s", "held_s", "timing_s"), 0.0)
+    flags = dict.fromkeys(("has_own_drive", "may_have_plateau", "prefers_balance"), False)
+    each = {**zeros, **flags, "lowest_command": np.nan, "adjoins": True, **given}
+    columns = {name: np.broadcast_to(value, count).copy() for name, value in each.items()}
+    return Fans(commands=100.0, balance_filter_per_s=balance_filter_per_s, **columns)
+
+
 def twin_of(
     fans: int = 1,
     *,
@@ -49,28 +58,21 @@ def twin_of(
     """Fans that need NEEDED for TWIN_SPEED, with a time constant of 0.6 s."""
     of_each = tacho_of_each_fan(tachos, fans)
 
-    def each(value: float) -> Floats:
-        return np.full(fans, value)
-
-    of_model = Fans(
-        top_rad_s=each(TOP_SPEED),
-        inertia=each(0.1),
-        viscous=each(VISCOUS),
-        drag=each(DRAG),
-        friction=each(FRICTION),
-        noise_rad_s=each(SIGMA),
-        pulse_rad_s=np.array([tacho.resolution_rad_s if tacho.kind == "count" else 0.0 for tacho in of_each]),
-        held_s=np.array([tacho.held_s for tacho in of_each]),
-        adjoins=np.array([tacho.window_s == tacho.held_s for tacho in of_each]),
-        timing_s=each(0.02),
-        coasts_s=each(2.0),
-        balance_noise=each(SIGMA_COMMAND),
+    of_model = model_fans(
+        fans,
+        top_rad_s=TOP_SPEED,
+        inertia=0.1,
+        viscous=VISCOUS,
+        drag=DRAG,
+        friction=FRICTION,
+        noise_rad_s=SIGMA,
+        pulse_rad_s=[tacho.resolution_rad_s if tacho.kind == "count" else 0.0 for tacho in of_each],
+        held_s=[tacho.held_s for tacho in of_each],
+        adjoins=[tacho.window_s == tacho.held_s for tacho in of_each],
+        timing_s=0.02,
+        coasts_s=2.0,
+        balance_noise=SIGMA_COMMAND,
         balance_filter_per_s=3.0,
-        lowest_command=each(np.nan),
-        commands=100.0,
-        has_own_drive=np.zeros(fans, np.bool_),
-        may_have_plateau=np.zeros(fans, np.bool_),
-        prefers_balance=np.zeros(fans, np.bool_),
     )
     steady = [SteadyFan(VISCOUS, DRAG, FRICTION, TOP_SPEED)] * fans
     advice = Advice("%", 10.0, 100.0)

@@ -2,71 +2,39 @@
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Callable
 from dataclasses import replace
-from types import TracebackType
 from typing import Self
 
 import numpy as np
 
 from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.config.loading import parse_config
-from fantwin.pipeline.runtime.runner import Runner
 from fantwin.pipeline.runtime.sessions import Session
 from fantwin.pipeline.runtime.stage import load_stage
 from fantwin.pipeline.timebase.host_clock import HOST_CLOCK
 from fantwin.schemas.codec import encode, type_name
-from fantwin.schemas.enums import StageStatus
 from fantwin.schemas.header import Header
 from fantwin.schemas.health import Health, Output
 from fantwin.schemas.messages import Raw
 from fantwin.schemas.topics import BY_NAME, health_key, tray_key
 from tests.support.made_messages import filled, health
-from tests.support.running_chain import eventually
+from tests.support.running_stage import RunningStage
 from tests.support.secured_site import SITE, SecuredSite
 
 SAMPLES, STEP_NS = 10, 10_000_000
 """of a message: 0.1 s at 100 Hz"""
 
 
-class SecuredStage:
-    """Runs until the block ends; what it raised is raised then."""
+class SecuredStage(RunningStage):
+    """Runs until the block ends."""
 
     def __init__(self, site: SecuredSite, name: str, *settings: str) -> None:
         config = parse_config(site.config.text, site.config.path, settings, stages=(name,))
-        self._stop = threading.Event()
-        self.newest: Health | None = None
-        """the last that it has sent; None: none yet"""
-        self._error: BaseException | None = None
-        self.runner = Runner(load_stage(name), config, None, self._stop, self._take)
-        self._thread = threading.Thread(target=self._run)
+        super().__init__(load_stage(name), config)
 
     def __enter__(self) -> Self:
-        self._thread.start()
-        self.health_with(lambda health: health.status == StageStatus.OK, "the stage is ready")
+        self.wait_until_ready()
         return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._stop.set()
-        self._thread.join()
-        if error is None and self._error is not None:
-            raise self._error
-
-    def health_with(self, fits: Callable[[Health], bool], what: str) -> Health:
-        """The first health from now on that fits."""
-        return eventually(lambda: self.newest if self.newest and fits(self.newest) else None, what)
-
-    def _take(self, health: Health) -> None:
-        self.newest = health
-
-    def _run(self) -> None:
-        try:
-            self.newest = self.runner.run()
-        except BaseException as error:  # noqa: BLE001  raised again at the end of the block
-            self._error = error
 
 
 class Sender:

@@ -8,12 +8,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from fantwin.schemas.enums import Action, Severity, Transition
 from fantwin.scoring.alarms.alarm_state import DATA_LOST_AFTER_NS, UNTIL_IT_CLEARS_T_NS, is_retained, is_silenced
-from fantwin.scoring.alarms.alarms_of_tray import AlarmEvent, AlarmsOfTray, Decided
+from fantwin.scoring.alarms.alarms_of_tray import AlarmsOfTray, Decided
 
 STEP_NS = DATA_LOST_AFTER_NS * 2 // 7
 RAISED, CLEARED, UNSHELVED = Transition.RAISED, Transition.CLEARED, Transition.UNSHELVED
@@ -170,36 +168,16 @@ def test_commissioning_is_granted_and_does_not_change_the_alarm():
     assert conditions.alarm_state(0) == before
 
 
-# any history: decisions on two fans with requests between them, by the number of the one before which each is asked
-
-LENGTH = 60
-HISTORIES = st.fixed_dictionaries(
-    {
-        "active": st.lists(st.tuples(*[st.sampled_from([LOW, UP, HIGH])] * 2), min_size=LENGTH, max_size=LENGTH),
-        "judged": st.lists(
-            st.tuples(st.sampled_from([True, True, False]), st.booleans()), min_size=LENGTH, max_size=LENGTH
-        ),
-        "requests": st.dictionaries(
-            st.integers(1, LENGTH - 1),
-            st.tuples(st.sampled_from(Action), st.integers(0, 1), st.sampled_from([0, 3 * STEP_NS, 17 * STEP_NS])),
-            max_size=12,
-        ),
-    }
-)
-
-
-@given(HISTORIES)
-@settings(max_examples=30, deadline=None)
-def test_raised_and_cleared_alternate_and_say_what_was_decided_last(history: dict[str, Any]) -> None:
-    conditions, found = AlarmsOfTray(2), list[Any]()
-    for number, (active, judged) in enumerate(zip(history["active"], history["judged"], strict=True)):
-        if number in history["requests"]:
-            action, fan, duration_ns = history["requests"][number]
-            found += conditions.request(action, [fan], STEP_NS * (number - 1), duration_ns, "Ann")
-        found += conditions.update(decided(number, active, judged))
-    for fan in (0, 1):
-        events = [each for each in found if isinstance(each, AlarmEvent) and each.fan == fan]
-        turns = [each.transition for each in events if each.transition in (RAISED, CLEARED)]
-        assert turns == [CLEARED if i % 2 else RAISED for i in range(len(turns))]
-        judged = [a[fan] for a, j in zip(history["active"], history["judged"], strict=True) if j[fan]]
-        assert conditions.alarm_state(fan).active == bool(judged and judged[-1])
+def test_whatever_is_asked_raised_and_cleared_alternate_and_say_what_was_decided_last() -> None:
+    for seed in range(20):
+        rng, conditions, turns = np.random.default_rng(seed), AlarmsOfTray(2), ([], [])
+        active, judged = rng.choice([LOW, UP, HIGH], (60, 2)), rng.random((60, 2)) > 0.3
+        for number, (now, is_judged) in enumerate(zip(active.tolist(), judged.tolist(), strict=True)):
+            duration_ns = rng.choice([0, 3 * STEP_NS, 17 * STEP_NS])
+            asked(conditions, rng.choice(list(Action)), STEP_NS * (number - 1), duration_ns)
+            for each in conditions.update(decided(number, now, is_judged)):
+                if each.transition in (RAISED, CLEARED):
+                    turns[each.fan].append(each.transition)
+        for fan, of_fan in enumerate(turns):
+            assert of_fan == [CLEARED if i % 2 else RAISED for i in range(len(of_fan))] != []
+            assert conditions.active[fan] == (active[judged[:, fan], fan][-1] > LOW)

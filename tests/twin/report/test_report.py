@@ -26,9 +26,9 @@ from fantwin.twin.report.recording_sums import common_extent, extent_of, recordi
 from fantwin.twin.report.steady_states import static_curve
 from fantwin.twin.report.timeline import broken_at, kept_samples, timeline
 from fantwin.twin.runs import Run
-from tests.support.browser import seen_in_browser
 from tests.support.fan_data import PUBLISHED_PARAMETERS, published_run, rough_run
 from tests.support.fantwin_command import error_of, fantwin
+from tests.support.page_browser import measured
 from tests.support.written_recordings import write_run as record
 
 SECTIONS = ["assessment", "figures", "alarms", "parameters", "fan-0", "fan-1", "meaning", "card"]
@@ -322,9 +322,9 @@ def test_invalid_input_is_a_one_line_error(folder, tmp_path):
     assert "name a file that ends in .html" in error_of("report", twin, held_out, "-o", tmp_path)
 
 
-def test_in_a_browser_nothing_overflows_is_fetched_or_too_small_to_read(page_of_hybrid, tmp_path):
+def test_in_a_browser_nothing_overflows_is_fetched_or_too_small_to_read(page_of_hybrid):
     width_px = 390
-    seen = seen_in_browser(page_of_hybrid, width_px, tmp_path)
+    seen = measured(page_of_hybrid, width_px)
     assert seen["needs"] <= seen["width"] <= width_px
     assert seen["fetched"] == []
     assert seen["background"] == "rgb(255, 255, 255)"
