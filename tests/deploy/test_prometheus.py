@@ -7,6 +7,7 @@ import math
 import re
 import subprocess
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -95,20 +96,14 @@ def gateway(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Running
     """What it was last fed with does not grow old, however long Prometheus takes."""
     for module in ("fantwin.pipeline.site.site_model", "fantwin.pipeline.site.stage_states"):
         monkeypatch.setattr(f"{module}.SILENT_AFTER_S", math.inf)
-    running = RunningGateway(tmp_path, fans=ALL_FANS)
-    try:
+    with closing(RunningGateway(tmp_path, fans=ALL_FANS)) as running:
         yield running
-    finally:
-        running.close()
 
 
 @pytest.fixture
 def prometheus(tmp_path: Path, gateway: RunningGateway) -> Iterator[RunningPrometheus]:
-    running = RunningPrometheus(tmp_path, gateway.port)
-    try:
+    with closing(RunningPrometheus(tmp_path, gateway.port)) as running:
         yield running
-    finally:
-        running.close()
 
 
 def promtool(*words: str | Path, text: str | None = None) -> str:

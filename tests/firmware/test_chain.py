@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 import subprocess
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -66,11 +67,8 @@ def board(tmp_path: Path) -> Iterator[SimulatedBoard]:
 def chain(tmp_path: Path, endpoint: str) -> Iterator[Chain]:
     settings = (f"site='{SITE}'", f"tray.0.twin='{BOARD_TWIN}'")
     quick = ("twin_integrator.warm_up_s=2",)
-    chain = Chain(tmp_path, endpoint, *settings, *quick, configuration=FIRMWARE / "fantwin.toml")
-    try:
+    with closing(Chain(tmp_path, endpoint, *settings, *quick, configuration=FIRMWARE / "fantwin.toml")) as chain:
         yield chain
-    finally:
-        chain.close()
 
 
 def test_a_blocked_rotor_on_the_pins_is_an_alarm(board: SimulatedBoard, chain: Chain, tmp_path: Path) -> None:

@@ -25,15 +25,7 @@ from fantwin.schemas.codec import decode
 from fantwin.schemas.codec import encode as encode_message
 from fantwin.schemas.messages import Command, Raw
 from fantwin.schemas.units import NS_PER_S as S
-from fantwin.schemas.wire import (
-    CommandFrame,
-    Decoder,
-    Frame,
-    Protocol,
-    Sample,
-    SetPointFrame,
-    encode,
-)
+from fantwin.schemas.wire import CommandFrame, Decoder, Frame, Protocol, Sample, SetPointFrame, encode
 from fantwin.stages.acquisition import AcquisitionConfig
 from tests.support.serial_core import FakeLink, SerialCore
 

@@ -15,12 +15,7 @@ from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.prediction.twin_file import TwinFile
 from fantwin.pipeline.runtime.stage import Context, Core, load_stage
 from fantwin.pipeline.sources.serial.config import MOST_FANS_ON_LINE
-from fantwin.pipeline.sources.source import (
-    MOST_FANS,
-    LinkUp,
-    Reading,
-    ReadingBatch,
-)
+from fantwin.pipeline.sources.source import MOST_FANS, LinkUp, Reading, ReadingBatch
 from fantwin.schemas import wire
 from fantwin.schemas.codec import decode, encode
 from fantwin.schemas.enums import Transition

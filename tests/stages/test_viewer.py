@@ -11,12 +11,7 @@ import numpy as np
 import pytest
 
 from fantwin.pipeline.config.settings import TrayConfig
-from fantwin.pipeline.outputs.rerun.viewer_core import (
-    FLUSH_PERIOD_NS,
-    REPEAT_STATES_NS,
-    SAMPLES_HELD,
-    ViewerCore,
-)
+from fantwin.pipeline.outputs.rerun.viewer_core import FLUSH_PERIOD_NS, REPEAT_STATES_NS, SAMPLES_HELD, ViewerCore
 from fantwin.pipeline.runtime.stage import StageError
 from fantwin.schemas.units import RAD_S_PER_UNIT
 from fantwin.stages.viewer import build, check

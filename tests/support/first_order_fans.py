@@ -6,9 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from fantwin.pipeline.learning.sweep_steps import (
-    Observed,
-)
+from fantwin.pipeline.learning.sweep_steps import Observed
 
 PERIOD_S = 0.1
 

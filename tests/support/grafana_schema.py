@@ -13,9 +13,7 @@ def problems_of(board: Mapping[str, Any]) -> list[str]:
     """Fields that the schema does not have, and values that it reads as others."""
     sdk = pytest.importorskip("grafana_foundation_sdk.models.dashboard", reason="grafana-foundation-sdk of `dev`")
     from grafana_foundation_sdk.cog.encoder import JSONEncoder  # type: ignore[import-not-found]  # noqa: PLC0415
-    from grafana_foundation_sdk.cog.plugins import (  # type: ignore[import-not-found]  # noqa: PLC0415
-        register_default_plugins,
-    )
+    from grafana_foundation_sdk.cog.plugins import register_default_plugins  # type: ignore[import-not-found]  # noqa: PLC0415
 
     register_default_plugins()  # the options of each kind of panel, the queries of each kind of source
     read = sdk.Dashboard.from_json(board)

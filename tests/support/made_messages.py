@@ -20,12 +20,12 @@ MessageType = TypeVar("MessageType", bound=Message)
 def filled(kind: type[MessageType], samples: int, fans: int, **given: Any) -> MessageType:
     """A message whose columns are zero, and valid, but for what is given: numbers, or arrays of the column's shape."""
     shapes = {"samples": (samples,), "samples x fans": (samples, fans), "fans": (fans,)}
-    values: dict[str, Any] = {
+    values = {
         name: np.broadcast_to(np.asarray(given.pop(name, name == "valid"), column.dtype), shapes[column.shape]).copy()
         for name, column in columns(kind).items()
         if name in given or not column.optional
     }
-    return kind(fans=fans, **values, **given)
+    return kind(**{"fans": fans, **values, **given})
 
 
 def health(stage: str, instance: str = "all", producer: str = "", sequence: int = 0, **more: Any) -> Health:

@@ -50,12 +50,8 @@ def running_browser() -> Iterator[Browser]:
         pytest.skip(f"no browser to look at the page with ({', '.join(BROWSERS)}); apt-get install chromium")
     arguments = ["--no-sandbox"] if os.geteuid() == 0 else []  # the sandbox refuses to run as root
     expect.set_options(timeout=DEADLINE_MS)
-    with sync_playwright() as playwright:
-        running = playwright.chromium.launch(executable_path=path, args=arguments)
-        try:
-            yield running
-        finally:
-            running.close()
+    with sync_playwright() as playwright, playwright.chromium.launch(executable_path=path, args=arguments) as running:
+        yield running
 
 
 def opened(

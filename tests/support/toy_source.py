@@ -5,14 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Literal
 
-from fantwin.pipeline.sources.source import (
-    LinkUp,
-    Reading,
-    ReadingBatch,
-    SourceConfig,
-    SourceContext,
-    SourceEvent,
-)
+from fantwin.pipeline.sources.source import LinkUp, Reading, ReadingBatch, SourceConfig, SourceContext, SourceEvent
 from fantwin.schemas.tacho import Tacho
 from fantwin.schemas.units import NS_PER_S
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -35,21 +35,15 @@ def configuration(tmp_path: Path, endpoint: str) -> Path:
     return path
 
 
-@pytest.fixture
-def tray(tmp_path: Path) -> Iterator[RunningCommand]:
-    """A simulated one, whose plant moves its fans and hardly ever lets them stand."""
-    line = ("--set", "rate_hz=20", "--set", "speed_unit=rpm", "--link", tmp_path / "line", "--json")
-    tray = RunningCommand(("simulate", "--fans", FANS, "--profile", "multisine", *line))
-    try:
-        tray.line_with(" on ")
-        yield tray
-    finally:
-        tray.kill()
-
-
 def test_a_tray_that_its_plant_moves_gets_a_calibrated_twin_and_meanwhile_a_second_one_is_refused(
-    configuration: Path, tray: RunningCommand, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
+    configuration: Path,
+    start_command: Callable[..., RunningCommand],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    """The plant of the simulated tray moves its fans and hardly ever lets them stand."""
+    line = ("--set", "rate_hz=20", "--set", "speed_unit=rpm", "--link", tmp_path / "line", "--json")
+    start_command("simulate", "--fans", FANS, "--profile", "multisine", *line).line_with(" on ")
     monkeypatch.setattr(commission, "stop_on_signals", threading.Event)  # this process has its own
     for name, least in (("NEEDED_RANGES", 2), ("NEEDED_S", 3.0), ("NEEDED_CHANGES", 2)):
         monkeypatch.setattr(ordinary_operation, name, least)

@@ -8,8 +8,7 @@ import re
 import shutil
 import signal
 import subprocess
-from collections.abc import Iterator
-from pathlib import Path
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -43,12 +42,8 @@ CAN_CUT = os.geteuid() == 0 and shutil.which("ss") is not None
 
 
 @pytest.fixture
-def chain(tmp_path: Path, endpoint: str) -> Iterator[Chain]:
-    chain = Chain(tmp_path, endpoint)
-    try:
-        yield chain
-    finally:
-        chain.close()
+def chain(new_chain: Callable[..., Chain]) -> Chain:
+    return new_chain()
 
 
 def start(chain: Chain) -> RunningCommand:
@@ -186,22 +181,16 @@ def test_without_their_launcher_all_stages_end_in_order_and_leave_a_whole_record
     check_whole(chain, MANY)
 
 
-def test_a_stage_that_cannot_start_ends_all_with_one_line(tmp_path, endpoint):
+def test_a_stage_that_cannot_start_ends_all_with_one_line(tmp_path, new_chain):
     twin = write_twin(tmp_path / "twin.onnx", fans=FANS, calibration={"speed": "none"})
-    chain = Chain(tmp_path, endpoint, f"tray.0.twin='{twin}'", stages=("scorer", "recorder"))
-    try:
-        up = chain.start_up()
-        assert up.process.wait(DEADLINE_S) == 1
-        up.kill()
-        assert f"recorded until then: {tmp_path}/recording.mcap" in up.lines
-        errors = [line for line in up.lines if line.startswith("fantwin:")]
-        assert errors and errors[0].startswith(
-            f"fantwin: {twin}: its calibration cannot be used: false_alarms_per_day: "
-        )
-        assert len(errors) == 1
-        assert "Traceback" not in "\n".join(up.lines)
-        started = chain.process_ids()
-        assert "scorer" in started
-        assert not any(map(is_running, started.values()))
-    finally:
-        chain.close()
+    chain = new_chain(f"tray.0.twin='{twin}'", stages=("scorer", "recorder"))
+    up = chain.start_up()
+    assert up.process.wait(DEADLINE_S) == 1
+    up.kill()
+    assert f"recorded until then: {tmp_path}/recording.mcap" in up.lines
+    (error,) = [line for line in up.lines if line.startswith("fantwin:")]
+    assert error.startswith(f"fantwin: {twin}: its calibration cannot be used: false_alarms_per_day: ")
+    assert "Traceback" not in "\n".join(up.lines)
+    started = chain.process_ids()
+    assert "scorer" in started
+    assert not any(map(is_running, started.values()))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -37,29 +37,18 @@ def configuration(tmp_path: Path, endpoint: str) -> Path:
     return path
 
 
-@pytest.fixture
-def tray(tmp_path: Path) -> Iterator[RunningCommand]:
-    tray = RunningCommand(
-        ["simulate", "--fans", FANS, "--link", tmp_path / "line", "--profile", "prbs", "--set", "rate_hz=20", "--json"]
-    )
-    try:
-        tray.line_with("fans on")
-        yield tray
-    finally:
-        tray.kill()
-
-
-def test_a_twin_is_learned_and_takes_over_while_the_stages_run(configuration: Path, tray: RunningCommand) -> None:
+def test_a_twin_is_learned_and_takes_over_while_the_stages_run(
+    tmp_path: Path, configuration: Path, start_command: Callable[..., RunningCommand]
+) -> None:
+    line = ("--link", tmp_path / "line", "--profile", "prbs", "--set", "rate_hz=20", "--json")
+    start_command("simulate", "--fans", FANS, *line).line_with("fans on")
     versions = TwinVersions(learning_folder(configuration.parent / "runs", "tray1"), "tray1")
-    up = RunningCommand(["up", "-c", configuration, "--json"])
-    try:
-        up.line_with("learner, tray1: no twin yet, nothing is judged; ")
-        eventually(versions.in_force, "the first version is made", 2 * DEADLINE_S)
-        up.line_with("learner, tray1: tray1-1 is in force; ")
-        assert up.end() == 0
-        outcome = up.output()
-    finally:
-        up.kill()
+    up = start_command("up", "-c", configuration, "--json")
+    up.line_with("learner, tray1: no twin yet, nothing is judged; ")
+    eventually(versions.in_force, "the first version is made", 2 * DEADLINE_S)
+    up.line_with("learner, tray1: tray1-1 is in force; ")
+    assert up.end() == 0
+    outcome = up.output()
     assert outcome["restarts"] == {}
     assert not any(outcome["lost"].values())
     (recording,) = map(Path, outcome["recordings"])

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -59,11 +60,8 @@ class Site:
 
 @pytest.fixture
 def site(tmp_path: Path, endpoint: str) -> Iterator[Site]:
-    site = Site(tmp_path, endpoint)
-    try:
+    with closing(Site(tmp_path, endpoint)) as site:
         yield site
-    finally:
-        site.close()
 
 
 def grids(site: Site) -> list[Grid]:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -16,7 +16,7 @@ from fantwin.pipeline.bus.session import join_bus
 from fantwin.pipeline.config.loading import load_config
 from fantwin.pipeline.site.site_watcher import SiteWatcher
 from tests.support.fantwin_command import as_typed
-from tests.support.running_chain import DEADLINE_S, DEMO, TRAY, Chain, RunningCommand, eventually, received, view_of
+from tests.support.running_chain import DEADLINE_S, DEMO, TRAY, Chain, eventually, received, view_of
 
 pytestmark = [pytest.mark.slow, pytest.mark.real_time]
 
@@ -24,28 +24,20 @@ FAULTY = 2
 
 
 @pytest.fixture
-def chain(tmp_path: Path, endpoint: str) -> Iterator[Chain]:
-    secured = endpoint.replace("tcp/", "tls/")
+def chain(tmp_path: Path, endpoint: str, new_chain: Callable[..., Chain]) -> Chain:
     files = {"ca": "ca.pem", "certificate": "{role}.pem", "key": "{role}.key"}
     security = [f"bus.security.{name}='{tmp_path}/certs/{file}'" for name, file in files.items()]
     settings = ["bus.mode=client", *security, "twin_integrator.warm_up_s=2"]
-    chain = Chain(tmp_path, secured, *settings)
-    try:
-        yield chain
-    finally:
-        chain.close()
+    return new_chain(*settings, endpoint=endpoint.replace("tcp/", "tls/"))
 
 
-def test_a_site_with_certificates_comes_from_nothing_to_an_alarm(chain):
+def test_a_site_with_certificates_comes_from_nothing_to_an_alarm(chain, start_command):
     authority = ("--authority", chain.folder / "authority")
     for words in (["init", *authority], ["issue", *authority]):
         done = as_typed(*chain.words("certs"), *words)
         assert done.returncode == 0, done.stderr
-    router = RunningCommand(chain.words("router"))
-    try:
-        run(chain)
-    finally:
-        router.kill()
+    start_command(*chain.words("router"))
+    run(chain)
 
 
 def run(chain: Chain) -> None:

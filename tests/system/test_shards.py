@@ -10,6 +10,7 @@ import os
 import signal
 import threading
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -148,11 +149,8 @@ class Shards:
 
 @pytest.fixture
 def shards(tmp_path: Path, endpoint: str) -> Iterator[Shards]:
-    shards = Shards(tmp_path, endpoint)
-    try:
+    with closing(Shards(tmp_path, endpoint)) as shards:
         yield shards
-    finally:
-        shards.close()
 
 
 def kill(running: RunningCommand) -> None:

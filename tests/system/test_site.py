@@ -10,8 +10,7 @@ import json
 import re
 import subprocess
 import urllib.request
-from collections.abc import Iterator
-from pathlib import Path
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -50,13 +49,9 @@ def page() -> str:
 
 
 @pytest.fixture
-def chain(tmp_path: Path, endpoint: str, page: str) -> Iterator[Chain]:
+def chain(page: str, new_chain: Callable[..., Chain]) -> Chain:
     settings = ("twin_integrator.warm_up_s=2", f"gateway.port={page.rpartition(':')[2]}")
-    chain = Chain(tmp_path, endpoint, *settings, stages=(*STAGES, "gateway"))
-    try:
-        yield chain
-    finally:
-        chain.close()
+    return new_chain(*settings, stages=(*STAGES, "gateway"))
 
 
 def current_alarms(chain: Chain) -> list[dict[str, Any]]:

@@ -20,17 +20,7 @@ from fantwin.scoring.wear.slow_change import (
 )
 from fantwin.scoring.wear.trend import NS_PER_DAY
 from fantwin.scoring.wear.wear_monitor import SETTLING_INTERVALS, WearMonitor
-from tests.support.wear_data import (
-    DAYS_OF_WEAR,
-    EVERY_S,
-    LOSS,
-    PER_DAY,
-    START_NS,
-    feed,
-    loss_of,
-    slow_states,
-    times_ns,
-)
+from tests.support.wear_data import DAYS_OF_WEAR, EVERY_S, LOSS, PER_DAY, START_NS, feed, loss_of, slow_states, times_ns
 
 FANS, WORN = 4, 2
 EVERY_NS = round(EVERY_S * 1e9)
