@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fantwin.schemas.messages import Raw
 from fantwin.schemas.units import NS_PER_S
 from fantwin.scoring.model.bins import Bins, bin_ns_of
 from fantwin.scoring.model.decision import Decision
@@ -53,22 +52,3 @@ def test_without_any_one_part_a_fan_that_loses_a_fifth_of_its_speed_has_an_alarm
         ):
             decision.take(one)
     assert decision.active.tolist() == [True, False]
-
-
-def test_wrong_readings_are_where_they_are_said_to_be() -> None:
-    bench = importlib.import_module("bench.detection.wrong_readings")
-    speed = np.full((1000, 4), 100.0)
-    command = np.where(np.arange(1000) < 500, 0.2, 0.8)[:, np.newaxis] * np.ones(4)
-    raw = Raw(fans=4, host_receive_t_ns=np.arange(1000) * (NS_PER_S // 10), command=command, speed_rad_s=speed)
-
-    def wrong(case: str, *, is_start: bool = False) -> np.ndarray:
-        found = bench.Wrong(case, 20.0, 10.0).replaced(raw, np.random.default_rng(1), is_start=is_start)
-        return found != speed
-
-    assert 0.04 < wrong("half").mean() < 0.06
-    in_a_row = wrong(bench.IN_A_ROW)
-    assert (in_a_row[1:-1] <= (in_a_row[:-2] | in_a_row[2:])).all()
-    changing = np.flatnonzero(wrong(bench.CHANGING).any(axis=1))
-    assert len(changing) and changing.min() >= 500 and changing.max() < 520
-    assert np.flatnonzero(wrong(bench.FIRST, is_start=True).any(axis=1)).tolist() == [0]
-    assert not wrong(bench.FIRST).any()

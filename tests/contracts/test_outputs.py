@@ -2,23 +2,215 @@
 
 from __future__ import annotations
 
+import asyncio
 import itertools
+import json
+import re
 import shutil
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any, ClassVar
 
 import pytest
+from asyncua.client.client import Client as OpcuaClient
+from prometheus_client.parser import text_string_to_metric_families
 
+from fantwin.pipeline.config.settings import TrayConfig
+from fantwin.pipeline.outputs.notify.config import NotifierConfig
+from fantwin.pipeline.outputs.rerun.viewer_core import FLUSH_PERIOD_NS, ViewerCore
 from fantwin.schemas.enums import FanState, Severity, Transition
+from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.header import Header
-from fantwin.schemas.messages import Alarm
-from tests.support.outputs import OUTPUTS, Output
+from fantwin.schemas.messages import Alarm, Message, Score
+from fantwin.schemas.topics import tray_key
+from fantwin.schemas.units import NS_PER_S
+from tests.support.drawn_views import FakeSink
+from tests.support.message_receivers import HttpReceiver
+from tests.support.mosquitto import Mosquitto, retained_by
+from tests.support.notified_alarms import START_NS, notifier_core, secret
 from tests.support.running_chain import eventually
-from tests.support.running_core import TRAY
+from tests.support.running_core import FANS, SITE, TRAY
+from tests.support.running_gateway import Client, RunningGateway
+from tests.support.running_mqtt import ROOT, RunningMqtt
+from tests.support.running_opcua import RunningOpcua
 from tests.support.score_data import one_sample
 from tests.support.site_messages import NOW_NS, alarm, score
+
+Alarms = dict[int, tuple[bool, bool]]
+"""fans with an active alarm: whether it is acknowledged, and whether it is silenced"""
+
+
+class Output:
+    """A running output of a site of one tray of `FANS` fans."""
+
+    keeps_state = True
+    """whether its reader sees acknowledgements and silenced fans; otherwise it hears events only"""
+    running: Any
+
+    def feed(self, *messages: Message) -> None:
+        """Pass messages, as the runner does."""
+        self.running.feed(*messages)
+
+    def alarms(self) -> Alarms:
+        """What its reader sees."""
+        raise NotImplementedError
+
+    def refused(self) -> int:
+        """How many messages it has counted as not usable."""
+        names = ("unknown_tray", "unknown_fan", "refused_scores", "wrong_fan_count", "undecodable")
+        counters = self.running.counters()
+        return sum(counters.get(name, 0) for name in names)
+
+    def close(self) -> None:
+        """End it; once, however often it is called."""
+        self.running.close()
+
+
+class GatewayOutput(Output):
+    """The operators' page, by its API."""
+
+    def __init__(self, folder: Path) -> None:
+        self.running = RunningGateway(folder)
+
+    def alarms(self) -> Alarms:
+        """Alarms of the fans that the list of alarms and the list of fans agree on."""
+        client = Client(self.running)
+        found = client.ask("GET", "/api/v1/alarms?all=1")[1]["alarms"]
+        groups = [client.ask("GET", f"/api/v1/fans?state={group}")[1]["fans"] for group in ("alarm", "silenced")]
+        fans = {each["fan"] for group in groups for each in group}
+        return {a["fan"]: (a["acknowledged"], _is_silenced(a)) for a in found if a["active"] and a["fan"] in fans}
+
+
+def _is_silenced(alarm: Mapping[str, Any]) -> bool:
+    return bool(alarm["shelved_until_t_ns"] or alarm["suppressed"] or alarm["out_of_service"])
+
+
+class PrometheusOutput(GatewayOutput):
+    """The metrics of the gateway."""
+
+    keeps_state = False
+
+    def alarms(self) -> Alarms:
+        families = text_string_to_metric_families(Client(self.running).ask("GET", "/metrics")[1])
+        samples = [sample for family in families for sample in family.samples if sample.value]
+        fans = {
+            name: {int(each.labels["fan"]) for each in samples if each.name == f"fantwin_fan_alarm_{name}"}
+            for name in ("active", "unacknowledged")
+        }
+        return {fan: (fan not in fans["unacknowledged"], False) for fan in fans["active"]}
+
+
+class OpcuaOutput(Output):
+    """The OPC UA server, read by a client of the same library."""
+
+    def __init__(self, folder: Path) -> None:
+        self.running = RunningOpcua(folder)
+
+    def alarms(self) -> Alarms:
+        return asyncio.run(self._read())
+
+    async def _read(self) -> Alarms:
+        names = ("ActiveState/Id", "AckedState/Id", "SuppressedOrShelved")
+        async with OpcuaClient(self.running.url, timeout=60) as client:
+            nodes = [client.get_node(f"ns=2;s={TRAY}/{fan}/Alarm/{name}") for fan in range(FANS) for name in names]
+            values = await client.read_values(nodes)
+        fans = {fan: values[3 * fan : 3 * fan + 3] for fan in range(FANS)}
+        return {fan: (acked, silenced) for fan, (active, acked, silenced) in fans.items() if active}
+
+
+class MqttOutput(Output):
+    """What a real broker keeps."""
+
+    def __init__(self, folder: Path) -> None:
+        self.broker = Mosquitto(folder)
+        self.broker.start()
+        self.running = RunningMqtt(folder, self.broker.port)
+
+    def alarms(self) -> Alarms:
+        kept = retained_by(self.broker.port)
+        texts = {fan: json.loads(kept.get(f"{ROOT}/{TRAY}/{fan}/alarm") or "null") for fan in range(FANS)}
+        return {fan: (a["acknowledged"], _is_silenced(a)) for fan, a in texts.items() if a and a["active"]}
+
+    def close(self) -> None:
+        self.running.close()
+        self.broker.stop()
+
+
+class NotifierOutput(Output):
+    """A webhook that is sent messages; its clock goes on by a minute with each look."""
+
+    keeps_state = False
+
+    posted: ClassVar[dict[Path, list[Any]]] = {}
+    """what the reader has, by folder: more than one notifier may have sent it"""
+
+    def __init__(self, folder: Path) -> None:
+        self._receiver = HttpReceiver()
+        self._receiver.received = self.posted.setdefault(folder, [])
+        url = secret(folder, "hook", f"json://127.0.0.1:{self._receiver.port}/")
+        target = {"name": "hook", "url_file": url, "repeat_s": 0}
+        config = NotifierConfig.model_validate({"target": [target]})
+        self.running = notifier_core(folder, config, {TRAY: FANS})
+        self._now_ns = START_NS
+        self._is_closed = False
+
+    def feed(self, *messages: Message) -> None:
+        for message in messages:
+            self.running.step(message)
+
+    def alarms(self) -> Alarms:
+        for _ in range(20):
+            self._now_ns += NS_PER_S
+            self.running.tick(self._now_ns)
+        active: Alarms = {}
+        for title in [posted["title"] for posted in self._receiver.received]:
+            fan = int(re.findall(r"fan (\d+) of", title)[0])
+            active.pop(fan, None) if title.startswith("Cleared") else active.update({fan: (False, False)})
+        return active
+
+    def close(self) -> None:
+        if not self._is_closed:
+            self._is_closed = True
+            self.running.close()
+            self._receiver.stop()
+
+
+class ViewerOutput(Output):
+    """The table of alarms in the viewer."""
+
+    def __init__(self, _folder: Path) -> None:
+        self._sink = FakeSink()
+        self.running = ViewerCore(SITE, [TrayConfig(name=TRAY, fans=FANS, speed_unit="rpm")], self._sink)
+        self._ticks = 0
+
+    def feed(self, *messages: Message) -> None:
+        for each in messages:
+            is_score = isinstance(each, Score)
+            self.running.step(Envelope.of(tray_key(SITE, TRAY, "score"), each, 0) if is_score else each)
+
+    def alarms(self) -> Alarms:
+        self._ticks += 1
+        self.running.tick(self._ticks * FLUSH_PERIOD_NS)
+        text = self._sink.tables[-1][1] if self._sink.tables else ""
+        rows = re.findall(rf"^\| \*\*{TRAY}/(\d+)\*\* \| (.*?) \|.*\| (.*?) \|$", text, re.MULTILINE)
+        return {int(fan): (seen_by != "nobody", "silenced" in words) for fan, words, seen_by in rows}
+
+    def close(self) -> None:
+        if not self._sink.closed:
+            self.running.close()
+
+
+OUTPUTS: dict[str, Callable[[Path], Output]] = {
+    "gateway": GatewayOutput,
+    "prometheus": PrometheusOutput,
+    "opcua": OpcuaOutput,
+    "mqtt": MqttOutput,
+    "notifier": NotifierOutput,
+    "viewer": ViewerOutput,
+}
+
 
 pytestmark = pytest.mark.usefixtures("quickly_hashed")
 SEEN = {"acknowledged": True, "operator_name": "ann"}
