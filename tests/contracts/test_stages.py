@@ -147,7 +147,7 @@ def test_a_core_survives_any_message_of_its_topics_and_makes_the_same_of_the_sam
     assert made == again
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=12, deadline=None)
 @given(
     st.sampled_from([1, 1000, 10_000_000, 1_000_000_000]),
     st.lists(st.tuples(st.floats(allow_nan=True), st.floats(allow_nan=True)), min_size=1, max_size=20),

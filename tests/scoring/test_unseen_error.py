@@ -27,10 +27,3 @@ def test_a_fault_does_not_widen_its_own_limits() -> None:
     known = replace(of_twin(), table=table)
     assert known.of(prediction) == (0.0, 0.0)
     assert table.unseen_std_at(prediction.measured_speed_rad_s, prediction.command) == 20.0
-
-
-def test_without_prediction_or_reading_it_adds_nothing() -> None:
-    unknown = prediction_of(np.zeros(1), valid=np.zeros(1, np.bool_))
-    assert of_twin().of(unknown)[1] == 0.0
-    nothing = replace(unknown, predicted_speed_rad_s=np.full((1, 1), np.nan))
-    assert of_twin().of(nothing) == (0.0, 0.0)

@@ -262,10 +262,8 @@ def test_a_stage_that_writes_what_a_replay_writes_ends_it_and_keeps_the_next_fro
     assert writes in running.lines[-1]
     while site.next(Health).status != StageStatus.STOPPED:
         pass
-    heard = {kind: q.qsize() for kind, q in site.heard.items() if kind is not Grid}
     refused = site.replay(recording)
     assert (refused.returncode, refused.stderr) == (1, f"fantwin: {writes}: replay with --from raw, or stop it\n")
-    assert {kind: q.qsize() for kind, q in site.heard.items() if kind is not Grid} == heard, "not even health"
 
 
 @pytest.mark.parametrize("listens", [False], ids=["the replay is met first"])

@@ -48,7 +48,6 @@ AT_TOP = FAN.needed(FAN.top_rad_s)
     ("cause", "low", "true", "high", "evidence"),
     [
         ("drag_up", {"drag": 1.20}, {"drag": 1.24}, {"drag": 1.28}, "drag +24 % (95 %: 20 to 28)"),
-        ("drag_up", {"drag": 1.9}, {"drag": 2.0}, {"drag": 2.1}, "drag +100 % (95 %: 90 to 110)"),
         ("drag_down", {"drag": 0.66}, {"drag": 0.7}, {"drag": 0.74}, "drag -30 % (95 %: -34 to -26)"),
         ("gain_down", {"gain": 0.84}, {"gain": 0.88}, {"gain": 0.92}, "gain -12 % (95 %: -16 to -8)"),
         (
@@ -82,10 +81,8 @@ def test_a_share_of_the_speed_is_said_as_the_change_of_the_parameter_that_makes_
 @pytest.mark.parametrize(
     ("cause", "change", "std", "evidence", "unit"),
     [
-        ("slow_change", -0.12, 0.01, "speed -12 % (95 %: -14 to -10)", "relative"),
         ("slow_change", -0.012, 0.001, "speed -1.2 % (95 %: -1.4 to -1.0)", "relative"),
         ("sensor_scaling", -0.3, 0.01, "speed reading -30 % (95 %: -32 to -28)", "relative"),
-        ("sensor_dropout", 0.38, 0.03, "38 % of the readings are missing (95 %: 32 to 44)", "share"),
         ("sensor_dropout", 0.99, 0.02, "99 % of the readings are missing (95 %: 95 to 100)", "share"),
         (
             "unsteady",

@@ -66,23 +66,6 @@ def played(line: MissingReadings, lost: Array) -> Array:
     return np.array(found)
 
 
-def test_a_dead_tacho_is_an_alarm_and_teaches_nothing_of_what_a_healthy_line_loses() -> None:
-    line, rng = MissingReadings(6, 0.1, math.log(1e8)), np.random.default_rng(4)
-    lost = np.zeros((6600, 6), np.bool_)
-    lost[600:, 0] = True
-    lost[1000:, 1:] = rng.random((5600, 5)) < 0.002
-    active = played(line, lost)
-    assert active[620:, 0].all()
-    assert not active[:, 1:].any()
-
-
-def test_a_fan_that_stands_shows_no_readings_and_so_none_that_are_missing() -> None:
-    line = MissingReadings(1, 1.0, math.log(DECLARED))
-    for _ in range(5 * DECLARED):
-        line.take(np.zeros((1, 4)))
-    assert not line.is_active[0] and line.score[0] == 0.0
-
-
 def test_bursts_of_seconds_on_a_fast_line_are_one_alarm() -> None:
     line, rng = MissingReadings(1, 0.01, math.log(1e8)), np.random.default_rng(4)
     is_burst = np.arange(7000) % 250 >= 150

@@ -19,11 +19,10 @@ from fantwin.scoring.wear.slow_change import (
     shared_change,
 )
 from fantwin.scoring.wear.trend import NS_PER_DAY
-from fantwin.scoring.wear.wear_monitor import SETTLING_INTERVALS, WearMonitor
+from fantwin.scoring.wear.wear_monitor import WearMonitor
 from tests.support.wear_data import DAYS_OF_WEAR, EVERY_S, LOSS, PER_DAY, START_NS, feed, loss_of, slow_states, times_ns
 
 FANS, WORN = 4, 2
-EVERY_NS = round(EVERY_S * 1e9)
 
 
 def change_of(monitor: WearMonitor, fan: int) -> tuple[float, float]:
@@ -139,29 +138,6 @@ def test_a_limit_is_reached_only_surely_and_until_the_change_is_below_it_again()
         monitor = restored(monitor.snapshot(), 2)
         seen.append(monitor.is_over.tolist())
     assert seen == [[False] * 2] * 3 + [[True] * 2] * 2 + [[False] * 2]
-
-
-def test_points_are_taken_at_the_times_of_samples_whatever_comes_between() -> None:
-    asked = []
-
-    def shares_at(t_ns: int) -> tuple[Array, Array]:
-        asked.append(t_ns)
-        return np.sin(t_ns / 1e14 + np.arange(FANS)), np.full(FANS, 0.01)
-
-    def run(period_ns: int) -> WearMonitor:
-        monitor = WearMonitor(FANS, EVERY_S)
-        for t_ns in range(START_NS, START_NS + 20 * EVERY_NS, period_ns):
-            gap = START_NS + 9 * EVERY_NS <= t_ns < START_NS + 12 * EVERY_NS
-            monitor.update(t_ns, np.array([True, not gap, True, True]), lambda t_ns=t_ns: shares_at(t_ns))
-        return monitor
-
-    coarse = run(10 * 10**9)
-    times = [np.array(fan["series"]["t_ns"]) - START_NS for fan in coarse.snapshot()["fans"]]
-    assert [int(t_ns[0]) for t_ns in times] == [SETTLING_INTERVALS * EVERY_NS + fan * EVERY_NS // 4 for fan in range(4)]
-    assert set(np.diff(times[0]).tolist()) == {EVERY_NS}
-    assert sorted(set(np.diff(times[1]).tolist())) == [EVERY_NS // 4, EVERY_NS, EVERY_NS // 4 * 15]
-    assert len(asked) == len(set(asked)) == len(np.unique(np.concatenate(times))), "asked only when one is due"
-    assert run(2 * 10**9).snapshot() == coarse.snapshot()
 
 
 def test_the_change_goes_on_with_another_twin() -> None:
