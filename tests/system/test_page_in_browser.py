@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from playwright.sync_api import Browser, Route, expect
+from playwright.sync_api import Browser, expect
 
 from fantwin.schemas.enums import Action, FanState, Feedback, Transition
 from fantwin.schemas.messages import Alarm, Diagnosis, Request
-from tests.support.page_browser import DEADLINE_MS, inaccessible, opened, running_browser
+from tests.support.page_browser import inaccessible, opened, running_browser
 from tests.support.running_core import FANS, TRAY
 from tests.support.running_gateway import RunningGateway
 from tests.support.site_messages import NOW_NS, alarm, golden_twin, marked, score
@@ -144,26 +144,6 @@ def test_whoever_must_log_in_is_asked_again_after_a_restart_and_sees_the_page_ag
         expect(page.get_by_role("button", name=f"{TRAY} fan 0")).to_be_visible()
     finally:
         running.close()
-
-
-def test_a_click_counts_while_the_page_learns_what_is_going_on(gateway, browser):
-    page = browser.new_context().new_page()
-    page.set_default_timeout(DEADLINE_MS)
-    held: list[Route] = []
-
-    def hold(route: Route) -> None:
-        held.append(route)
-
-    page.route("**/api/v1/stages", hold)
-    with page.expect_request("**/api/v1/stages"):
-        page.goto(f"http://127.0.0.1:{gateway.port}/")
-    page.get_by_role("button", name="Log in").hover()
-    page.mouse.down()
-    with page.expect_response("**/api/v1/stages"):
-        held.pop().continue_()
-    page.evaluate("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
-    page.mouse.up()
-    expect(page.get_by_label("Name")).to_be_visible()
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
