@@ -108,7 +108,7 @@ def in_blocks(items: Iterable[Any], sizes: Iterable[int]) -> Iterator[Any]:
     wanted = cycle(sizes)
     size = next(wanted)
     for item in items:
-        is_message = not callable(item)
+        is_message = not isinstance(item, methodcaller)
         if block and not (is_message and len(block) < size and item.header.producer == block[0].header.producer):
             yield join(block)
             block, size = [], next(wanted)
@@ -136,7 +136,7 @@ def same_in_blocks(
         core, made = new(), list[Any]()
         with np.errstate(all="ignore"):
             for item in fed:
-                made += item(core) if callable(item) else core.step(item)
+                made += item(core) if isinstance(item, methodcaller) else core.step(item)
             problem, counters = core.problem(), dict(core.counters())
             made += core.close()
         of_kind = [message for message in made if isinstance(message, kind)]

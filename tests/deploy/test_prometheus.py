@@ -22,9 +22,9 @@ import yaml
 
 from fantwin.schemas.enums import FanState, StageStatus
 from fantwin.schemas.fields import columns
-from fantwin.schemas.header import Header
 from fantwin.schemas.health import Health, Input, LatencyBucket, Output
 from fantwin.schemas.messages import Score
+from tests.support import made_messages
 from tests.support.ports import free_port
 from tests.support.running_chain import eventually
 from tests.support.running_core import FANS, SITE, TRAY
@@ -176,21 +176,16 @@ def health(stage: str, messages: int, uptime_s: float, latency_s: float = 0.05, 
         LatencyBucket(upper_s=upper_s, count=messages * (latency_s <= upper_s))
         for upper_s in (0.1, 1.0, 10.0, math.inf)
     )
-    key = f"fantwin/{SITE}/{TRAY}/"
+    key, t_ns = f"fantwin/{SITE}/{TRAY}/", messages * 10**9
+    received = Input(key=f"{key}in", producer="p-1", received=messages, missing=0, duplicated=0, next_sequence=messages)
     values = {
-        "status": StageStatus.OK,
-        "inputs": (
-            Input(key=f"{key}in", producer="p-1", received=messages, missing=0, duplicated=0, next_sequence=messages),
-        ),
+        "inputs": (received,),
         "outputs": (Output(key=f"{key}out", published=messages),),
         "latencies": latencies,
         "latency_sum_s": messages * latency_s,
-        "t_ns": messages * 10**9,
-        "newest_input_t_ns": messages * 10**9,
-        **more,
+        **{"t_ns": t_ns, "newest_input_t_ns": t_ns, "uptime_s": uptime_s, **more},
     }
-    header = Header(f"{stage}-all-1", messages)
-    return Health(header=header, stage=stage, instance="all", uptime_s=uptime_s, **values)
+    return made_messages.health(stage, sequence=messages, **values)
 
 
 @pytest.fixture

@@ -31,7 +31,7 @@ def alarm(
     onset_s: float = 0.0,
     sequence: int | None = None,
     producer: str = "scorer-all-1",
-    **more: object,
+    **more: Any,
 ) -> Alarm:
     """A transition; without `sequence` a later one than all before."""
     values: dict[str, Any] = {

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -47,8 +48,8 @@ def score(seconds: float = 0.0, *, state: FanState = FanState.NORMAL, samples: i
     )
 
 
-def alarm(transition: Transition = Transition.RAISED, sequence: int = 0, **more: object) -> Alarm:
-    values = {
+def alarm(transition: Transition = Transition.RAISED, sequence: int = 0, **more: Any) -> Alarm:
+    values: dict[str, Any] = {
         "residual_rad_s": 9.0,
         "residual_std_rad_s": 5.0,
         "message": "fan 2: 90 rpm below the twin (limit 50)",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -37,15 +38,11 @@ def raw(
 ) -> Raw:
     numbers = np.random.default_rng(sequence)
     count = np.arange(samples if clock else 0)
-    return Raw(
-        header=Header(producer, sequence, tray),
-        fans=fans,
-        host_receive_t_ns=np.arange(samples) + sequence * samples,
-        device_clock_us=count,
-        device_sequence=count,
-        command=numbers.normal(size=(samples, fans)),
-        speed_rad_s=numbers.normal(size=(samples, fans)),
-    )
+    command, speed_rad_s = numbers.normal(size=(2, samples, fans))
+    times: dict[str, Any] = {"host_receive_t_ns": np.arange(samples) + sequence * samples}
+    times |= {"device_clock_us": count, "device_sequence": count}
+    header = Header(producer, sequence, tray)
+    return Raw(header=header, fans=fans, command=command, speed_rad_s=speed_rad_s, **times)
 
 
 def alarm(sequence: int) -> Alarm:

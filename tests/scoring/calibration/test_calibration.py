@@ -1,4 +1,4 @@
-"""scoring.calibration.calibration: which rate may be promised, how far a limit is raised, and the rate that really was."""
+"""scoring.calibration.calibration: which rate may be promised, how far a limit is raised, and the real rate."""
 
 from __future__ import annotations
 
