@@ -84,7 +84,7 @@ class GatewayOutput(Output):
 
 
 def _is_silenced(alarm: Mapping[str, Any]) -> bool:
-    return bool(alarm["shelved_until_t_ns"] or alarm["suppressed"] or alarm["out_of_service"])
+    return bool(alarm["shelved_until_t_ns"] or alarm["out_of_service"])
 
 
 class PrometheusOutput(GatewayOutput):

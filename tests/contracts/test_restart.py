@@ -28,8 +28,6 @@ from fantwin.scoring.alarms.alarm_state import DATA_LOST_AFTER_NS
 from fantwin.scoring.alarms.alarms_of_tray import AlarmsOfTray, Decided, KeptConditions
 from fantwin.scoring.model.saved import as_json, from_json
 from fantwin.scoring.standing.against_command import AgainstCommand
-from fantwin.scoring.wear.wear_monitor import WearMonitor
-from tests.support import wear_data
 from tests.support.scored_blocks import core_of, prediction_of, request_of
 
 FANS, BLOCK = 3, 20
@@ -169,19 +167,7 @@ class Against:
         self._of_fans.restore(from_json(state["arrays"]))
 
 
-def worn(monitor: WearMonitor, item: tuple[Any, ...]) -> Any:
-    wear_data.feed(monitor, *item)
-    return monitor.notices()
-
-
-def wear() -> list[Any]:
-    """Half days of a tray with a fan that wears."""
-    t_ns, (shares, std_error) = wear_data.times_ns(40), wear_data.slow_states(wear_data.loss_of(0, FANS, 40))
-    return [(t_ns[k : k + 24], shares[k : k + 24], std_error[k : k + 24]) for k in range(0, len(t_ns), 24)]
-
-
 PARTS = {
-    "wear": Kind(lambda fans: WearMonitor(fans, wear_data.EVERY_S), wear, worn),
     "alarm conditions": Kind(Conditions, decisions, lambda one, item: repr(one.update(item))),
     "fans against their command": Kind(Against, stops, Against.take, state=lambda one: None),
 }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -191,8 +192,8 @@ def test_a_blocked_fan_at_its_minimum_is_an_alarm_that_a_stop_does_not_end(found
 
 @pytest.mark.parametrize("name", ["held", "slow, then held", "at half speed, then held", "held, and jerking"])
 def test_a_fan_that_is_held_is_blocked_whatever_it_did_before(found: dict[str, Seen], name: str) -> None:
-    named = [alarm.causes[0].cause for alarm in found[name].alarms if alarm.causes]
-    assert named[-1] == "blocked", named
+    last = found[name].alarms[-1].causes[0]
+    assert last.cause == "blocked" and re.search(r"it ran on for 0\.[01] s", last.evidence), last
 
 
 @pytest.mark.parametrize("conditions", [None, ReferenceConditions(supply_voltage_v=12.0)])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 from typing import Any
 
@@ -20,7 +21,18 @@ from fantwin.scoring.wear.slow_change import (
 )
 from fantwin.scoring.wear.trend import NS_PER_DAY
 from fantwin.scoring.wear.wear_monitor import WearMonitor
-from tests.support.wear_data import DAYS_OF_WEAR, EVERY_S, LOSS, PER_DAY, START_NS, feed, loss_of, slow_states, times_ns
+from tests.support.wear_data import (
+    DAYS_OF_WEAR,
+    EVERY_S,
+    LOSS,
+    PER_DAY,
+    START_NS,
+    feed,
+    loss_of,
+    slow_states,
+    times_ns,
+    worn_monitor,
+)
 
 FANS, WORN = 4, 2
 
@@ -138,6 +150,26 @@ def test_a_limit_is_reached_only_surely_and_until_the_change_is_below_it_again()
         monitor = restored(monitor.snapshot(), 2)
         seen.append(monitor.is_over.tolist())
     assert seen == [[False] * 2] * 3 + [[True] * 2] * 2 + [[False] * 2]
+
+
+@pytest.mark.parametrize("earlier", [True, False])
+def test_a_damaged_snapshot_is_refused_and_changes_nothing(earlier: bool) -> None:
+    monitor = worn_monitor(FANS, WORN, days=2)
+    before, whole = monitor.snapshot(), worn_monitor(FANS, WORN, days=3).snapshot()
+    damaged: list[Any] = [{}, [], None, worn_monitor(FANS + 1, WORN, days=2).snapshot()]
+    for path in (("state",), ("fans",), ("state", "shift"), ("state", "t_ns"), ("fans", 1, "series")):
+        for other in (None, "x", [0] * FANS):
+            broken = copy.deepcopy(whole)
+            place: Any = broken
+            for key in path[:-1]:
+                place = place[key]
+            place[path[-1]] = other
+            damaged += [broken] if path != ("state", "shift") or other != [0] * FANS else []
+    restore = monitor.restore_of_earlier_twin if earlier else monitor.restore
+    for snapshot in damaged:
+        with pytest.raises((ValueError, LookupError, TypeError, AttributeError)):
+            restore(snapshot)
+        assert monitor.snapshot() == before
 
 
 def test_the_change_goes_on_with_another_twin() -> None:
