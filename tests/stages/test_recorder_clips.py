@@ -80,7 +80,7 @@ def tick_until_cut(core: Recorder, clips: AlarmClips, now_ns: int) -> None:
 
 
 def raised(fan: int, t_ns: int, **more: Any) -> Alarm:
-    return alarm(fan, t_ns, sequence=fan, **({"transition": Transition.RAISED} | more))
+    return alarm(fan, t_ns, sequence=fan, **{"transition": Transition.RAISED, **more})
 
 
 def crash(core: Recorder) -> None:

@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 
 from fantwin.pipeline.tray_scoring.healthy_twin import known_of
 from fantwin.pipeline.tray_scoring.scorer_config import ScorerConfig
+from fantwin.pipeline.tray_scoring.scorer_core import ScorerCore
 from fantwin.schemas.blocks import join
 from fantwin.schemas.enums import FanState, Transition
 from fantwin.schemas.messages import Alarm, Prediction, Score
 from fantwin.schemas.reference_conditions import ReferenceConditions
 from fantwin.schemas.standstill import Standstill
 from fantwin.scoring.alarms.current_alarms import current_alarm
-from fantwin.pipeline.tray_scoring.scorer_core import ScorerCore
 from tests.support.integrated_twins import core_of, grid_of, physical_twin, run_freely, split
 
 pytestmark = pytest.mark.usefixtures("one_reading_starts")
