@@ -21,7 +21,7 @@ from fantwin.pipeline.errors import UsageError, UserError
 from fantwin.pipeline.files import write_whole
 from fantwin.pipeline.recordings.raw_recordings import record
 from fantwin.pipeline.runtime.signals import stop_on_signals
-from fantwin.pipeline.sources.hwmon.chips import chip_of
+from fantwin.pipeline.sources.hwmon.chip_table import chip_of
 from fantwin.pipeline.sources.simulated.device import PlaybackCounts, PseudoTerminal, play, wait_for_reader
 from fantwin.pipeline.sources.simulated.hwmon import FAULT_FILE, HwmonTree, play_hwmon
 from fantwin.pipeline.sources.simulated.table import TableDevice

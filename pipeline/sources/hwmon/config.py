@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from fantwin.pipeline.sources.hwmon.chips import chip_of
+from fantwin.pipeline.sources.hwmon.chip_table import chip_of
 from fantwin.pipeline.sources.polling import PolledConfig
 from fantwin.schemas.tacho import Tacho
 

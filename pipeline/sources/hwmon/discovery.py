@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from fantwin.pipeline.sources.hwmon.chips import chip_of
+from fantwin.pipeline.sources.hwmon.chip_folder import ChipFolder, chip_folders, device_words
+from fantwin.pipeline.sources.hwmon.chip_table import chip_of
 from fantwin.pipeline.sources.hwmon.config import ROOT
-from fantwin.pipeline.sources.hwmon.tree import ChipFolder, chip_folders, device_words
 
 HIGHEST_RPM = 20_000
 _UNKNOWN = "n/a"

@@ -18,9 +18,9 @@ from pydantic import BaseModel, ValidationError
 
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.files import replace_file
-from fantwin.pipeline.sources.hwmon.chips import chip_of
+from fantwin.pipeline.sources.hwmon.chip_folder import ChipFolder, chip_folders, device_words
+from fantwin.pipeline.sources.hwmon.chip_table import chip_of
 from fantwin.pipeline.sources.hwmon.config import HwmonConfig
-from fantwin.pipeline.sources.hwmon.tree import ChipFolder, chip_folders, device_words
 from fantwin.pipeline.sources.polling import DeviceError, PollingSource
 from fantwin.pipeline.sources.source import Reading, Rejected, SourceContext
 from fantwin.schemas.channels import CURRENT, SUPPLY_VOLTAGE, TEMPERATURE
