@@ -18,15 +18,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Literal, TypeAlias, TypeVar
+from typing import Any, ClassVar, Literal, Protocol, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fantwin.simulation.errors import SimulationError
-
-if TYPE_CHECKING:
-    from _typeshed import DataclassInstance
 
 Array: TypeAlias = NDArray[np.float64]
 Measured = Literal["supply_voltage_v", "current_a", "temperature_c"]
@@ -138,7 +135,13 @@ class FanParameters:
 
 
 VARYING_PARAMETERS = ("J", "alpha", "C_D", "gain", "lag_s", "coulomb_v", "breakaway_v", "stribeck_rad_s")
-Parameters = TypeVar("Parameters", bound="DataclassInstance")
+
+
+class _Dataclass(Protocol):
+    __dataclass_fields__: ClassVar[dict[str, Any]]
+
+
+Parameters = TypeVar("Parameters", bound=_Dataclass)
 
 
 def varied(base: Parameters, varying: Sequence[str], fans: int, seed: int, fan_variation: float) -> Parameters:

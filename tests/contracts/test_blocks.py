@@ -193,7 +193,7 @@ def test_blocks_of_any_size_give_the_same_grid_predictions_and_decisions(
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(free_run, "START_SAMPLES", 1 + seed % 6)
         patch.setattr(tray_integrator, "HOLD_LIMIT_NS", 50_000_000 * (seed % 11))
-        patch.setattr("fantwin.stages.scorer.NOT_JUDGED_S", 0.1)
+        patch.setattr("fantwin.pipeline.tray_scoring.scorer_core.NOT_JUDGED_S", 0.1)
         predicted = one_by_one(grids, seed, ROWS_OF_TWIN)
         predictions = same_in_blocks(lambda: core_of(twins[twin], warm_up_s=0.05), predicted, sizes, Prediction)
         judged = one_by_one(predictions, seed, ROWS_OF_SCORER)

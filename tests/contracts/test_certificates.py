@@ -35,12 +35,13 @@ from tests.support.ports import free_port
 from tests.support.site_certificates import SiteCertificates
 
 CERTIFICATE, KEY, CA = "own.pem", "own.key", "ca.pem"
-PAIR: dict[str, Any] = {"certificate": Path(CERTIFICATE)}
+PAIR: dict[str, Any] = {"certificate": Path(CERTIFICATE), "key": Path(KEY)}
 
 
 def problems_of_bus(folder: Path) -> list[str]:
     try:
-        checked_credentials(SecurityConfig(ca=folder / CA, certificate=folder / CERTIFICATE), ("own",))
+        files: dict[str, Any] = {"ca": folder / CA, "certificate": folder / CERTIFICATE, "key": folder / KEY}
+        checked_credentials(SecurityConfig(**files), ("own",))
     except UserError as error:
         return [str(error)]
     return []

@@ -60,7 +60,7 @@ class ToySource:
         number = 0
         while not self.stopped.wait(0.05):
             one = Reading((0.5,) * self.fans, (self.speed,) * self.fans, sequence=number)
-            self.deliver(ReadingBatch(HOST_CLOCK.now_ns(), (one,), tachos=()))
+            self.deliver(ReadingBatch(HOST_CLOCK.now_ns(), (one,)))
             number += 1
 
     def stop(self):

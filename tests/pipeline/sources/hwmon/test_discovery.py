@@ -70,7 +70,9 @@ def test_the_command_writes_a_new_configuration_and_prints_json(root: Path, tmp_
     assert all(isinstance(tray.source, HwmonConfig) and tray.source.writable for tray in config.trays)
     assert "left out: acpitz" not in result.stderr, "it has no fans"
     text = file.read_text(encoding="utf-8")
-    assert error_of(*words) == f"{file}: exists and was not changed: paste the [[tray]] that it lacks"
+    assert (
+        error_of(*words) == f"{file}: exists and was not changed: paste the [[tray]] that it lacks, or name a new file"
+    )
     assert file.read_text(encoding="utf-8") == text
 
 
