@@ -50,7 +50,7 @@ class IndexedRecording:
         summary = summary_of(path)
         channels, chunks = summary.channels, summary.chunk_indexes
         if not chunks:
-            channels, chunks = _index_of(path)
+            channels, chunks = index_of(path)
         for channel in channels.values():
             self.reading.add_channel(channel, self.channels)
         in_order = sorted(chunks, key=lambda chunk: chunk.chunk_start_offset)
@@ -82,7 +82,7 @@ class IndexedRecording:
             yield from self.envelopes(chunk)
 
 
-def _index_of(path: Path) -> tuple[dict[int, Channel], list[ChunkIndex]]:
+def index_of(path: Path) -> tuple[dict[int, Channel], list[ChunkIndex]]:
     """The channels and chunks of a file without an index. Only chunks that describe a channel are opened."""
     channels: dict[int, Channel] = {}
     chunks: list[ChunkIndex] = []
@@ -106,10 +106,12 @@ def _index_of(path: Path) -> tuple[dict[int, Channel], list[ChunkIndex]]:
             )
         elif record.opcode == Opcode.MESSAGE_INDEX and chunks:
             chunks[-1].message_index_offsets[struct.unpack_from("<H", record.content)[0]] = record.offset
+            chunks[-1].message_index_length += record.end - record.offset
     for number, chunk in enumerate(chunks):
         held = chunk.message_index_offsets
         if reader.damaged_ranges or number == len(chunks) - 1:
             held.clear()  # some may be missing: `may_hold` then takes it for any channel
+            chunk.message_index_length = 0
         if not (held and held.keys() <= channels.keys()):
             channels |= _channels_in(path, chunk)
     return channels, chunks

@@ -111,9 +111,9 @@ class Recorder(Core):
             self._is_urgent |= bool(item.message.problem)
         elif item.topic in URGENT:
             self._is_urgent = True
-        self._record(item)
         if self._clips and item.topic == "alarm":
-            self._clips.add(item)
+            self._clips.add(item)  # first: the list of clips is on the disk before the alarm is
+        self._record(item)
         return ()
 
     def tick(self, now_ns: int) -> Sequence[Message]:
@@ -199,8 +199,6 @@ class Recorder(Core):
         if self._part:
             self._unflushed_ns, self._flushed_ns = None, self._now_ns
             self._unflushed_bytes, self._is_urgent = 0, False
-            if self._clips:
-                self._clips.save()
             self._attempt(self._part.flush)
         return not self.unsaved()
 
@@ -226,6 +224,8 @@ class Recorder(Core):
     def _begin(self, about: Mapping[str, str]) -> None:
         self._began_ns = min(self._held[0].received_t_ns, self._now_ns) if self._held else self._now_ns
         self._part = self._parts.begin(self._began_ns, self._ledger, about)
+        if self._clips:
+            self._part.before_chunk = self._clips.save
         self._least_bytes = 2 * self._part.size
         self._counts["parts"] += 1
         self._problem = ""
@@ -256,8 +256,6 @@ class Recorder(Core):
         if self._part is None:
             return
         try:
-            if self._clips:
-                self._clips.save()
             for health in self._healths.take_waiting():
                 self._part.add(health)
             self._part.finish(has_ended=has_ended)

@@ -1,6 +1,6 @@
 """Repair of truncated and damaged recordings: every intact message is kept, and the file gets a ledger, index and end.
 
-What a killed recorder left is ended in place, without an index: that needs little room and no copy. Every other repair
+What a killed recorder left is ended in place: that needs little room and no copy. Every other repair
 writes a new file. Nothing is removed before its replacement is on the disk. See docs/reference/recordings.md.
 """
 
@@ -21,6 +21,7 @@ from mcap.writer import MCAP0_MAGIC, Writer
 from fantwin.pipeline.files import sync_folder
 from fantwin.pipeline.recordings.contents import losses_outside_counts
 from fantwin.pipeline.recordings.disk import AtomicAppendFile, not_being_written, refused
+from fantwin.pipeline.recordings.ending import write_ending
 from fantwin.pipeline.recordings.records import (
     ACTIVE_SUFFIX,
     MESSAGE,
@@ -31,7 +32,7 @@ from fantwin.pipeline.recordings.records import (
 )
 from fantwin.pipeline.recordings.scan import NOT_A_RECORD, Contents, scan
 from fantwin.pipeline.recordings.sequence_ledger import LEDGER_NAME, ledger_metadata
-from fantwin.pipeline.recordings.writing import CHUNK_BYTES, free_name, write_short_ending
+from fantwin.pipeline.recordings.writing import CHUNK_BYTES, free_name
 
 ORIGINAL_SUFFIX = ".original"
 _UNFINISHED_SUFFIX = ".recovering"
@@ -88,8 +89,7 @@ def repair_in_place(active: Path) -> Recovery | None:
         if found.is_damaged:
             return _recover(active, None)
         if not found.reader.is_complete:
-            file.cut(found.data_end)
-            write_short_ending(file, _ledger_of(found))
+            write_ending(active, file, found, _ledger_of(found))
         name = _finished_name(active)
         active.rename(name)
         sync_folder(name.parent)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import mimetypes
 import sys
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from functools import cache
 from itertools import chain, count
@@ -17,13 +17,13 @@ from pathlib import Path
 from types import TracebackType
 from typing import IO, NoReturn, Self, cast
 
-from mcap.records import DataEnd, Footer, Metadata
 from mcap.well_known import MessageEncoding, SchemaEncoding
-from mcap.writer import MCAP0_MAGIC, Writer
+from mcap.writer import Writer
 from mcap_protobuf.schema import build_file_descriptor_set
 
 from fantwin.pipeline.files import sync_folder
 from fantwin.pipeline.recordings.disk import AtomicAppendFile, Disk, refused
+from fantwin.pipeline.recordings.ending import write_short_ending
 from fantwin.pipeline.recordings.records import (
     FORMAT_KEY,
     MADE_BY_KEY,
@@ -32,7 +32,6 @@ from fantwin.pipeline.recordings.records import (
     RECORD,
     RecordingError,
     active_path,
-    record_bytes,
     this_program,
 )
 from fantwin.pipeline.recordings.sequence_ledger import BEFORE_NAME, LEDGER_NAME, SequenceLedger, ledger_metadata
@@ -98,6 +97,8 @@ class RecordingWriter:
         self._unsynced: list[Envelope] = []
         """the messages that are written and may not be on the disk yet"""
         self._unsynced_bytes = 0
+        self.before_chunk: Callable[[], object] | None = None
+        """is called before messages are written to the disk"""
         self._overwrite = overwrite
         self._ended = False
         self._schemas: dict[str, int] = {}
@@ -244,6 +245,8 @@ class RecordingWriter:
     def _finish_chunk(self) -> None:
         if not self._filling:
             return
+        if self.before_chunk:
+            self.before_chunk()
         self.stay_in_place()  # before writing: a write to a file that was cut would hide that
         start = self._file.size
         try:
@@ -326,18 +329,6 @@ class RecordingWriter:
             ) from error
         finally:
             self._file.close()
-
-
-def write_short_ending(file: AtomicAppendFile, ledger: Mapping[str, str]) -> None:
-    """End a file that its writer cannot finish, without an index, as far as the disk allows: readers read it in full.
-    It needs little room and no copy."""
-    end = record_bytes(DataEnd(0), Footer(0, 0, 0)) + MCAP0_MAGIC
-    for data in (record_bytes(Metadata(LEDGER_NAME, dict(ledger))) + end, end, b""):
-        with suppress(OSError):
-            file.write(data)
-            break
-    with suppress(OSError):
-        file.sync()
 
 
 @cache

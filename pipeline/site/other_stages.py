@@ -29,9 +29,10 @@ def configured(context: Context, *stages: str) -> Config | None:
 
 
 def expected_stages(context: Context) -> Sequence[StageProcess]:
-    """The processes that the configuration asks for; none if it is not known here."""
-    config = configured(context)
-    return process_list(config) if config else ()
+    """The processes of this one's trays that the configuration asks for; none if it is not known here."""
+    config, trays = configured(context), {tray.name for tray in context.trays}
+    found = process_list(config) if config else ()
+    return [each for each in found if not trays.isdisjoint(each.shard.trays)]
 
 
 def recordings_of(config: Config) -> Sequence[Path]:

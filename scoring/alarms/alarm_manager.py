@@ -171,10 +171,9 @@ class AlarmManager:
         """
         fans = self._listed()
         self._conditions.discard_all(keep_silenced=keep_silenced)
-        self._last_emitted = {}
+        self._last_emitted, self._due_t_ns = {}, {}
         alarms: list[Alarm] = []
         for fan in fans:
-            self._due_t_ns.pop(fan, None)
             fields = _state_fields(self._conditions.alarm_state(fan))
             self._last_emitted[fan] = replace(self._next_message(fan), t_ns=t_ns, **fields)
             alarms.append(self._republished(fan))
@@ -202,9 +201,11 @@ class AlarmManager:
             ValueError, OverflowError: it is not such a snapshot.
         """
         kept = _KEPT.validate_python(stored)
-        named = {*kept.due_t_ns, *kept.last_emitted, *(alarm.fan for alarm in kept.last_emitted.values())}
+        named = {*kept.due_t_ns, *kept.last_emitted}
         if not named <= set(range(self._fans)) or not all(kept.due_t_ns.values()):
             raise ValueError("an alarm of a fan that does not exist, or without times")
+        if any(fan != alarm.fan for fan, alarm in kept.last_emitted.items()):
+            raise ValueError("an alarm of another fan")
         if len(kept.stood) != self._fans:
             raise ValueError(f"a snapshot of alarms, but not of {self._fans} fans")
         self._conditions.restore(kept.conditions)

@@ -167,6 +167,7 @@ class HealthyFans(Saved):
     def begin_again(self, fan: int) -> None:
         """Return a fan to the priors."""
         self.mean[fan], self._has_begun[fan] = 0.0, False
+        self._turns[fan], self._before_rad_s[fan] = UNRELATED, 0.0
         self.covariance[fan] = _prior(self.fans.of(np.array([fan])), self._priors, self._period_s)[0]
 
     def rest(self, bins: int) -> None:

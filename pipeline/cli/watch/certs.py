@@ -180,19 +180,25 @@ def _renew(request: _Request) -> tuple[list[Certificate], list[Path]]:
     if not old:
         raise UserError(f"{request.security.certificate.parent}: no certificates: `fantwin certs issue` makes them")
     return [
-        _make(request, each.role, (*each.hosts, *request.hosts), (each.not_after - each.not_before).days, replace=True)
+        _make(request, each.role, (*each.hosts, *request.hosts), each.not_after - each.not_before, replace=True)
         for each in old
     ], []
 
 
-def _make(request: _Request, role: str, hosts: Iterable[str], days: int = _DAYS, *, replace: bool) -> Certificate:
+def _make(
+    request: _Request, role: str, hosts: Iterable[str], valid: timedelta = timedelta(_DAYS), *, replace: bool
+) -> Certificate:
     security = request.security
     if ROLE_PLACE not in str(security.certificate) and len(request.roles) != 1:
         raise UsageError(f"{security.certificate}: name the one role of this file, or write {ROLE_PLACE} into its path")
     authority = Authority.read(request.authority)
-    if authority.certificate.public_bytes(Encoding.PEM) != (security.ca.read_bytes() if security.ca.exists() else b""):
+    try:
+        known = security.ca.read_bytes()
+    except OSError as error:
+        raise UserError(f"{security.ca}: {error.strerror}: `fantwin certs init` makes it") from error
+    if authority.certificate.public_bytes(Encoding.PEM) != known:
         raise UserError(f"{security.ca} is not the certificate of {request.authority}: use the files of one site")
-    signed, key = authority.issue(role, list(dict.fromkeys(hosts)), timedelta(days=request.days or days))
+    signed, key = authority.issue(role, list(dict.fromkeys(hosts)), timedelta(request.days) if request.days else valid)
     certificate = of_role(security.certificate, role)
     write_pair(certificate, of_role(security.key, role), signed, key, replace=replace)
     return read_certificate(certificate)

@@ -30,7 +30,7 @@ class AlarmClips:
         self._folder, self._list = clip_folder(recording), list_path(recording)
         self._thread: threading.Thread | None = None
         self._results: SimpleQueue[CutResult] = SimpleQueue()
-        self._saved = tracker.clips
+        self._saved: list[Clip] | None = tracker.clips
         self._unwritten = self._undeletable = ""
 
     def add(self, envelope: Envelope) -> None:
@@ -60,11 +60,12 @@ class AlarmClips:
         """Write the list of clips if it has changed: before the alarms that they are of are on the disk."""
         if self.tracker.clips == self._saved:
             return
-        self._saved, self._unwritten = self.tracker.clips, ""
+        clips = self.tracker.clips
+        self._saved, self._unwritten = clips, ""
         try:
-            replace_file(self._list, clips_as_text(self._saved))
+            replace_file(self._list, clips_as_text(clips))
         except OSError as error:
-            self._saved = []
+            self._saved = None
             self._unwritten = f"{self._folder}: cannot be written: {error.strerror}; make room, or correct the folder"
 
     def close(self) -> None:

@@ -58,6 +58,7 @@ class ClipTracker:
         self._retry_ns = self._now_ns = 0
         self._failed = ""
         """why a clip could not be cut; until one is"""
+        self._being_cut: set[str] = set()
         self._not_kept = ""
         """the last clip for which there was no room"""
         self.counts: Counter[str] = Counter()
@@ -106,12 +107,14 @@ class ClipTracker:
             for clip in self._clips.values()
             if clip.is_due and (clip.name in self._ended or clip.until_ns + SETTLED_NS <= now_ns)
         ]
+        self._being_cut = set()
         if now_ns < self._retry_ns or not found:
             return []
         if self.is_full:
             self._drop(*found)
             self._not_kept, self._failed = found[-1].name, ""
             return []
+        self._being_cut = {clip.name for clip in found}
         return found
 
     def cut(self, result: CutResult) -> None:
@@ -166,7 +169,7 @@ class ClipTracker:
 
     def _is_joined(self, clip: Clip, received_t_ns: int, until_ns: int) -> bool:
         """Whether an alarm that is received now belongs to a clip, which then goes on until `until_ns`."""
-        is_running = clip.is_due and clip.name not in self._ended
+        is_running = clip.is_due and clip.name not in self._ended | self._being_cut
         is_short = until_ns - clip.since_ns <= LONGEST_NS + BEFORE_NS + AFTER_NS
         return is_running and is_short and clip.since_ns <= received_t_ns <= clip.until_ns
 

@@ -236,8 +236,9 @@ class HwmonSource(PollingSource):
                 pwm = chip.number(f"pwm{number}")
             except OSError:
                 pwm = None
-            self._before[number] = FoundPwm(mode=automatic if has_enable and mode is None else mode, pwm=pwm)
-            self._keep_modes(chip)
+            found = FoundPwm(mode=automatic if has_enable and mode is None else mode, pwm=pwm)
+            self._keep_modes(chip, self._before | {number: found})
+            self._before[number] = found
         if has_enable and mode != MANUAL:
             _write(chip, enable.name, MANUAL)
 
@@ -249,9 +250,9 @@ class HwmonSource(PollingSource):
             return {}
         return found.pwms if found and (found.chip, found.device) == (chip.name, chip.device) else {}
 
-    def _keep_modes(self, chip: ChipFolder) -> None:
+    def _keep_modes(self, chip: ChipFolder, pwms: dict[int, FoundPwm]) -> None:
         if self._modes_file:
-            found = FoundModes(chip=chip.name, device=chip.device, pwms=self._before)
+            found = FoundModes(chip=chip.name, device=chip.device, pwms=pwms)
             try:
                 replace_file(self._modes_file, found.model_dump_json().encode())
             except OSError as error:

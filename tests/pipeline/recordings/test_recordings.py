@@ -24,7 +24,7 @@ def test_messages_metadata_and_attachments_are_read_back_as_written_each_time_th
     assert len(list(reading)) == len(entries) and reading.damage == ""
     assert [e.topic for e in read_recording(path, topics=("alarm",))] == ["alarm"]
     head = read_metadata(path)
-    assert head.metadata == {"site": "plant", "format": "2", "made_by": f"fantwin {version('fantwin')}"}
+    assert head.metadata == {"site": "plant", "format": "3", "made_by": f"fantwin {version('fantwin')}"}
     assert head.attachments == {"configuration.toml": b"site = 'plant'"}
     assert [(e.key, e.topic, e.received_t_ns) for e in entries] == [
         (RAW_KEY, "raw", 1000),
@@ -56,8 +56,8 @@ def of_tomorrow(tmp_path):
     path = write(tmp_path / "r.mcap", 2)
     stated = b"format\1\0\0\0"
     content = path.read_bytes()
-    assert content.count(stated + b"2") == 1
-    path.write_bytes(content.replace(stated + b"2", stated + b"3"))
+    assert content.count(stated + b"3") == 1
+    path.write_bytes(content.replace(stated + b"3", stated + b"4"))
     return path
 
 
@@ -74,7 +74,7 @@ def of_tomorrow(tmp_path):
     ],
 )
 def test_a_recording_of_an_unknown_format_is_refused_however_it_is_read(of_tomorrow, read):
-    with pytest.raises(RecordingError, match=r"r\.mcap: a recording of format 3; this fantwin reads format 2: update"):
+    with pytest.raises(RecordingError, match=r"r\.mcap: a recording of format 4; this fantwin reads format 3: update"):
         read(of_tomorrow)
 
 
