@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from fantwin.pipeline.bus.identity import checked_credentials
-from fantwin.pipeline.certificates import is_host
+from fantwin.pipeline.certificates import Authority, is_host, write_pair
 from fantwin.pipeline.cli import main as command_line
 from fantwin.pipeline.config.loading import load_config
 from fantwin.pipeline.errors import UserError
@@ -115,6 +115,17 @@ def test_a_renewed_certificate_keeps_its_role_and_hosts_and_has_a_new_key(path):
     assert "press.example" in result[0]["hosts"]
     assert key.read_bytes() != before
     assert mode(key) == 0o600
+
+
+def test_a_renewed_certificate_is_valid_for_as_long_as_the_one_before_and_needs_the_one_of_its_authority(path):
+    certs(path, "init")
+    folder = path.parent / "certs"
+    signed, key = Authority.read(path.parent / "authority").issue("viewer", ["localhost"], timedelta(hours=12))
+    write_pair(folder / "viewer.pem", folder / "viewer.key", signed, key, replace=False)
+    assert made(certs(path, "renew", "viewer", "--json")) == ["viewer"]
+    assert certs(path, "show").exit_code == 0
+    (folder / "ca.pem").unlink()
+    assert str(certs(path, "renew", "viewer").exception).endswith("`fantwin certs init` makes it")
 
 
 def test_each_role_may_have_a_folder_of_its_own(path):

@@ -72,6 +72,16 @@ def test_alarms_of_a_tray_that_come_while_its_clip_runs_share_it_and_those_of_ot
     assert len(of.clips) == 3
 
 
+def test_an_alarm_that_is_heard_late_joins_no_clip_that_is_being_cut():
+    of = tracker()
+    follow(of, alarm(0))
+    (due,) = of.due(T0 + 62 * S)
+    follow(of, alarm(1, 50.0))
+    of.cut(CutResult(due.name, 100))
+    assert [[each.fan for each in clip.alarms] for clip in of.clips] == [[0], [1]]
+    assert [clip.is_due for clip in of.clips] == [False, True]
+
+
 def test_a_fan_that_raises_alarms_for_ever_does_not_make_a_clip_without_an_end():
     of = tracker()
     follow(of, *(alarm(0, at_s) for at_s in range(0, 2000, 50)))

@@ -143,6 +143,20 @@ def test_what_a_killed_process_took_over_is_given_back_by_the_next_one(root: Pat
     assert modes[0].read_text() == "2", "as it was found last"
 
 
+def test_a_pwm_whose_mode_cannot_be_kept_is_not_taken_over(root: Path, tmp_path: Path) -> None:
+    folder = board(root)
+    (tmp_path / "runs").write_text("a file in the place of the folder")
+    made = HwmonSource(
+        HwmonConfig(chip="nct6798", root=root, writable=True),
+        SourceContext(3, "rpm", Path(), "a", run_folder=tmp_path / "runs"),
+    )
+    made.connect()
+    for _ in range(2):
+        with pytest.raises(DeviceError, match="the modes of pwms cannot be kept in run_folder"):
+            made.write((200.0, NAN, NAN))
+    assert [(folder / name).read_text().strip() for name in ("pwm1_enable", "pwm1")] != ["1", "200"]
+
+
 def test_fans_that_share_a_pwm_take_one_command(root: Path) -> None:
     folder = board(root)
     made = connected(root, 3, pwms=[1], writable=True)
