@@ -59,7 +59,7 @@ def test_topics_metadata_twins_and_stages_are_in_the_json_and_in_the_text(tmp_pa
         "rate_hz": 1.0,
     }
     (found,) = whole["files"]
-    assert found["metadata"] == METADATA | {"format": "2"}
+    assert found["metadata"] == METADATA | {"format": "3"}
     assert (found["messages"], found["duration_s"]) == (8, 6.0)
     assert found["size_bytes"] == (tmp_path / "r.mcap").stat().st_size
     assert found["has_configuration"] is True
