@@ -33,7 +33,8 @@ went wrong as one line on standard error.
 This page is made from the commands in the code: `make reference`.
 """
 _EXAMPLE = re.compile(r"^Example: ((?:.+\n)+)", re.MULTILINE)
-_HELP = re.compile(r"^\* `--help`.*\n", re.MULTILINE)
+_OF_ALL = re.compile(r"^\* `--(help|json)`.*\n|^\*\*(Usage|Options)\*\*:\n\n(```console\n.*\n```\n\n)?", re.MULTILINE)
+"""what each command has alike"""
 
 
 def page() -> str:
@@ -50,7 +51,7 @@ def page() -> str:
                 obj=click.commands[name], ctx=typer.Context(click), indent=2, name=name, call_prefix="fantwin"
             )
             examples = _EXAMPLE.sub(lambda found: f"    {' '.join(found[1].split())}\n", about)
-            parts.append(f"{_HELP.sub('', examples).strip()}\n")
+            parts.append(f"{_OF_ALL.sub('', examples).strip()}\n")
     return "\n".join(parts)
 
 
