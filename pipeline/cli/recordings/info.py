@@ -17,6 +17,7 @@ from rich.table import Table
 from fantwin.pipeline.cli.options import JsonOption
 from fantwin.pipeline.cli.printing import table_of
 from fantwin.pipeline.cli.progress import working
+from fantwin.pipeline.config.registry import RECORDER
 from fantwin.pipeline.errors import UsageError
 from fantwin.pipeline.recordings.clips.clip import clip_lines
 from fantwin.pipeline.recordings.contents import contents_of, continuity, losses_of, messages_as_text
@@ -114,6 +115,12 @@ def _streams(parts: Iterable[Contents]) -> list[tuple[StreamId, StreamCounts]]:
     return [(stream, each) for stream, counts in most.items() for each in counts]
 
 
+def _losses(sessions: Iterable[Health]) -> dict[str, int]:
+    """What the stages have lost. What a recorder lacks stands with the topics: the last health of a killed one in its
+    recording is of before its last messages."""
+    return losses(health for health in sessions if health.stage != RECORDER)
+
+
 def as_json(parts: Sequence[Contents], breaks: Sequence[str]) -> dict[str, Any]:
     """The output of --json: each file, and the topics of all files together."""
     together = sum_by_key(_streams(parts))
@@ -121,13 +128,13 @@ def as_json(parts: Sequence[Contents], breaks: Sequence[str]) -> dict[str, Any]:
         "files": [_part_as_json(part) for part in parts],
         "topics": {key: _counts_as_json(counts) for key, counts in together.items()},
         "continuity": list(breaks),
-        "lost": losses(_sessions(parts)),
+        "lost": _losses(_sessions(parts)),
         "refused": refused(_sessions(parts)),
     }
 
 
 def _part_as_json(part: Contents) -> dict[str, Any]:
-    lost = losses(part.sessions)
+    lost = _losses(part.sessions)
     return {
         "file": str(part.path),
         "size_bytes": part.size_bytes,
@@ -184,7 +191,7 @@ def _show(parts: Sequence[Contents], breaks: Iterable[str]) -> None:
         show((line if line == STILL_WRITTEN else f"{line}{advice}" for line in part.damage), "red")
     show(breaks, "red")
     show(refused_lines(refused(_sessions(parts))), "yellow")
-    lost = losses(_sessions(parts))
+    lost = _losses(_sessions(parts))
     if any(lost.values()):
         by_stage = ", ".join(f"{name} {count}" for name, count in lost.items() if count)
         show([f"lost, over all sessions of each stage: {by_stage}"], "red")

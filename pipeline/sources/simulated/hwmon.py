@@ -48,10 +48,18 @@ class _Channel:
     last_pwm: int = HIGHEST_PWM
 
     def write(self, file: str, value: float) -> None:
-        """Replace the file, so that no reader finds half of it; NaN: it is empty."""
+        """Replace the file, so that no reader finds half of it; NaN: it is empty.
+
+        Raises:
+            UserError: the folder cannot be written any more.
+        """
         new = self.folder / "new"
-        new.write_text("\n" if math.isnan(value) else f"{round(value)}\n", encoding="ascii")
-        new.replace(self.folder / file)
+        try:
+            new.write_text("\n" if math.isnan(value) else f"{round(value)}\n", encoding="ascii")
+            new.replace(self.folder / file)
+        except OSError as error:
+            hint = "give each simulation a folder of its own"
+            raise UserError(f"{self.folder}: cannot be written any more: {error.strerror}: {hint}") from error
 
     def read(self, file: str, otherwise: int) -> int:
         """The number that somebody wrote; `otherwise` while that is being written, or is none."""
