@@ -155,7 +155,7 @@ def _part_as_json(part: Contents) -> dict[str, Any]:
                 "status": health.status.name.lower(),
                 "problem": health.problem,
                 "notes": notes_as_json(health),
-                "lost": lost[label(health)],
+                "lost": lost.get(label(health), health.lost),
                 "counters": {counter.name: counter.value for counter in health.counters},
             }
             for health in part.healths
