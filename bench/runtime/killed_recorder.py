@@ -199,9 +199,10 @@ class Kills:
 
 
 def _is_readable(path: Path) -> bool:
-    """By the official reader: checksums must be right, and an index complete; a part that was repaired has none."""
+    """Return whether the official reader finds an index and correct checksums, and reads all messages by the index."""
     with path.open("rb") as file:
         reader = make_reader(file, validate_crcs=True)
         summary = reader.get_summary()
-        messages = sum(1 for _ in reader.iter_messages(log_time_order=False))
-        return summary is None or (summary.statistics is not None and summary.statistics.message_count == messages)
+        if summary is None or summary.statistics is None:
+            return False
+        return summary.statistics.message_count == sum(1 for _ in reader.iter_messages())

@@ -1,7 +1,7 @@
 """A recording read by its index: only the chunks that have messages of the topics asked for.
 
-Messages of a topic of which a recording has few are found so without reading the rest. A file without an index, such as
-one that is still being written, gets one in memory: from the headers of its chunks, of which few are opened.
+Rare messages, such as alarms, are found without reading the rest. A file without an index, such as one that is still
+being written, gets one in memory, from the headers of its chunks.
 """
 
 from __future__ import annotations

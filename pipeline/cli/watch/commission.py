@@ -158,7 +158,7 @@ def _works(settings: Config, chosen: Sequence[TrayConfig], output: Path | None) 
 
 
 def _refuse_what_cannot_end_well(settings: Config, work: TrayWork, option: str) -> None:
-    """Before anything is recorded. option: names another file for its twin."""
+    """Refuse what would fail after the recording. option: names another file for its twin."""
     if work.tray.command_min == work.tray.command_max:
         raise UserError(
             f"{settings.path}: command_min and command_max of tray {work.name} are equal: no twin can be made"
@@ -169,7 +169,7 @@ def _refuse_what_cannot_end_well(settings: Config, work: TrayWork, option: str) 
 
 
 def _refuse_site_that_cannot_end_well(settings: Config, works: Sequence[TrayWork]) -> None:
-    """Before anything is recorded."""
+    """Refuse what would fail after the recordings of all trays."""
     judging = [name for name, row in STAGES.items() if row.needs_twin]
     if missing := [name for name in judging if name not in settings.stages]:
         switched_off = [name for name in missing if name in settings.launcher.without]
