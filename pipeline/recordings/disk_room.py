@@ -14,13 +14,20 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from fantwin.pipeline.recordings.disk import Disk
-from fantwin.pipeline.recordings.parts import LEAST_PART_S, PART_BYTES, PART_S, RecordingParts
-from fantwin.pipeline.recordings.recorder_config import CLIPS_SHARE, PARTS_WITHIN_LIMITS, RecorderConfig
+from fantwin.pipeline.recordings.parts import RecordingParts
+from fantwin.pipeline.recordings.recorder_config import (
+    CLIPS_SHARE,
+    PART_BYTES,
+    PART_S,
+    PARTS_WITHIN_LIMITS,
+    RecorderConfig,
+)
 from fantwin.pipeline.recordings.records import RecordingError
 from fantwin.pipeline.recordings.stored_recordings import Stored, StoredPart, StoredRecordings
 from fantwin.schemas.units import NS_PER_S
 
 DAY_NS = 86_400 * NS_PER_S
+LEAST_PART_S = 1.0
 AGED_S = 3600.0
 """between two parts that are deleted by age alone, unless a part has ended: the clock may be wrong"""
 _LOG = logging.getLogger(__name__)

@@ -113,9 +113,6 @@ def read_parts(
         damage += [reading.damage] if reading.damage else []
 
 
-PART_BYTES, PART_S = 100_000_000, 86_400.0
-"""a new part begins at this size and after this time, and earlier where the limits on the disk are small"""
-LEAST_PART_S = 1.0
 PARTS_SEARCHED = 3
 """for the last messages of a topic"""
 

@@ -13,6 +13,8 @@ from fantwin.schemas.topics import BY_NAME, TOPICS
 
 FLUSH_S, FLUSH_BYTES = 1.0, 64 << 10
 """messages in memory are flushed after this time if they are more than this, or if one of them is urgent"""
+PART_BYTES, PART_S = 100_000_000, 86_400.0
+"""the recorder begins a new file, a part, at this size and after this time, and earlier where the limits are small"""
 PARTS_WITHIN_LIMITS = 8
 """parts within each limit, because only whole parts are deleted"""
 RECORDED = tuple(topic.name for topic in TOPICS if topic.recorded)

@@ -9,12 +9,12 @@ import numpy as np
 from fantwin.twin.each_network import ForEachNetwork, one_after_another
 from fantwin.twin.errors import TwinError
 from fantwin.twin.evaluation.accuracy import evaluation_pieces
+from fantwin.twin.fitting import narx_training
 from fantwin.twin.fitting.cross_validation import choose_prior_std
 from fantwin.twin.fitting.drive_fit import FoundDrive
 from fantwin.twin.fitting.identification import Identification
 from fantwin.twin.fitting.initial_weights import initial_weights
-from fantwin.twin.fitting.narx_training import train_narx
-from fantwin.twin.fitting.training import GRID_PRIOR_STD, data_scaling, train_network
+from fantwin.twin.fitting.training import GRID_PRIOR_STD, MAX_ITERATIONS, data_scaling, train_network
 from fantwin.twin.models.fan_ode import FanOde, NetworkOde
 from fantwin.twin.models.model import Model
 from fantwin.twin.models.network import TanhNetwork
@@ -24,8 +24,6 @@ from fantwin.twin.runs import Array, Run
 
 Trainer = Literal["levenberg-marquardt", "adam"]
 
-DEFAULT_ITERATIONS: dict[Trainer, int] = {"levenberg-marquardt": 120, "adam": 400}
-NARX_ITERATIONS = 100
 SILENT_NETWORK = "the network is not used: free runs with it were no better than those of the physics alone"
 
 
@@ -72,12 +70,12 @@ def fit_physical(request: FitRequest) -> FittedModel:
 
 def fit_narx(request: FitRequest) -> FittedModel:
     """Levenberg-Marquardt on the free run (twin.fitting.narx_training)."""
-    narx, iterations = train_narx(
+    narx, iterations = narx_training.train_narx(
         request.runs,
         request.validation_runs,
         data_scaling(request.runs, request.identification),
         seed=request.seed,
-        max_iterations=request.max_iterations or NARX_ITERATIONS,
+        max_iterations=request.max_iterations or narx_training.MAX_ITERATIONS,
         progress=request.progress,
     )
     return FittedModel(narx, request.identification.parameters, iterations)
@@ -92,9 +90,8 @@ def fit_network_ode(
     """Fit a model whose network has these units and inputs, by the trainer of the request."""
     scaling = data_scaling(request.runs, request.identification)
     untrained = make(TanhNetwork.zero(units, inputs, scaling))
-    limit = request.max_iterations or DEFAULT_ITERATIONS[request.trainer]
     train = _by_adam if request.trainer == "adam" else _by_levenberg_marquardt
-    model, parameters, iterations = train(untrained, request, limit)
+    model, parameters, iterations = train(untrained, request)
     silent = model.has_physics and not np.any(model.theta)
     driven, parameters = _behind(request.drive, model, parameters)
     return FittedModel(
@@ -112,25 +109,28 @@ def _behind(drive: FoundDrive | None, model: FanOde, parameters: Array) -> tuple
     return model.with_drive(drive.drive), np.hstack((parameters, drive.settings))
 
 
-def _by_adam(untrained: NetworkOde, request: FitRequest, limit: int) -> tuple[NetworkOde, Array, int]:
+def _by_adam(untrained: NetworkOde, request: FitRequest) -> tuple[NetworkOde, Array, int]:
     """The published recipe. The physics stay as identified. Raises TwinError for tachos that average."""
     if any(tacho.reach_s > 0.0 for run in request.runs for tacho in run.tacho):
         raise TwinError(
             "trainer 'adam' takes readings for speeds, which a counting tacho's are not; use levenberg-marquardt"
         )
     # torch is needed by this trainer alone, and takes seconds to import.
-    from fantwin.twin.fitting.torch_reference import train_adam  # noqa: PLC0415
+    from fantwin.twin.fitting import torch_reference  # noqa: PLC0415
 
     found = request.identification
     (theta,) = initial_weights(
         untrained, evaluation_pieces(request.runs), found, np.random.default_rng(request.seed), 1
     )
     start = untrained.with_theta(theta)
-    model, iterations = train_adam(start, request.runs, found, max_iterations=limit, progress=request.progress)
+    limit = request.max_iterations or torch_reference.MAX_ITERATIONS
+    model, iterations = torch_reference.train_adam(
+        start, request.runs, found, max_iterations=limit, progress=request.progress
+    )
     return model, found.parameters, iterations
 
 
-def _by_levenberg_marquardt(untrained: NetworkOde, request: FitRequest, limit: int) -> tuple[NetworkOde, Array, int]:
+def _by_levenberg_marquardt(untrained: NetworkOde, request: FitRequest) -> tuple[NetworkOde, Array, int]:
     prior_std = GRID_PRIOR_STD
     if not request.validation_runs:
         prior_std = choose_prior_std(untrained, request.runs, seed=request.seed, progress=request.progress)
@@ -139,7 +139,7 @@ def _by_levenberg_marquardt(untrained: NetworkOde, request: FitRequest, limit: i
         request.runs,
         request.validation_runs,
         request.identification,
-        max_iterations=limit,
+        max_iterations=request.max_iterations or MAX_ITERATIONS,
         seed=request.seed,
         prior_std=prior_std,
         networks=request.networks,

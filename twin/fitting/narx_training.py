@@ -90,6 +90,7 @@ def _low_pass(command: Array, kept: float) -> Array:
     return command[0] + np.asarray(lfilter([0.0, 1.0 - kept], [1.0, -kept], command - command[0]))
 
 
+MAX_ITERATIONS = 100
 MAX_SAMPLES, DRAWN_STRETCHES = 16_000, 16
 PRIOR_PRECISIONS = (1e5, 1e4, 1e3, 1e2, 1e1, 1e0)
 # A weaker prior must lower the error by this share: less is chance, and a strong one is safer on new commands.

@@ -19,7 +19,7 @@ from fantwin.twin.models.physics import LAG
 from fantwin.twin.progress import Progress, unreported
 from fantwin.twin.runs import Array, Run
 
-LEARNING_RATE = 1e-3
+LEARNING_RATE, MAX_ITERATIONS = 1e-3, 400
 
 
 def torch_free_run(

@@ -50,6 +50,7 @@ from fantwin.twin.models.physics import LAG
 from fantwin.twin.progress import Progress, unreported
 from fantwin.twin.runs import Array, Run
 
+MAX_ITERATIONS = 120
 SHORT_STRETCH_TIME_CONSTANTS = 10.0
 STARTS_OF_NETWORK, START_ITERATIONS, START_SAMPLES = 4, 5, 30_000
 MOST_NETWORKS = PLACEMENTS // STARTS_OF_NETWORK
