@@ -4,8 +4,8 @@ import { AlarmsView, HistoryView } from "./alarms.js";
 import { logOut, showLogin } from "./actions.js";
 import { learnClips } from "./clips.js";
 import { element, notice } from "./dom.js";
-import { FanView } from "./fan.js";
-import { address, bytes, FansView } from "./fans.js";
+import { FanView } from "./one_fan.js";
+import { address, bytes, Overview } from "./overview.js";
 import { StagesView } from "./stages.js";
 import { ask, Events, learnWhoIAm, me, Refused } from "./server.js";
 
@@ -20,12 +20,12 @@ const events = new Events({
   fleet: (data) => {
     fleet = data;
     showSummary();
-    if (view instanceof FansView || view instanceof FanView) view.update(fleet);
+    if (view instanceof Overview || view instanceof FanView) view.update(fleet);
     showWhatFansDo();
   },
   alarm: (alarm) => {
     const name = `${alarm.tray}/${alarm.fan}`;
-    if (view instanceof FansView && alarm.active && alarm.presented && !alarms.get(name)?.active) view.raise(indexOf(alarm.tray, alarm.fan));
+    if (view instanceof Overview && alarm.active && alarm.presented && !alarms.get(name)?.active) view.raise(indexOf(alarm.tray, alarm.fan));
     alarms.set(name, alarm);
     showAlarms(alarm);
     showCount();
@@ -130,9 +130,9 @@ function showView() {
   else if (kind === "history") view = new HistoryView();
   else if (kind === "stages") view = new StagesView();
   else if (kind === "fan") view = { root: element("p", {}, `There is no fan ${fan ?? ""} of ${tray ?? ""}. `, element("a", { href: address }, "All fans")) };
-  else view = new FansView(site, new URLSearchParams(filters));
+  else view = new Overview(site, new URLSearchParams(filters));
   content.replaceChildren(view.root);
-  if ((view instanceof FansView || view instanceof FanView) && fleet) view.update(fleet);
+  if ((view instanceof Overview || view instanceof FanView) && fleet) view.update(fleet);
   if (view instanceof StagesView) view.update(stages);
   const current = isFan || !["alarms", "history", "stages"].includes(kind) ? "fans" : kind;
   for (const link of document.querySelectorAll("nav a")) {
@@ -176,7 +176,7 @@ async function start() {
 
 window.addEventListener("hashchange", () => {
   showView();
-  if (!(view instanceof FansView && view.focus(lastFan))) {
+  if (!(view instanceof Overview && view.focus(lastFan))) {
     content.focus({ preventScroll: true });  // it would scroll the first line behind the header
     scrollTo(0, 0);
   }

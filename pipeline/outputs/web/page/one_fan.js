@@ -2,7 +2,7 @@
 
 import { HistoryView, card, rerunLink } from "./alarms.js";
 import { buttons } from "./actions.js";
-import { address, bytes, levelText, NO_LEVEL } from "./fans.js";
+import { address, bytes, levelText, NO_LEVEL } from "./overview.js";
 import { Plot } from "./plot.js";
 import { clock, element, facts, keepFocus } from "./dom.js";
 import { ask, learn } from "./server.js";

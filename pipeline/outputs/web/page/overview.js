@@ -27,7 +27,7 @@ export const levelText = (level) => `${level >= HIGHEST_LEVEL ? "≥ " : ""}${le
 
 export const bytes = (base64) => Uint8Array.from(atob(base64), (letter) => letter.charCodeAt(0));
 
-export class FansView {
+export class Overview {
   // filters: of the address.
   constructor(site, filters) {
     this.site = site;
