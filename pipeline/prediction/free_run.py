@@ -17,6 +17,9 @@ START_SAMPLES = 5
 """a free run starts from the mean of so many readings: one alone has the noise of its tacho"""
 MOST_STEPS = 1000
 """steps of the twin in a sample: 10 s of a twin that was trained at 100 Hz"""
+DIVERGED = 10.0
+"""multiple of the top speed of training beyond which no rotor is: physics that were fitted with a negative drag run
+away at commands above those of training"""
 
 
 @dataclass(frozen=True)
@@ -178,14 +181,14 @@ class FreeRun(ColumnState):
             return nothing, nothing, np.zeros_like(self.running)
         while True:
             speed_rad_s, state = self._run(command[:rows])
-            finite = np.isfinite(speed_rad_s)
-            diverged = self.running & ~(finite.all(axis=0) & np.isfinite(state).all(axis=1))
+            is_possible = np.abs(speed_rad_s) <= DIVERGED * self._twin.card.top_speed_rad_s
+            diverged = self.running & ~(is_possible.all(axis=0) & np.isfinite(state).all(axis=1))
             if rows == 1 or not diverged.any():
                 break
             rows //= 2
         self._state = np.where((self.running & ~diverged)[:, np.newaxis], state, self._state)
         if self._knows_density:
             speed_rad_s = speed_rad_s / self._density
-        reading, half_range = self._reading.update(np.where(self.running & finite, speed_rad_s, np.nan))
+        reading, half_range = self._reading.update(np.where(self.running & is_possible, speed_rad_s, np.nan))
         self.stop(diverged)
         return reading, half_range, diverged

@@ -162,7 +162,7 @@ def twins(tmp_path_factory: pytest.TempPathFactory) -> list[TwinFile]:
         write_twin(folder / "air.onnx", conditions=CONDITIONS),
     )
     counting = physical_twin(FANS, tacho=(Tacho(kind="count", window_s=1.0),))
-    made = [unstable_twin(FANS), twin_with_friction(30.0, FANS), counting]
+    made = [unstable_twin(FANS, np.inf), twin_with_friction(30.0, FANS), counting]
     return [*made, *(TwinFile.load(file, FANS) for file in files)]
 
 

@@ -64,14 +64,14 @@ def twin_with_friction(friction: float, fans: int = 1) -> TwinFile:
     return replace(twin, balance=balance)
 
 
-def unstable_twin(fans: int) -> TwinFile:
-    """The speed of a fan is infinite from the sample after its command exceeds 85."""
+def unstable_twin(fans: int, runs_away_to_rad_s: float) -> TwinFile:
+    """The speed of a fan is this from the sample after its command exceeds 85."""
 
     def advance(state: Floats, command: Floats, period_s: Floats) -> tuple[Floats, Floats]:
         assert np.isfinite(state).all()
         speed, now = np.empty_like(command), state[:, 0]
         for k, wanted in enumerate(command):
-            speed[k], now = now, np.where(wanted > 85, np.inf, 0.9 * now + wanted)
+            speed[k], now = now, np.where(wanted > 85, runs_away_to_rad_s, 0.9 * now + wanted)
         return speed, np.column_stack((now, command[-1]))
 
     return replace(physical_twin(fans), advance_with=lambda _: advance)
