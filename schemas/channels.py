@@ -31,7 +31,8 @@ class Channel:
         name: of its column in messages, tables and payloads, with the unit.
         title: what people call it.
         unit: as people read it.
-        letter: begins its group in a text line of the wire protocol.
+        letter: begins its group in a text line of the wire protocol; one that no other row has, and none of S, C and P,
+            which begin lines.
         lowest, highest: a value beyond them is not plausible, in its unit.
         interpolation: on the grid, `linear` between two samples that have a value; otherwise, and with `hold`, the last
             value counts until the next sample.
@@ -73,7 +74,7 @@ def channel(
 class Measured:
     """What a source may measure beside command and speed; messages that carry it extend this.
 
-    The order is that of the bits in a binary frame of the wire protocol: a new channel comes last.
+    The order is that of the eight bits in a binary frame of the wire protocol: a new channel comes last.
     """
 
     supply_voltage_v: Array = channel("supply voltage", "V", "V", 0.0, 2000.0)
@@ -82,6 +83,8 @@ class Measured:
 
 
 CHANNELS = tuple(Channel(row.name, *row.metadata["channel"]) for row in fields(Measured))
+if len(CHANNELS) > 8 or len({"S", "C", "P"} | {each.letter for each in CHANNELS}) != 3 + len(CHANNELS):
+    raise ValueError("a frame has eight channels at most, each with a letter of its own other than S, C and P")
 SUPPLY_VOLTAGE, CURRENT, TEMPERATURE = "supply_voltage_v", "current_a", "temperature_c"
 """names of the channels that single sources and twins have a rule for"""
 BY_NAME = {each.name: each for each in CHANNELS}

@@ -52,7 +52,7 @@ class StatedTacho:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Raw(Measured):
-    """Samples as the device sent them. A column that the device does not have is empty.
+    """Accepted samples of the source, in rad/s, at their own times. A column that the device does not have is empty.
 
     tachos: what the speeds are, one for all fans or one for each; empty where the source does not state it.
     """

@@ -47,8 +47,8 @@ class Topic:
     """One topic.
 
     Attributes:
-        history: a producer keeps this many of its last messages for consumers that begin, 80 s at 100 Hz, as far as its
-            memory allows (`pipeline.bus.publisher`).
+        history: a producer keeps this many of its last messages for consumers that begin, as far as its memory
+            allows (`pipeline.bus.publisher`).
         largest_bytes: a longer message is refused before it is decoded. The largest that any configuration makes is
             half of it or less (`most_samples`).
     """
@@ -86,10 +86,19 @@ class Topic:
 
 
 CATCH_UP_MESSAGES = 4096
-"""a consumer that begins asks for no more of each stream: 40 s at 100 Hz, enough to replace one that hung"""
+"""a consumer that begins asks for no more of each stream: 3 minutes in blocks of 0.05 s, enough for one that
+replaces another that hung"""
 
 TOPICS: tuple[Topic, ...] = (
-    Topic("raw", Raw, "as the device sends, often 100 Hz", True, 8192, 16 * MIB, "samples as the device sent them"),
+    Topic(
+        "raw",
+        Raw,
+        "as the device sends, often 100 Hz",
+        True,
+        8192,
+        16 * MIB,
+        "accepted samples of the source, at their own times",
+    ),
     Topic(
         "reading",
         PushedSamples,

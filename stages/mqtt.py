@@ -36,7 +36,7 @@ from fantwin.schemas.units import NS_PER_S
 from fantwin.scoring.alarms.alarm_state import is_listed
 
 SETTLED_AFTER_NS = 2 * NS_PER_S
-"""time after the start in which alarms of before are heard again, and nothing is published"""
+"""time after the start in which alarms of before are heard again, and nothing retained is published"""
 KNOWN_AFTER_NS = 10 * NS_PER_S
 """time after the start until a fan of which no alarm was heard has none, and a tray without a score is silent"""
 PERIOD_S = 5.0

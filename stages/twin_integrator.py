@@ -9,7 +9,7 @@ messages that wait together, one. The graph runs once for all fans of a message,
 names a sample within a message as its first, there is one prediction for each twin.
 
 The prediction is a *free run*: it starts from the mean of the first measured speeds and is never corrected by a
-measurement again. It needs commands only, so a missing reading does not disturb it. While no samples arrive, the last
+measurement again. It needs no readings, so a missing one does not disturb it. While no samples arrive, the last
 command is held for half a second; then the free run ends, and a new one starts when samples arrive again. Samples are
 not valid in the first `warm_up_s` of a free run (WARMING_UP), nor in the first `warm_up_s` after a command that was out
 of the twin's range or too small to turn the rotor (OUT_OF_RANGE).

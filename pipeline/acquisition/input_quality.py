@@ -89,7 +89,10 @@ class Plausibility:
         for name, values in reading.measured.items():
             if not values:
                 continue
-            each = BY_NAME[name]
+            each = BY_NAME.get(name)
+            if each is None:
+                self.counts["unknown_channel"] += 1
+                continue
             if each not in self.measured:
                 self.measured.append(each)
             if len(values) == self.limits.fans:

@@ -1,8 +1,8 @@
 """The one loop that every stage runs in: receive, check the sequence, step, stamp, publish, count.
 
 Everything a stage reacts to comes through one bounded inbox: messages from the bus, items from the stage's sources, and
-the arrival and departure of other stages. While the inbox is full, publishers wait. Only a stage that may drop (the
-viewer) discards its oldest items instead, and counts them.
+the arrival and departure of other stages. While the inbox is full, publishers wait. Only a stage that may drop
+(learner, viewer, gateway, opcua, mqtt) discards its oldest items instead, and counts them.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from fantwin.pipeline.runtime.kept_snapshots import KeptForOthers
 from fantwin.pipeline.runtime.publishing import Outputs
 from fantwin.pipeline.runtime.receiving import Receiver
 from fantwin.pipeline.runtime.reports import Reports
-from fantwin.pipeline.runtime.service_manager import Notifier
+from fantwin.pipeline.runtime.service_manager import SignsOfLife
 from fantwin.pipeline.runtime.sessions import Session, Sessions, trays_in_words
 from fantwin.pipeline.runtime.stage import BuiltStage, Stage, StageError
 from fantwin.pipeline.runtime.started_sources import Sources
@@ -127,7 +127,7 @@ class Runner:
             due=self._due,
         )
         self._tracker = self._receiver.tracker
-        self._notifier = Notifier.from_environment()
+        self._signs_of_life = SignsOfLife.from_environment()
         self._ending = Ending(stage.name, config.launcher.watchdog_s)
         self._require_rights()
         self._steps = Steps(
@@ -212,10 +212,10 @@ class Runner:
 
     def _work(self) -> None:
         self._start()
-        self._notifier.ready()
+        self._signs_of_life.ready()
         self._loop(self._should_end, StageStatus.OK)
         self._ending.begin()
-        self._notifier.stopping()
+        self._signs_of_life.stopping()
         self._drain()
 
     def _start(self) -> None:
@@ -260,7 +260,7 @@ class Runner:
                     self._steps.owes_answer = False
                     next_health = now + HEALTH_PERIOD_S
                     reported_lost = self._reports.publish(status).lost
-                self._notifier.at_work(self._health.summary)
+                self._signs_of_life.at_work(self._health.summary)
 
     def _should_end(self) -> bool:
         return self.stop.is_set() or (self.launcher_gone.is_set() and not self._sessions.has_producer())

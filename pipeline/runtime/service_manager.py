@@ -25,7 +25,7 @@ BUILD_LIMIT_S = 600.0
 """how long building a stage may take: the repair of a large recording, or a router that is not there yet"""
 
 
-class Notifier:
+class SignsOfLife:
     """Sends the notices of one process; does nothing where nobody asked for them. Never blocks, never raises."""
 
     def __init__(self, address: str | None, file: Path | None = None) -> None:
@@ -41,7 +41,7 @@ class Notifier:
             self._socket.setblocking(False)
 
     @classmethod
-    def from_environment(cls) -> Notifier:
+    def from_environment(cls) -> SignsOfLife:
         """The notifier that the environment asks for."""
         file = os.environ.get(FILE_VARIABLE)
         return cls(os.environ.get(VARIABLE), Path(file) if file else None)
@@ -79,12 +79,12 @@ class Notifier:
 @contextmanager
 def starting(limit_s: float = BUILD_LIMIT_S) -> Iterator[None]:
     """While the body builds a stage, a thread says that the process is at work, for limit_s at most."""
-    notifier, built = Notifier.from_environment(), threading.Event()
+    signs, built = SignsOfLife.from_environment(), threading.Event()
 
     def repeat() -> None:
         until_s = time.monotonic() + limit_s
         while time.monotonic() < until_s and not built.wait(PERIOD_S):
-            notifier.at_work("starting")
+            signs.at_work("starting")
 
     thread = threading.Thread(target=repeat, name="notices", daemon=True)
     thread.start()

@@ -12,7 +12,7 @@ from fantwin.pipeline.site.request_desk import RequestDesk
 from fantwin.pipeline.site.site_model import SiteModel
 from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.health import Health
-from fantwin.schemas.messages import Alarm, Message, ModelCard, ScorerSnapshot
+from fantwin.schemas.messages import Alarm, Message, ModelCard, Score, ScorerSnapshot
 from fantwin.schemas.units import NS_PER_S
 
 ALL_SAMPLES = 64
@@ -43,6 +43,8 @@ class SiteCore(Core):
         elif isinstance(item, Envelope):
             if self.needs_score(tray.name):
                 self.add_score(item)
+        elif isinstance(item, Score):
+            raise TypeError("a stage of a SiteCore declares undecoded=('score',)")
         elif isinstance(item, ModelCard):
             self._model.add_twin(item)
         elif isinstance(item, ScorerSnapshot):

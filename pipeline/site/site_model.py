@@ -111,7 +111,7 @@ class SiteModel:
 
     def add_score(self, envelope: Envelope, columns: Sequence[str] = COLUMNS, every_s: float = 0.0) -> Score | None:
         """A score of a known tray has arrived; returns it with these columns, or None if it cannot be shown. It is not
-        kept where another was, less than every_s ago."""
+        kept if another one was kept less than every_s ago."""
         try:
             score = decode(Score, envelope.payload, columns)
         except CodecError:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from typing import Literal, TypeAlias
 
+from fantwin.schemas.channels import CHANNELS
 from fantwin.schemas.wire.binary import decode_binary, encode_binary
 from fantwin.schemas.wire.frames import (
     DEVICE_COUNTERS,
@@ -33,7 +34,8 @@ End: TypeAlias = Literal["host", "device"]
 DELIMITERS: dict[Protocol, bytes] = {"binary": b"\0", "text": b"\n"}
 """between frames; one more is no frame and no fault"""
 
-MAX_FRAME_BYTES = 5120  # of both forms, that of 64 fans with all columns in text; bounds the memory of a decoder
+MAX_FRAME_BYTES = 16 * MAX_FANS * (2 + len(CHANNELS))
+"""of both forms: a number takes at most so much of a text line; bounds the memory of a decoder"""
 
 
 def encode(protocol: Protocol, frame: Frame) -> bytes:

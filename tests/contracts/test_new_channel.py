@@ -51,6 +51,7 @@ def test_a_channel_goes_from_a_payload_to_every_output_by_its_row_and_its_field(
     run = subprocess.run(command, cwd=package, env=environment, capture_output=True, text=True, check=False)
     assert run.returncode == 0, run.stderr
     found = json.loads(run.stdout.splitlines()[-1])
+    assert found["line"], "a line of 64 fans with all channels is too long"
     sent = np.arange(200) / 200
     for topic in TOPICS:
         values = found[f"recording, {topic}"]

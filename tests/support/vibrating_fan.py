@@ -24,6 +24,8 @@ from fantwin.pipeline.recordings.writing import RecordingWriter
 from fantwin.pipeline.runtime.stage import Core
 from fantwin.pipeline.sources.json_samples import batches_of, parse_samples
 from fantwin.pipeline.timebase.receipt_times import ReceiptTimes
+from fantwin.schemas import wire
+from fantwin.schemas.channels import CHANNELS
 from fantwin.schemas.codec import decode, encode
 from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Grid, Message, Prediction, Raw, Score
@@ -96,7 +98,11 @@ def main(folder: Path, channel: str) -> None:
     with RecordingWriter(path, metadata) as writer:
         for number, message in enumerate(messages):
             writer.add_message(tray_key(SITE, TRAY, TOPIC_OF[type(message)]), message, START_S * 10**9 + number)
-    found: dict[str, Any] = {}
+    every = tuple(float(np.float32(-1.1754944e-38)) * (1 + fan % 2) for fan in range(wire.MAX_FANS))
+    longest = wire.Sample(2**32 - 1, 2**32 - 1, every, every, {each.name: every for each in CHANNELS})
+    found: dict[str, Any] = {
+        "line": wire.Decoder("text", wire.MAX_FANS).feed(wire.encode("text", longest)) == [longest]
+    }
     for kind in KINDS:
         topic = TOPIC_OF[kind]
         of_topic = [block[channel][:, 1] for block in read_arrays(path, topic) if len(block[channel])]

@@ -17,7 +17,7 @@ from fantwin.pipeline.config.loading import load_config
 from fantwin.pipeline.config.shards import Shard, StageProcess
 from fantwin.pipeline.launch.launcher import Launcher
 from fantwin.pipeline.launch.processes import EXIT_CANNOT_START, Child, HangDetector, Notices
-from fantwin.pipeline.runtime.service_manager import Notifier, starting
+from fantwin.pipeline.runtime.service_manager import SignsOfLife, starting
 from fantwin.pipeline.site.stage_states import START_LIMIT_S
 from tests.support.running_chain import DEMO, eventually
 
@@ -83,7 +83,7 @@ def test_a_stage_that_starts_is_given_longer():
 
 def test_notices_follow_the_protocol_of_systemd():
     notices = Notices()
-    notifier = Notifier(notices.address)
+    notifier = SignsOfLife(notices.address)
     assert not notices.read()
     notifier.at_work("starting")
     assert notices.read()
@@ -111,7 +111,7 @@ def test_row_01_a_stage_that_is_built_for_long_says_that_it_is_at_work(monkeypat
 
 def test_a_launcher_that_reads_nothing_does_not_block_a_stage():
     notices = Notices()
-    notifier = Notifier(notices.address)
+    notifier = SignsOfLife(notices.address)
     for _ in range(2000):
         notifier.ready()
         notifier.at_work("ok")

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from fantwin.pipeline.runtime.service_manager import FILE_VARIABLE, PERIOD_S, VARIABLE, Notifier
+from fantwin.pipeline.runtime.service_manager import FILE_VARIABLE, PERIOD_S, VARIABLE, SignsOfLife
 
 
 @pytest.fixture
@@ -20,7 +20,7 @@ def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_the_file_is_renewed_when_the_main_loop_runs_and_only_then(file, monkeypatch):
     now_s = [100.0]
     monkeypatch.setattr("fantwin.pipeline.runtime.service_manager.time.monotonic", lambda: now_s[0])
-    notifier = Notifier.from_environment()
+    notifier = SignsOfLife.from_environment()
     notifier.ready()
     assert not file.exists()
     notifier.at_work("ok")
@@ -36,4 +36,4 @@ def test_a_file_that_cannot_be_renewed_ends_nothing(file):
     file.mkdir()
     file.rmdir()
     file.parent.rmdir()
-    Notifier.from_environment().at_work("ok")
+    SignsOfLife.from_environment().at_work("ok")

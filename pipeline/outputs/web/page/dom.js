@@ -17,15 +17,15 @@ const two = (number) => String(number).padStart(2, "0");
 export const day = (at) => `${at.getFullYear()}-${two(at.getMonth() + 1)}-${two(at.getDate())}`;
 export const time = (at) => `${two(at.getHours())}:${two(at.getMinutes())}:${two(at.getSeconds())}`;
 
-// Local date and time.
+// Local date and time; a time of 0 is none.
 export function stamp(t_ns) {
+  if (!t_ns) return "";
   const at = new Date(ms(t_ns));
   return `${day(at)} ${time(at)}`;
 }
 
 // Local time, with the date unless it is today.
 export function clock(t_ns) {
-  if (!t_ns) return "";
   const at = new Date(ms(t_ns));
   return at.toDateString() === new Date().toDateString() ? time(at) : stamp(t_ns);
 }

@@ -32,7 +32,7 @@ const events = new Events({
   },
   stages: (data) => { stages = data.stages; if (view instanceof StagesView) view.update(stages); },
   samples: (data) => { if (view instanceof FanView) view.add(data); },
-  missed: () => learnState(),
+  missed: () => { learnState(); view?.begin?.(); },
 });
 let wasConnected = false, wasLost = false;
 

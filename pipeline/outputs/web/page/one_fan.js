@@ -56,8 +56,11 @@ export class FanView {
     const past = await ask(`${this.path}/curves?seconds=${KEPT_S}`);
     await this.learn();
     this.speedUnit = past.speed_unit;
-    if (this.plots.length) {  // the page has more than a server that has just begun
+    if (this.plots.length) {  // what has come in the meantime stays, and what a server that has just begun lacks
+      const had = this.columns, before = had.t_s.findIndex((t_s) => t_s >= (past.t_s[0] ?? Infinity));
+      if (before >= 0) this.columns = Object.fromEntries(this.names.map((name) => [name, had[name].slice(0, before)]));
       this.add(past);
+      this.add(had);
       return;
     }
     const live = this.columns;
