@@ -17,12 +17,12 @@ from contextlib import suppress
 from fantwin.pipeline.config.registry import STAGES
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.learning.healthy_history import HealthyHistory, recorded_raws
-from fantwin.pipeline.learning.learner_core import LearnerConfig, LearnerCore
+from fantwin.pipeline.learning.learner_core import LearnerCore
 from fantwin.pipeline.learning.learning_schedule import LearningProcess
 from fantwin.pipeline.learning.ordinary_operation import OrdinaryOperation
 from fantwin.pipeline.learning.versions import TwinVersions, learning_folder
 from fantwin.pipeline.recordings.metadata import recording_metadata
-from fantwin.pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageError
+from fantwin.pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageConfig, StageError
 from fantwin.schemas.messages import Message, Raw, Request, Score
 
 
@@ -40,7 +40,7 @@ def build(context: Context) -> BuiltStage:
     Raises:
         StageError: the versions or the history cannot be read.
     """
-    tray, config = context.tray, context.config
+    tray = context.tray
     if tray.twin is not None:
         return BuiltStage(_NamesItsTwin())
     folder = learning_folder(context.run_folder, tray.name)
@@ -56,7 +56,7 @@ def build(context: Context) -> BuiltStage:
         raise StageError(str(error)) from error
     assert context.configuration_path
     learning = LearningProcess(context.configuration_path, context.overrides, tray.name, folder / "learn.log")
-    return BuiltStage(LearnerCore(tray.fans, config, history, versions, operation, learning))
+    return BuiltStage(LearnerCore(tray.fans, history, versions, operation, learning))
 
 
 def check(context: Context) -> list[str]:
@@ -70,7 +70,7 @@ def check(context: Context) -> list[str]:
 STAGE = Stage(
     row=STAGES["learner"],
     about="learns the twin of a tray that names none, from its healthy running",
-    config=LearnerConfig,
+    config=StageConfig,
     build=build,
     check=check,
 )

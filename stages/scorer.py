@@ -23,14 +23,12 @@ from fantwin.pipeline.tray_scoring.scorer_config import ScorerConfig
 from fantwin.pipeline.tray_scoring.scorer_core import ScorerCore
 from fantwin.pipeline.tray_scoring.snapshot_store import Elsewhere, SnapshotStore
 from fantwin.schemas.messages import ScorerSnapshot
-from fantwin.schemas.topics import ALL_TRAYS
 
 
 def _kept_by_others(context: Context) -> Elsewhere | None:
     """Access to the snapshots that others keep of a tray; None: they are not asked."""
-    kept, tray, config = context.kept, context.tray.name, context.config
-    asks = config.asks_for_snapshots if config.asks_for_snapshots is not None else context.instance != ALL_TRAYS
-    return (lambda is_patient: kept.of(tray, is_patient=is_patient)) if kept and asks else None
+    kept, tray = context.kept, context.tray.name
+    return (lambda is_patient: kept.of(tray, is_patient=is_patient)) if kept else None
 
 
 def build(context: Context) -> BuiltStage:

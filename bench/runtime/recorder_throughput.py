@@ -19,6 +19,9 @@ from mcap.writer import Writer
 from mcap_protobuf.schema import register_schema
 
 from bench.printing import JsonOption, progress, show
+from fantwin.pipeline.recordings.clips.alarm_clips import AlarmClips
+from fantwin.pipeline.recordings.clips.cutting import ClipCutter
+from fantwin.pipeline.recordings.clips.tracker import ClipTracker
 from fantwin.pipeline.recordings.parts import RecordingParts
 from fantwin.pipeline.recordings.recorder import Recorder
 from fantwin.pipeline.recordings.recorder_config import RecorderConfig
@@ -123,7 +126,9 @@ def _packets(first: int, block: int) -> list[Envelope]:
 
 
 def _ours(path: Path, packets: list[Envelope]) -> None:
-    recorder = Recorder(RecordingParts(path, {}, {}, "bench"), RecorderConfig(min_free_bytes=0), time.time_ns())
+    parts = RecordingParts(path, {}, {}, "bench")
+    clips = AlarmClips(ClipTracker((), most_bytes=0), path, ClipCutter(path, parts.free_bytes).cut)
+    recorder = Recorder(parts, RecorderConfig(), time.time_ns(), clips)
     for number, packet in enumerate(packets):
         recorder.step(packet)
         if number % TICK_EVERY == 0:

@@ -29,7 +29,7 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 from bench.training.published_fan import RATE_HZ, rough_run
 from fantwin.pipeline.config.loading import parse_config
 from fantwin.pipeline.recordings.reading import read_recording
-from fantwin.pipeline.recordings.recorder_config import FLUSH_BYTES, FLUSH_S, SAMPLES, RecorderConfig
+from fantwin.pipeline.recordings.recorder_config import FLUSH_BYTES, FLUSH_S, LONGEST_FLUSH_S, SAMPLES
 from fantwin.pipeline.recordings.writing import RecordingWriter
 from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.messages import ScorerSnapshot
@@ -168,7 +168,7 @@ def size(envelopes: Sequence[Envelope], folder: Path) -> int:
     flushed_ns, unflushed_bytes = START_NS, 0
     with RecordingWriter(path, {}, overwrite=True) as writer:
         for envelope in envelopes:
-            after_s = FLUSH_S if unflushed_bytes >= FLUSH_BYTES else RecorderConfig().flush_interval_s
+            after_s = FLUSH_S if unflushed_bytes >= FLUSH_BYTES else LONGEST_FLUSH_S
             if envelope.received_t_ns - flushed_ns >= after_s * NS_PER_S:
                 writer.flush()
                 flushed_ns, unflushed_bytes = envelope.received_t_ns, 0

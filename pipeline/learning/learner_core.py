@@ -10,16 +10,14 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import partial
 
-from pydantic import Field
-
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.learning.fan_alarms import FanAlarms
 from fantwin.pipeline.learning.healthy_history import HealthyHistory
-from fantwin.pipeline.learning.learning_schedule import LearningProcess, LearningSchedule, Work
+from fantwin.pipeline.learning.learning_schedule import FIRST_S, LearningProcess, LearningSchedule, Work
 from fantwin.pipeline.learning.ordinary_operation import OrdinaryOperation
 from fantwin.pipeline.learning.versions import TwinVersions, Version, VersionList, overlap
 from fantwin.pipeline.recordings.dates import format_utc
-from fantwin.pipeline.runtime.stage import Core, StageConfig
+from fantwin.pipeline.runtime.stage import Core
 from fantwin.schemas.enums import Action
 from fantwin.schemas.messages import Message, NewTwin, Raw, Request, Score
 from fantwin.schemas.units import NS_PER_S
@@ -32,19 +30,12 @@ AHEAD_NS = 60 * NS_PER_S
 """largest lead of the history over the samples"""
 
 
-class LearnerConfig(StageConfig):
-    """Section `[learner]`, for trays that name no twin."""
-
-    first_minutes: float = Field(default=10.0, ge=1.0, description="healthy running before the first version")
-
-
 class LearnerCore(Core):
     """The learner of one tray."""
 
     def __init__(
         self,
         fans: int,
-        config: LearnerConfig,
         history: HealthyHistory,
         versions: TwinVersions,
         operation: OrdinaryOperation,
@@ -52,7 +43,6 @@ class LearnerCore(Core):
     ) -> None:
         """operation: what the fans have done in the history. learning: makes versions."""
         self._fans = fans
-        self._config = config
         self._history = history
         self._versions = versions
         self._operation = operation
@@ -66,7 +56,7 @@ class LearnerCore(Core):
         """the versions when they were last read"""
         self._in_force: Version | None = None
         """the one that was published"""
-        self._schedule = LearningSchedule(history, operation, config.first_minutes)
+        self._schedule = LearningSchedule(history, operation)
         self._problems: dict[str, str] = {}
         """problems with the versions, by what was done with them"""
 
@@ -265,7 +255,7 @@ class LearnerCore(Core):
         minutes = self._history.seconds / 60.0
         missing = self._operation.missing()
         lacks = f"; not moved enough yet: {'; '.join(missing)}; {self._operation.how_to_move}" if missing else ""
-        needed = f"{self._config.first_minutes:g} needed"
+        needed = f"{FIRST_S / 60.0:g} needed"
         return f"no twin yet, nothing is judged; {minutes:.0f} min recorded ({needed}){lacks}"
 
     def _next_version(self) -> str:

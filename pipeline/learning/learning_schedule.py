@@ -106,6 +106,8 @@ class LearningProcess:
 
 Work: TypeAlias = Literal["version", "check"]
 
+FIRST_S = 600.0
+"""of healthy running before the first version: a shorter one shows too little of slow changes, such as of the air"""
 CHECK_AFTER_S = 24 * 3600.0
 """of healthy running between two checks of the fans against the reference; of all running if much was near alarms"""
 COMMISSIONED_CHECK_S = 4000.0
@@ -136,12 +138,10 @@ class _Failure:
 class LearningSchedule:
     """The schedule of one tray."""
 
-    def __init__(self, history: HealthyHistory, operation: OrdinaryOperation, first_minutes: float) -> None:
-        """operation: what the fans have done in the history. first_minutes: of healthy running, for the first
-        version."""
+    def __init__(self, history: HealthyHistory, operation: OrdinaryOperation) -> None:
+        """operation: what the fans have done in the history."""
         self._history = history
         self._operation = operation
-        self._first_s = 60.0 * first_minutes
         self._started: Work = "version"
         self._listed = VersionList()
         """when that was started"""
@@ -208,10 +208,10 @@ class LearningSchedule:
         """As `version_wait_s`, but not above 0 where a version is due, and without failures."""
         since = self._history.seconds_since
         if not listed.versions:
-            return None if self._operation.missing() else self._first_s - self._history.seconds
+            return None if self._operation.missing() else FIRST_S - self._history.seconds
         last = listed.versions[-1]
         if listed.is_tainted:
-            return self._first_s - self._history.seconds
+            return FIRST_S - self._history.seconds
         if listed.commissioned_t_ns > last.made_t_ns:
             return AFTER_COMMISSIONING_S - since(listed.commissioned_t_ns)
         return None if listed.waiting else min(last.learned_s, KEPT_S) - since(last.made_t_ns)

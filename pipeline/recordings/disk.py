@@ -11,6 +11,8 @@ from pathlib import Path
 
 from fantwin.pipeline.recordings.records import RecordingError
 
+LEAST_FREE_BYTES, LEAST_FREE_SHARE = 100_000_000, 1 / 8
+"""space to leave free on a disk for other programs, and of a small disk this share of it"""
 _COPY_BYTES = 1 << 20
 _MAY_PASS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.ENODEV, errno.ENXIO, errno.EROFS, errno.ESTALE)
 
@@ -23,6 +25,11 @@ def refused(what: str, error: OSError, advice: str) -> RecordingError:
     """An error of the operating system as a RecordingError of one line; a DiskError if it may pass."""
     kind = DiskError if error.errno in _MAY_PASS else RecordingError
     return kind(f"{what}: {error.strerror}; {advice}")
+
+
+def least_free_bytes(disk_bytes: int) -> int:
+    """Space to leave free on a disk of this size."""
+    return round(min(LEAST_FREE_BYTES, LEAST_FREE_SHARE * disk_bytes))
 
 
 class AtomicAppendFile:

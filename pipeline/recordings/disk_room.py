@@ -13,7 +13,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from fantwin.pipeline.recordings.disk import Disk
+from fantwin.pipeline.recordings.disk import Disk, least_free_bytes
 from fantwin.pipeline.recordings.parts import RecordingParts
 from fantwin.pipeline.recordings.recorder_config import (
     CLIPS_SHARE,
@@ -93,25 +93,24 @@ class DiskRoom:
         Raises:
             DiskError: the disk is gone, or its file system does not say its size.
         """
-        wanted = self._config.min_free_bytes + more_bytes
+        wanted = least_free_bytes(self._parts.disk_bytes()) + more_bytes
         free = self._parts.free_bytes()
         if free >= wanted:
             self._spared = None
             return ""
-        self._parts.disk_bytes()  # raises if the file system does not say its size: nothing is free there either
         self.problem = ""
         try:
             parts = self._look()
             if len(parts) == 1:
                 self._spared = parts[0].path
             if parts and parts[0].path != self._spared:
-                self._delete(parts[0], "the disk runs short (recorder.min_free_bytes)")
+                self._delete(parts[0], "the disk runs short")
                 return ""
         except RecordingError as error:
             self._report(error)
         return (
-            f"{free / 1e6:,.1f} MB are free on the disk, but {wanted / 1e6:,.1f} MB are required "
-            f"(recorder.min_free_bytes), and {self.problem or 'there is no older recording to delete: make room'}"
+            f"{free / 1e6:,.1f} MB are free on the disk, but {wanted / 1e6:,.1f} MB are required, and "
+            f"{self.problem or 'there is no older recording to delete: make room'}"
         )
 
     def notes(self) -> list[str]:

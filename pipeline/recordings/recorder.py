@@ -13,7 +13,7 @@ from fantwin.pipeline.recordings.interference import Interference
 from fantwin.pipeline.recordings.parts import RecordingParts
 from fantwin.pipeline.recordings.reading import RecordingError
 from fantwin.pipeline.recordings.recorded_healths import RecordedHealths
-from fantwin.pipeline.recordings.recorder_config import FLUSH_BYTES, FLUSH_S, RecorderConfig
+from fantwin.pipeline.recordings.recorder_config import FLUSH_BYTES, FLUSH_S, LONGEST_FLUSH_S, RecorderConfig
 from fantwin.pipeline.recordings.sequence_ledger import SequenceLedger
 from fantwin.pipeline.recordings.writing import RecordingWriter
 from fantwin.pipeline.runtime.stage import Core
@@ -49,19 +49,16 @@ class Recorder(Core):
         parts: RecordingParts,
         config: RecorderConfig,
         now_ns: int,
+        clips: AlarmClips,
         left_out: Collection[str] = (),
-        clips: AlarmClips | None = None,
     ) -> None:
         """Begin the first part, at `now_ns`. If the disk is full or gone, wait for it. left_out: topics that are left
-        out on purpose. clips: of alarms; None: no clips are kept.
+        out on purpose.
 
         Raises:
             RecordingError: nothing can be recorded there.
         """
         self._parts = parts
-        self._config = config
-        self._flush_ns = round(config.flush_interval_s * NS_PER_S)
-        self._soon_ns = min(self._flush_ns, round(FLUSH_S * NS_PER_S))
         self._clips = clips
         self._room = DiskRoom(parts, config)
         self._part: RecordingWriter | None = None
@@ -111,7 +108,7 @@ class Recorder(Core):
             self._is_urgent |= bool(item.message.problem)
         elif item.topic in URGENT:
             self._is_urgent = True
-        if self._clips and item.topic == "alarm":
+        if item.topic == "alarm":
             self._clips.add(item)  # first: the list of clips is on the disk before the alarm is
         self._record(item)
         return ()
@@ -122,7 +119,7 @@ class Recorder(Core):
             self._checked_ns = self._began_ns = self._limited_ns = now_ns
             self._paused_ns = min(self._paused_ns, now_ns)
             self._interference.clock_set_back(now_ns)
-            self._flushed_ns = now_ns - self._flush_ns
+            self._flushed_ns = now_ns - round(LONGEST_FLUSH_S * NS_PER_S)
             self._unflushed_ns = None if self._unflushed_ns is None else self._flushed_ns  # due at once
         self._now_ns = now_ns
         if self._part and self._is_flush_due():
@@ -140,8 +137,7 @@ class Recorder(Core):
             self._keep_limits(has_ended_part=True)
             if not self._problem:
                 self._attempt(lambda: self._begin({}))
-        if self._clips:
-            self._clips.tick(now_ns, self._flush)
+        self._clips.tick(now_ns, self._flush)
         return ()
 
     def close(self) -> Sequence[Message]:
@@ -151,8 +147,7 @@ class Recorder(Core):
             self._resume()
             self._attempt(lambda: self._end_part(has_ended=True))
         self._counts["lost_unwritten"] += len(self._take_held())
-        if self._clips:
-            self._clips.close()
+        self._clips.close()
         return ()
 
     def abort(self) -> None:
@@ -169,15 +164,14 @@ class Recorder(Core):
         file was deleted, parts, and files that were restored."""
         recorded = self._recorded + (self._part.written if self._part else Counter())
         written = {f"recorded_{topic}": count for topic, count in recorded.items()}
-        of_clips = self._clips.tracker.counts if self._clips else {}
+        of_clips = self._clips.tracker.counts
         return {**written, **self._counts, **self._room.counts, **self._interference.counts, **of_clips}
 
     def notes(self) -> Sequence[str]:
         """The space and days that recordings take of their limits, and the topics that are left out on purpose."""
         left_out = ", ".join(self._ledger.left_out)
         of_topics = [f"not recorded: {left_out} (recorder.topics)"] if left_out else []
-        of_clips = self._clips.notes() if self._clips else []
-        return [*self._room.notes(), *of_clips, *of_topics]
+        return [*self._room.notes(), *self._clips.notes(), *of_topics]
 
     def unsaved(self) -> Sequence[Envelope]:
         """Messages that are not flushed to the disk yet."""
@@ -186,8 +180,7 @@ class Recorder(Core):
     def problem(self) -> str:
         """Why nothing is recorded now, what another program did to the file, and why limits are not kept; empty if all
         is well."""
-        of_clips = self._clips.problem() if self._clips else ""
-        others = self._interference.problem(self._now_ns), self._room.problem, of_clips
+        others = self._interference.problem(self._now_ns), self._room.problem, self._clips.problem()
         return self._problem or "; ".join(filter(None, others))
 
     def _was_recorded(self, item: Envelope) -> bool:
@@ -224,8 +217,7 @@ class Recorder(Core):
     def _begin(self, about: Mapping[str, str]) -> None:
         self._began_ns = min(self._held[0].received_t_ns, self._now_ns) if self._held else self._now_ns
         self._part = self._parts.begin(self._began_ns, self._ledger, about)
-        if self._clips:
-            self._part.before_chunk = self._clips.save
+        self._part.before_chunk = self._clips.save
         self._least_bytes = 2 * self._part.size
         self._counts["parts"] += 1
         self._problem = ""
@@ -236,7 +228,7 @@ class Recorder(Core):
         """Return whether a message would be unflushed for too long at the next tick; not at every tick behind a
         backlog."""
         is_soon = self._is_urgent or self._unflushed_bytes >= FLUSH_BYTES
-        flush_ns = self._soon_ns if is_soon else self._flush_ns
+        flush_ns = (FLUSH_S if is_soon else LONGEST_FLUSH_S) * NS_PER_S
         return (
             self._unflushed_ns is not None
             and self._now_ns - self._unflushed_ns >= flush_ns - TICK_NS

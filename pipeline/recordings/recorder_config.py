@@ -15,6 +15,9 @@ FLUSH_S, FLUSH_BYTES = 1.0, 64 << 10
 """messages in memory are flushed after this time if they are more than this, or if one of them is urgent"""
 PART_BYTES, PART_S = 100_000_000, 86_400.0
 """the recorder begins a new file, a part, at this size and after this time, and earlier where the limits are small"""
+LONGEST_FLUSH_S = 120.0
+"""all others are flushed after this time: a crash of the machine loses at most this much; more flushes wear a memory
+card"""
 PARTS_WITHIN_LIMITS = 8
 """parts within each limit, because only whole parts are deleted"""
 RECORDED = tuple(topic.name for topic in TOPICS if topic.recorded)
@@ -38,12 +41,6 @@ class RecorderConfig(StageConfig):
         description="relative to run_folder; its parts are NAME.mcap, NAME-2.mcap and so on, of a shard "
         "SHARD.NAME.mcap",
     )
-    flush_interval_s: float = Field(
-        default=120.0,
-        gt=0,
-        description="longest time between flushes to the disk; a crash of the machine loses at most this much. A "
-        f"flush comes after {FLUSH_S:g} s if {FLUSH_BYTES >> 10} KiB, an alarm, a request, a twin or a problem waits",
-    )
     keep_days: float = Field(
         default=14.0, ge=0, description="older recordings are deleted; 0: none is deleted because of its age"
     )
@@ -54,14 +51,6 @@ class RecorderConfig(StageConfig):
         description="most space for all recordings and clips of the folder, as a share of the disk; the oldest are "
         "deleted beyond it",
     )
-    min_free_bytes: int = Field(
-        default=100_000_000,
-        ge=0,
-        description="free space to leave on the disk; below it the oldest recordings are deleted, and recording pauses "
-        "if that is not enough",
-    )
-
-    clips: bool = Field(default=True, description="keep a clip of each alarm, in the folder clips beside the recording")
 
     @field_validator("topics")
     @classmethod

@@ -14,6 +14,7 @@ from fantwin.pipeline.runtime.kept_snapshots import KeptSnapshots, keeps_snapsho
 from fantwin.pipeline.runtime.second_owner import refuse_second
 from fantwin.pipeline.runtime.sessions import Session
 from fantwin.pipeline.runtime.stage import BuiltStage, Context, Kept, Stage
+from fantwin.schemas.topics import ALL_TRAYS
 
 
 def build_and_join(
@@ -84,7 +85,9 @@ def abort(parts: dict[str, BuiltStage]) -> None:
 def _context_of(
     stage: Stage, config: Config, shard: Shard, session: Session, kept: Kept, is_replayed: Callable[[], bool]
 ) -> Context:
-    """What a process of a stage is built from. kept: what others keep of its state."""
+    """What a process of a stage is built from. kept: what others keep of its state, which counts where it may have run
+    on another host before."""
+    may_move = shard.name != ALL_TRAYS or config.bus.mode == "client"
     return Context(
         site=config.site,
         trays=tuple(map(config.tray, shard.trays)),
@@ -96,7 +99,7 @@ def _context_of(
         producer=session.producer,
         shard_number=shard.number,
         snapshot_folder=config.run_folder,
-        kept=kept,
+        kept=kept if may_move else None,
         is_replayed=is_replayed,
         configuration_path=config.path,
         configuration_text=config.text,

@@ -20,7 +20,7 @@ from fantwin.schemas.units import NS_PER_S
 
 CONSUMED = "consumed"
 PERIOD_NS = 120 * NS_PER_S
-"""equal to the default `flush_interval_s` of the recorder"""
+"""equal to the longest time between two flushes of the recorder"""
 
 
 @dataclass

@@ -43,7 +43,6 @@ class Scenario:
         run: does it to a site; returns what was seen.
         needs_own_site: it leaves traces that others must not see.
         needs_small_disk: the site's files lie on a disk of `SMALL_DISK_BYTES`, which only root may mount.
-        settings: of the site, `key=value`.
     """
 
     name: str
@@ -51,7 +50,6 @@ class Scenario:
     run: Callable[[ScratchSite], str]
     needs_own_site: bool = False
     needs_small_disk: bool = False
-    settings: tuple[str, ...] = ()
 
 
 def _require(condition: object, otherwise: str) -> None:
@@ -224,7 +222,6 @@ SCENARIOS = (
         _full_disk,
         needs_own_site=True,
         needs_small_disk=True,
-        settings=("recorder.min_free_bytes=8000000",),
     ),
     Scenario(
         "clock-back",

@@ -76,8 +76,8 @@ class DisturbedLine(PseudoTerminal):
 class ScratchSite:
     """Runs from entering to leaving its context; all its processes have ended after that."""
 
-    def __init__(self, folder: Path, device: Device, *settings: str) -> None:
-        """folder: for its files, empty but for `runs`. device: of `FANS` fans. settings: overrides, `key=value`."""
+    def __init__(self, folder: Path, device: Device) -> None:
+        """folder: for its files, empty but for `runs`. device: of `FANS` fans."""
         self.folder = folder
         self.run_folder = folder / "runs"
         """what the stages write"""
@@ -86,7 +86,6 @@ class ScratchSite:
             *(f"run_folder={json.dumps(str(self.run_folder))}", f"tray.0.port={json.dumps(str(folder / 'tray'))}"),
             f"bus.endpoint='tcp/127.0.0.1:{free_port()}'",
             "launcher.stages=" + json.dumps([stage.split("/")[0] for stage in STAGES]),
-            *settings,
         )
         self.line = DisturbedLine(folder / "tray")
         self._unplugged = threading.Event()

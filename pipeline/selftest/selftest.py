@@ -41,7 +41,7 @@ def run_scenarios(folder: Path, scenarios: Sequence[Scenario], device: Callable[
             if not is_there:
                 yield Row(group[0].name, group[0].promise, "not run: only root may mount a small disk", kept=None)
                 continue
-            with ScratchSite(place, device(), *(each for scenario in group for each in scenario.settings)) as site:
+            with ScratchSite(place, device()) as site:
                 for scenario in group:
                     yield run_scenario(site, scenario)
                 yield account(site, ", ".join(scenario.name for scenario in group))

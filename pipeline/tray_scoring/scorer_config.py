@@ -25,9 +25,3 @@ class ScorerConfig(StageConfig):
         gt=0,
         description="share of the speed: a fault that takes at least this much is an alarm, a smaller one a warning",
     )
-    asks_for_snapshots: bool | None = Field(
-        default=None,
-        description="whether it continues from the snapshot that a recorder keeps, where that is newer than its own "
-        "file, as on another host; with false and without the file, everything starts from the beginning; default: "
-        "true for one of several shards, else false",
-    )

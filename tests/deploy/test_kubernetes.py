@@ -115,7 +115,6 @@ def test_the_pods_of_a_stage_share_the_trays_and_keep_what_must_survive_them(sta
             found = parsed([word.replace("$(SHARD)", str(number)) for word in pod["args"]])
             assert (found["only"], found["shard"]) == (stage, f"{number}/3")
             assert {"bus.mode=client", "bus.endpoint=tls/plant-router:7447"} <= set(found["overrides"])
-        assert ("--set=scorer.asks_for_snapshots=true" in pod["args"]) == (stage == "scorer")
         claims = [each["metadata"]["name"] for each in spec.get("volumeClaimTemplates", ())]
         volumes = [each["name"] for each in spec["template"]["spec"]["volumes"]]
         is_kept = bool(MANY[stage]["storage"])

@@ -14,11 +14,10 @@ from hypothesis import strategies as st
 
 from fantwin.pipeline.config.loading import parse_config
 from fantwin.pipeline.config.settings import ConfigError, TrayConfig
-from fantwin.pipeline.recordings import disk_room
+from fantwin.pipeline.recordings import disk, disk_room
 from fantwin.pipeline.recordings.contents import contents_of
 from fantwin.pipeline.recordings.reading import read_metadata, read_recording
 from fantwin.pipeline.recordings.recorder import Recorder
-from fantwin.pipeline.recordings.recorder_config import RecorderConfig
 from fantwin.pipeline.recordings.scan import scan
 from fantwin.pipeline.runtime.stage import Context, StageError
 from fantwin.schemas.codec import encode
@@ -92,17 +91,25 @@ def test_configuration_twin_and_keys_of_the_command_line_are_in_the_recording(tm
     assert "twin.onnx: the twin is not in the recording: No such file" in caplog.text
 
 
-def test_a_path_that_cannot_be_written_is_refused_at_the_start(tmp_path):
+def test_a_path_that_cannot_be_written_is_refused_at_the_start(tmp_path, monkeypatch):
     (tmp_path / "runs").touch()
     with pytest.raises(StageError, match=r"recording\.mcap: cannot be written: .*; name another .*\(recorder\.file\)"):
         STAGE.build(context(tmp_path))
-    (problem,) = STAGE.check(context(tmp_path / "other", min_free_bytes=1 << 60))
+    monkeypatch.setattr(disk, "LEAST_FREE_BYTES", 1 << 60)
+    monkeypatch.setattr(disk, "LEAST_FREE_SHARE", 1.0)
+    (problem,) = STAGE.check(context(tmp_path / "other"))
     assert "nothing is recorded below" in problem
 
 
 TICK_NS = SECOND_NS // 20
 
 
+@pytest.fixture
+def flushing_each_second(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("fantwin.pipeline.recordings.recorder.LONGEST_FLUSH_S", 1.0)
+
+
+@pytest.mark.usefixtures("flushing_each_second")
 def test_every_message_is_on_the_disk_a_second_after_it_was_received_and_not_at_every_tick():
     disk = Disk()
     core = recorder(disk)
@@ -118,6 +125,7 @@ def test_every_message_is_on_the_disk_a_second_after_it_was_received_and_not_at_
     assert disk.parts[0].flushes == 18
 
 
+@pytest.mark.usefixtures("flushing_each_second")
 def test_after_a_clock_is_set_back_flushes_disk_checks_and_parts_continue(monkeypatch):
     monkeypatch.setattr(disk_room, "PART_S", 60.0)
     disk = Disk()
@@ -144,6 +152,7 @@ def unsaved(core: Recorder) -> list[int]:
     return [each.message.header.sequence for each in core.unsaved()]
 
 
+@pytest.mark.usefixtures("flushing_each_second")
 def test_messages_that_come_while_the_disk_refuses_are_kept_reported_as_unsaved_and_recorded_later():
     disk = Disk()
     core = recorder(disk)
@@ -185,6 +194,7 @@ def test_the_part_after_a_pause_states_the_gap():
     assert shown["lost_in_pause"] == "0"
 
 
+@pytest.mark.usefixtures("flushing_each_second")
 def test_a_pause_that_exceeds_memory_loses_the_oldest_messages_and_counts_them(monkeypatch):
     monkeypatch.setattr("fantwin.pipeline.recordings.recorder.HELD_BYTES", 10 * len(encode(raw(100))))
     disk = Disk()
@@ -270,7 +280,7 @@ def test_raw_samples_are_recorded_and_others_only_if_they_are_chosen():
 
 def test_a_slow_line_is_flushed_every_two_minutes_what_happens_on_it_at_once_and_what_fills_memory_each_second():
     disk = Disk()
-    core = Recorder(disk, RecorderConfig(), NOW_NS)
+    core = recorder(disk)
     flushed_at: list[int] = []
     for second in range(1, 181):
         now_ns = NOW_NS + second * SECOND_NS
@@ -290,7 +300,7 @@ def test_a_slow_line_is_flushed_every_two_minutes_what_happens_on_it_at_once_and
 
 
 def test_of_healths_those_that_report_something_new_are_recorded_and_no_other_is_missing(tmp_path):
-    run = context(tmp_path, flush_interval_s=60)
+    run = context(tmp_path)
     core = STAGE.build(run).core
     start_ns = run.started_t_ns
     for second in range(1000):

@@ -59,7 +59,7 @@ def clips_of(monkeypatch: pytest.MonkeyPatch) -> Callable[..., AlarmClips]:
         for name, seconds in (("BEFORE_NS", 0.5), ("AFTER_NS", after_s), ("SETTLED_NS", 0.3)):
             monkeypatch.setattr(tracker, name, round(seconds * SECOND_NS))
         of_recording = ClipTracker(clips_in(list_path(recording)), most_bytes=0)
-        return AlarmClips(of_recording, recording, ClipCutter(recording, lambda: FREE, min_free_bytes=1000).cut)
+        return AlarmClips(of_recording, recording, ClipCutter(recording, lambda: FREE, least_free_bytes=1000).cut)
 
     return make
 
@@ -68,7 +68,7 @@ def with_cutter(disk: Disk, folder: Path, **config: Any) -> tuple[Recorder, Alar
     """A recorder whose clips are cut by a stand-in."""
     cutter = Cutter()
     clips = AlarmClips(ClipTracker((), 0, kept_s=14 * 86_400.0), folder / "recording.mcap", cutter.cut)
-    return Recorder(disk, RecorderConfig(**config), NOW_NS, clips=clips), clips, cutter
+    return Recorder(disk, RecorderConfig(**config), NOW_NS, clips), clips, cutter
 
 
 def tick_until_cut(core: Recorder, clips: AlarmClips, now_ns: int) -> None:
@@ -109,7 +109,7 @@ def test_a_clip_that_was_due_at_the_end_of_a_recorder_is_cut_by_the_next_one(cha
     assert not kept_clips(tmp_path / "clips")
     (due,) = clips_in(list_path(recording))
     assert due.is_due
-    core = Recorder(RecordingParts(recording, {}, {}, "s2"), RecorderConfig(), NOW_NS, clips=clips_of(recording))
+    core = Recorder(RecordingParts(recording, {}, {}, "s2"), RecorderConfig(), NOW_NS, clips_of(recording))
     core.tick(due.until_ns + SECOND_NS)
     core.close()
     (clip,) = kept_clips(tmp_path / "clips")

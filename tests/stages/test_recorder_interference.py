@@ -24,7 +24,7 @@ class Run:
     """A recorder in a folder, which gets ten messages a second."""
 
     def __init__(self, folder: Path, **config) -> None:
-        core = STAGE.build(context(folder, min_free_bytes=0, **config)).core
+        core = STAGE.build(context(folder, **config)).core
         assert isinstance(core, Recorder)
         self.core, self.folder = core, folder / "runs"
         self.active = self.folder / "recording.mcap.active"
@@ -83,6 +83,7 @@ def test_row_03_the_file_that_replaced_a_recording_is_left_alone(tmp_path, monke
 
 @pytest.mark.parametrize("how", ["deleted", "cut"])
 def test_row_03_what_cannot_be_restored_is_lost_and_counted(tmp_path, monkeypatch, how):
+    monkeypatch.setattr("fantwin.pipeline.recordings.recorder.LONGEST_FLUSH_S", 1.0)
     run = Run(tmp_path)
     run.seconds(3)
 

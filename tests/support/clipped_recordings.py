@@ -18,6 +18,7 @@ from fantwin.pipeline.recordings.recorder_config import RecorderConfig
 from fantwin.schemas.codec import encode
 from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.messages import Alarm
+from tests.support.stub_disk import uncut_clips
 
 S = 1_000_000_000
 
@@ -35,7 +36,9 @@ def record(
     metadata = {**head.metadata, **({"left_out": ",".join(leaves_out)} if leaves_out else {})}
     parts = RecordingParts(recording, metadata, head.attachments, session="s1")
     envelopes = [each for each in read_recording(source) if each.topic not in leaves_out]
-    core = Recorder(parts, RecorderConfig(**config), envelopes[0].received_t_ns, leaves_out, clips=clips)
+    core = Recorder(
+        parts, RecorderConfig(**config), envelopes[0].received_t_ns, clips or uncut_clips(recording), leaves_out
+    )
     ticked_ns = 0
     with patch.object(disk_room, "PART_S", part_s):
         for envelope in envelopes:

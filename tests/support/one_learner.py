@@ -8,7 +8,7 @@ import numpy as np
 
 from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.learning.healthy_history import HealthyHistory, healthy_recordings, recordings_near_alarms
-from fantwin.pipeline.learning.learner_core import LearnerConfig, LearnerCore
+from fantwin.pipeline.learning.learner_core import LearnerCore
 from fantwin.pipeline.learning.learning_schedule import LearningProcess
 from fantwin.pipeline.learning.ordinary_operation import OrdinaryOperation
 from fantwin.pipeline.learning.versions import Check, TwinVersions
@@ -93,9 +93,7 @@ class Learner:
         self.versions = TwinVersions(folder, "tray1")
         self.learning = FakeLearning(self.versions)
         self.history = HealthyHistory(folder, "site", "tray1", {}, {}, hold_back_s=60.0, kept_s=1e6)
-        self.core = LearnerCore(
-            1, LearnerConfig(first_minutes=5.0), self.history, self.versions, OrdinaryOperation(TRAY), self.learning
-        )
+        self.core = LearnerCore(1, self.history, self.versions, OrdinaryOperation(TRAY), self.learning)
         self.now_s = 0
         self.emitted: list[Message] = []
 

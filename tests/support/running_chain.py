@@ -131,7 +131,7 @@ class Chain:
         self.settings = [
             *(f"run_folder='{folder}'", f"tray.0.port='{self.port}'", f"bus.endpoint='{endpoint}'"),
             *("viewer.grpc_port=0", "viewer.file='view.rrd'", f"launcher.stages={json.dumps(list(stages))}"),
-            *("recorder.topics=['raw', 'grid', 'prediction', 'score']", "recorder.flush_interval_s=1"),
+            "recorder.topics=['raw', 'grid', 'prediction', 'score']",
             # nothing is late, hangs or is cut short where other tests hold up a process for seconds
             *("resampler.watermark_s=600", "launcher.watchdog_s=300", *settings),
         ]

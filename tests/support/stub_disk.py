@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import NoReturn
 
 from fantwin.pipeline.config.settings import TrayConfig
+from fantwin.pipeline.recordings.clips.alarm_clips import AlarmClips
+from fantwin.pipeline.recordings.clips.tracker import ClipTracker, CutResult
 from fantwin.pipeline.recordings.disk import DiskError
 from fantwin.pipeline.recordings.parts import RecordingParts
 from fantwin.pipeline.recordings.reading import RecordingError
@@ -29,15 +31,11 @@ NOW_NS = 10 * SECOND_NS
 RAW_KEY = tray_key("plant", "tray1", "raw")
 
 
-def flushing_each_second(config: Mapping[str, Any]) -> RecorderConfig:
-    return RecorderConfig(**{"flush_interval_s": 1.0, **config})
-
-
 def context(folder: Path, tray: TrayConfig | None = None, **config) -> Context:
     return Context(
         site="plant",
         trays=(tray or TrayConfig(name="tray1", fans=2, speed_unit="rpm"),),
-        config=flushing_each_second(config),
+        config=RecorderConfig(**config),
         folder=folder,
         run_folder=folder / "runs",
         started_t_ns=1_800_000_000_250_000_000,
@@ -166,4 +164,9 @@ def old_parts(*names: str, last_ns: int = NOW_NS) -> list[StoredPart]:
 
 
 def recorder(disk: Disk, **config) -> Recorder:
-    return Recorder(disk, flushing_each_second(config), NOW_NS)
+    return Recorder(disk, RecorderConfig(**config), NOW_NS, uncut_clips(Path("recording.mcap")))
+
+
+def uncut_clips(recording: Path) -> AlarmClips:
+    """Clips that are empty."""
+    return AlarmClips(ClipTracker((), 0), recording, lambda clip: CutResult(clip.name))

@@ -18,6 +18,12 @@ from tests.support.stub_disk import SECOND_NS, context, envelope
 from tests.support.written_recordings import raw
 
 
+@pytest.fixture(autouse=True)
+def all_may_be_filled(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The recorder leaves no space for others: the disk itself refuses."""
+    monkeypatch.setattr("fantwin.pipeline.recordings.disk.LEAST_FREE_BYTES", 0)
+
+
 class Run:
     """A recorder that is fed 50 incompressible messages, about 100 kB, a second."""
 
@@ -70,7 +76,7 @@ def until(happens, run: Run) -> None:
 
 def test_a_full_disk_loses_nothing_that_memory_can_hold(small_disk, monkeypatch):
     monkeypatch.setattr(disk_room, "PART_BYTES", 1_000_000)
-    run = Run(small_disk, min_free_bytes=0)
+    run = Run(small_disk)
     ballast = small_disk / "ballast"
     ballast.write_bytes(bytes(SIZE_BYTES - 900_000))
     until(run.core.problem, run)
@@ -96,7 +102,7 @@ def test_a_full_disk_loses_nothing_that_memory_can_hold(small_disk, monkeypatch)
 
 
 def test_an_unmounted_disk_is_waited_for_and_its_mount_point_not_written(small_disk):
-    run = Run(small_disk, min_free_bytes=0)
+    run = Run(small_disk)
     for _ in range(3):
         run.second()
     unmount(small_disk)
@@ -119,7 +125,7 @@ def test_an_unmounted_disk_is_waited_for_and_its_mount_point_not_written(small_d
 
 
 def test_a_recorder_killed_on_a_full_disk_is_followed_by_one_that_waits_and_loses_no_part(small_disk):
-    run = Run(small_disk, min_free_bytes=0)
+    run = Run(small_disk)
     for _ in range(5):
         run.second()
     part = run.core._part
@@ -130,7 +136,7 @@ def test_a_recorder_killed_on_a_full_disk_is_followed_by_one_that_waits_and_lose
     with (small_disk / "ballast").open("wb", buffering=0) as ballast, pytest.raises(OSError, match="No space"):
         while True:
             ballast.write(bytes(4096))
-    run.begin(small_disk, min_free_bytes=0)
+    run.begin(small_disk)
     assert run.core.problem()
     assert len(run.sequences()) == recorded
     (small_disk / "ballast").unlink()

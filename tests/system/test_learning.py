@@ -25,7 +25,7 @@ def configuration(tmp_path: Path, endpoint: str) -> Path:
     path = tmp_path / "fantwin.toml"
     path.write_text(
         f'run_folder = "runs"\n[bus]\nendpoint = "{endpoint}"\n[[tray]]\nname = "tray1"\nfans = {FANS}\n'
-        f'command_max = 100\nport = "{tmp_path / "line"}"\n[learner]\nfirst_minutes = 2\n'
+        f'command_max = 100\nport = "{tmp_path / "line"}"\n'
         '[recorder]\ntopics = ["raw", "score"]\n'
         # beside the training the line may stand still for longer than the default, and late samples would be lost
         "[resampler]\nwatermark_s = 5\n"
@@ -33,7 +33,7 @@ def configuration(tmp_path: Path, endpoint: str) -> Path:
         encoding="utf-8",
     )
     folder = learning_folder(tmp_path / "runs", "tray1")
-    add_recording(folder, -100_000_000, 220.0, 1)
+    add_recording(folder, -100_000_000, 660.0, 1)
     return path
 
 

@@ -43,8 +43,6 @@ site = "{SITE}"
 [launcher]
 stages = ["scorer", "recorder"]
 shards = {{ scorer = 2 }}
-[recorder]
-flush_interval_s = 0.1
 """
 
 

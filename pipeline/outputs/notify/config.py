@@ -43,22 +43,14 @@ class TargetConfig(Section):
     )
     quiet_hours: str = Field(
         default="",
-        description='time of day in which messages are held, such as "22:00-06:00"; when it ends, one message lists '
-        "what was held",
-    )
-    held_severity: Literal["warning", "alarm"] = Field(
-        default="warning", description="greatest severity of alarms whose messages are held in quiet hours"
+        description='time of day in which messages about warnings are held, such as "22:00-06:00"; when it '
+        "ends, one message lists what was held",
     )
 
     @property
     def least_severity(self) -> Severity:
         """`severity` as alarms have it."""
         return Severity[self.severity.upper()]
-
-    @property
-    def most_held_severity(self) -> Severity:
-        """`held_severity` as alarms have it."""
-        return Severity[self.held_severity.upper()]
 
     @property
     def quiet_times(self) -> tuple[time, time] | None:
@@ -75,7 +67,7 @@ class TargetConfig(Section):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        of_apprise = {"repeat_s", "escalation_after_s", "quiet_hours", "held_severity"}
+        of_apprise = {"repeat_s", "escalation_after_s", "quiet_hours"}
         if self.kind == "alertmanager" and (found := sorted(of_apprise & self.model_fields_set)):
             by_itself = "an Alertmanager repeats, escalates and holds by itself"
             raise ValueError(f"target {self.name}: {by_itself}: take out {', '.join(found)}")

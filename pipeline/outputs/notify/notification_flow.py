@@ -24,6 +24,7 @@ from fantwin.pipeline.outputs.notify.deciding import (
 from fantwin.pipeline.outputs.notify.wording import Place, Text, about_fan, about_many
 from fantwin.pipeline.site.alarm_book import AlarmBook
 from fantwin.pipeline.site.fleet import Fan
+from fantwin.schemas.enums import Severity
 from fantwin.schemas.messages import Alarm
 from fantwin.schemas.units import NS_PER_S
 from fantwin.scoring.alarms.alarm_state import is_silenced
@@ -169,7 +170,7 @@ class Notifications:
 
     def _gather(self, target: TargetConfig, fan: Fan, happened: Happened, severity: int, now_ns: int) -> None:
         basket = Basket.OPEN
-        if severity <= target.most_held_severity and is_quiet(target, now_ns):
+        if severity < Severity.ALARM and is_quiet(target, now_ns):
             basket = Basket.HELD
         elif (before := self._gathered(target, Basket.HELD).fans.pop(fan, None)) is not None:
             # worse than what is held: all of it goes at once

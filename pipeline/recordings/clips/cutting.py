@@ -43,7 +43,7 @@ LEAD_S = 200.0
 PARTS_SEARCHED = 3
 """before the part where a clip begins, for the snapshot and the twin"""
 ROOM_BYTES = 4 << 20
-"""that must be free beyond recorder.min_free_bytes for a clip to be cut"""
+"""that must be free beyond `least_free_bytes` for a clip to be cut"""
 REST_S = 0.002
 """after each chunk, for the thread that records"""
 _JUDGED = ("alarm", "snapshot")
@@ -59,13 +59,13 @@ class ClipCutter:
     Attributes:
         recording: its first part.
         free_bytes: of its disk; raises DiskError.
-        min_free_bytes: half of it may be used while a clip is written, until the oldest part is deleted.
+        least_free_bytes: half of it may be used while a clip is written, until the oldest part is deleted.
         margin_s: of raw samples before all else.
     """
 
     recording: Path
     free_bytes: Callable[[], int]
-    min_free_bytes: int = 0
+    least_free_bytes: int = 0
     margin_s: float = CLOCK_MARGIN_S
 
     def cut(self, clip: Clip) -> CutResult:
@@ -73,7 +73,7 @@ class ClipCutter:
         path = clip_folder(self.recording) / clip.name
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            self._require(self.min_free_bytes + ROOM_BYTES)
+            self._require(self.least_free_bytes + ROOM_BYTES)
             lacks = self._write(clip, path)
             return CutResult(clip.name, path.stat().st_size, lacks)
         except RecordingError as error:
@@ -125,7 +125,7 @@ class ClipCutter:
                         writer.add(envelope)
                         topics.add(envelope.topic)
                 time.sleep(REST_S)
-                self._require(self.min_free_bytes // 2)
+                self._require(self.least_free_bytes // 2)
             if not topics:
                 raise RecordingError("nothing of that time is recorded any more")
         return lacks or ("" if "raw" in topics else "it has no raw samples")

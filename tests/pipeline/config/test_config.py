@@ -161,10 +161,10 @@ def test_a_file_that_is_not_utf_8_is_one_line(tmp_path):
         (GOOD, ["resampler.rate_hz=1e-300"], "resampler.rate_hz = 1e-300: too small: 0, or at least 1e-09"),
         (
             GOOD,
-            ["recorder.min_free_bytes=1" + 30 * "0"],
-            "recorder.min_free_bytes = 1000000000000000000000000000000: too large",
+            ["scorer.alarm_share=1" + 30 * "0"],
+            "scorer.alarm_share = 1000000000000000000000000000000: too large",
         ),
-        (GOOD, ["recorder.min_free_bytes=" + 5000 * "9"], "longer than 1,000 characters"),
+        (GOOD, ["scorer.alarm_share=" + 5000 * "9"], "longer than 1,000 characters"),
         (GOOD + "false_alarms_per_day = " + 5000 * "9", [], "not valid TOML: Exceeds the limit"),
         (GOOD + "false_alarms_per_day = " + 4000 * "9", [], "scorer.false_alarms_per_day = 9999"),
         (GOOD + "false_alarms_per_day = " + 5000 * "[" + 5000 * "]", [], "nested too deeply"),

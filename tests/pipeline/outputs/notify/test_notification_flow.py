@@ -213,9 +213,6 @@ def test_quiet_hours_hold_what_is_less_severe_and_say_it_at_their_end():
     (held,) = desk.wait(3600)
     assert held.body.startswith("Held during quiet hours:\n2 alarms in 1 tray at hall: 1 WARNING, 1 cleared")
     assert held.title.startswith("2 alarms in 1 tray")
-    desk = Desk(TEN_AT_NIGHT_NS, quiet_hours="21:00-23:00", held_severity="alarm", repeat_s=0)
-    desk.hear(alarm(severity=Severity.ALARM))
-    assert (desk.wait(3500), len(desk.wait(200))) == ([], 1), "no severity is excepted"
 
 
 def test_after_a_restart_nothing_is_said_twice_or_lost_and_what_was_missed_is_said():
