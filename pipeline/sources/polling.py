@@ -75,8 +75,9 @@ class _Write:
 class PollingSource(ABC):
     """A `SampleSource` that asks a device. A kind says how to connect, read and write, all called in one thread."""
 
-    def __init__(self, config: PolledConfig) -> None:
-        self._period_s = config.period_s
+    def __init__(self, config: SourceConfig, period_s: float) -> None:
+        """period_s: time between two readings."""
+        self._period_s = period_s
         self._why_no_commands = config.why_no_commands
         self._deliver: Callable[[SourceEvent], None] = lambda _event: None
         self._stopping = False

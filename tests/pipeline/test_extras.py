@@ -156,7 +156,7 @@ source = {{ kind = "mqtt", url = "mqtt://127.0.0.1", topic = "a" }}
 [[tray]]
 name = "drive"
 fans = 1
-source = {{ kind = "modbus", host = "127.0.0.1", fan = [{{ speed = {{ address = 0 }}, command = {{ address = 1 }} }}] }}
+source = {{ kind = "modbus", line = "127.0.0.1", fan = [{{ speed = {{ address = 0 }}, command = {{ address = 1 }} }}] }}
 [[tray]]
 name = "server"
 fans = 1

@@ -222,7 +222,7 @@ class ModbusWorld(World):
         self.port = free_port()
         scaled = {"scale": 0.001}
         fans = [{"speed": {"address": fan}, "command": {"address": 10 + fan, **scaled}, "unit": 3} for fan in (0, 1)]
-        self.settings = {"host": f"127.0.0.1:{self.port}", "fan": fans, **POLLED}
+        self.settings = {"line": f"127.0.0.1:{self.port}", "fan": fans, **POLLED}
         self.speeds, self.refuses = (0.0, 0.0), False
 
     async def access(self, _function: int, start: int, address: int, count: int, registers: list[int], values: Any):
@@ -253,7 +253,7 @@ class RedfishWorld(World):
         self.controller = Controller(is_new=True)
         self.controller.percent = [40, 40]
         self.controller.status = 503
-        self.settings = {"url": self.stack.enter_context(redfish_server(self.controller)), **POLLED}
+        self.settings = {"url": self.stack.enter_context(redfish_server(self.controller))}
 
     def plug_in(self) -> None:
         self.controller.status = 200

@@ -56,7 +56,7 @@ class HwmonSource(PollingSource):
 
     def __init__(self, config: HwmonConfig, context: SourceContext) -> None:
         """Raises UserError if the numbers do not fit the fans of the tray."""
-        super().__init__(config)
+        super().__init__(config, config.period_s)
         self._config = config
         self._root = context.folder / config.root
         self._quirks = chip_of(config.chip)

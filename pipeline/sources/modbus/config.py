@@ -58,37 +58,41 @@ class ModbusConfig(PolledConfig, frozen=True):
     """Drives and fan trays by Modbus, TCP or RTU. It needs the extra `devices`."""
 
     kind: Literal["modbus"] = "modbus"
-    host: str = Field(default="", description="name or address, for Modbus TCP; plc1:1502 if its port is not 502")
-    port: str = Field(default="", description="serial port, for Modbus RTU")
+    line: str = Field(
+        description="for Modbus TCP a name or address, plc1:1502 if its port is not 502; for Modbus RTU the path of a "
+        "serial port, /dev/ttyUSB0"
+    )
     baud: int = Field(default=19200, gt=0, description="speed of the serial port, bits a second")
     framing: Literal["8N1", "8E1", "8O1", "8N2", "8E2", "8O2"] = Field(
         default="8E1", description="data bits, parity and stop bits of the serial port"
     )
     fan: tuple[ModbusFan, ...] = Field(min_length=1, description="one [[tray.source.fan]] for each fan, in their order")
 
-    @field_validator("host")
+    @field_validator("line")
     @classmethod
-    def _has_a_port_if_any(cls, value: str) -> str:
+    def _is_path_or_address(cls, value: str) -> str:
+        if "/" in value:
+            return value
         try:
             parts = urlsplit(f"//{value}")
-            is_known = parts.hostname or not value
-            is_address = is_known and parts.port != 0 and parts.netloc == value and not set(value) & set("@ ")
+            is_address = parts.hostname and parts.port != 0 and parts.netloc == value and not set(value) & set("@ ")
         except ValueError:
             is_address = False
         if not is_address:
-            raise ValueError("give a name or address, with its port if that is not 502: plc1, plc1:1502 or [fe80::1]")
+            raise ValueError(
+                "give plc1, plc1:1502 or [fe80::1] for Modbus TCP, or a path, /dev/ttyUSB0, for Modbus RTU"
+            )
         return value
 
-    @model_validator(mode="after")
-    def _one_connection(self) -> Self:
-        if bool(self.host) == bool(self.port):
-            raise ValueError("give either host, for Modbus TCP, or port, for Modbus RTU")
-        return self
+    @property
+    def port(self) -> str:
+        """The serial port; empty for Modbus TCP."""
+        return self.line if "/" in self.line else ""
 
     @property
     def address(self) -> tuple[str, int]:
         """Host and port, for Modbus TCP."""
-        parts = urlsplit(f"//{self.host}")
+        parts = urlsplit(f"//{self.line}")
         return parts.hostname or "", parts.port or TCP_PORT
 
     @property

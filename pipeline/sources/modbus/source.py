@@ -40,7 +40,7 @@ class ModbusSource(PollingSource):
 
     def __init__(self, config: ModbusConfig, context: SourceContext) -> None:
         """Raises UserError if the extra is missing, or the fans are not those of the tray."""
-        super().__init__(config)
+        super().__init__(config, config.period_s)
         require("source modbus", "devices", "pymodbus")
         if context.fans != len(config.fan):
             raise UserError(
@@ -56,13 +56,13 @@ class ModbusSource(PollingSource):
     def name(self) -> str:
         """Host or port."""
         host, port = self._config.address
-        return f"{host}:{port}" if host else self._config.port
+        return self._config.port or f"{host}:{port}"
 
     @property
     def settings_to_check(self) -> str:
         """Settings that may differ between the two ends."""
         config = self._config
-        line = "" if config.host else f'baud = {config.baud}, framing = "{config.framing}", '
+        line = "" if not config.port else f'baud = {config.baud}, framing = "{config.framing}", '
         return f"{line}unit and registers"
 
     def connect(self) -> None:
@@ -109,7 +109,7 @@ class ModbusSource(PollingSource):
     def check(self) -> list[str]:
         """Problems before the start: the serial port is not there. A host is not asked."""
         if self._port and not os.access(self._port, os.R_OK | os.W_OK):
-            return [f"{self._port}: no such port, or this user may not open it (group dialout); correct source.port"]
+            return [f"{self._port}: no such port, or this user may not open it (group dialout); correct source.line"]
         return []
 
     def _made_client(self) -> ModbusBaseSyncClient:
@@ -117,7 +117,7 @@ class ModbusSource(PollingSource):
 
         config = self._config
         logging.getLogger("pymodbus.logging").setLevel(logging.CRITICAL)  # a failure is a line of this source already
-        if config.host:
+        if not config.port:
             host, port = config.address
             return ModbusTcpClient(host, port=port, timeout=TIMEOUT_S, retries=0)
         return ModbusSerialClient(

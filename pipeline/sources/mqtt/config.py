@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Literal, Self
 
 from pydantic import Field, model_validator
@@ -9,8 +10,18 @@ from pydantic import Field, model_validator
 from fantwin.pipeline.sources.mqtt.settings import BrokerSettings
 from fantwin.pipeline.sources.source import SourceConfig
 
-FAN = "{fan}"
-"""stands for the number of a fan in a topic"""
+_FAN = re.compile(r"\{(\d+)\}")
+"""the place of the number of a fan in a topic, with that of the tray's first fan"""
+
+
+def is_of_each_fan(topic: str) -> bool:
+    """Whether each fan has a topic of its own."""
+    return _FAN.search(topic) is not None
+
+
+def of_fan(topic: str, fan: int) -> str:
+    """The topic of a fan of the tray, counted from 0."""
+    return _FAN.sub(lambda first: str(int(first[1]) + fan), topic)
 
 
 class MqttConfig(SourceConfig, BrokerSettings, frozen=True):
@@ -18,17 +29,18 @@ class MqttConfig(SourceConfig, BrokerSettings, frozen=True):
     (docs/how-to/sources.md)."""
 
     kind: Literal["mqtt"] = "mqtt"
-    topic: str = Field(default="", description="topic of samples in JSON; may have the wildcards + and #")
-    speed_topic: str = Field(
-        default="",
-        description="instead of topic: topic of the speed of a fan as a number; `{fan}` stands for the fan's number",
+    topic: str = Field(
+        min_length=1,
+        description="topic of samples in JSON, which may have the wildcards + and #; or of the speed of a fan as a "
+        "number: then the number of the first fan is in braces, plant/fan{1}/rpm",
     )
-    command_topic: str = Field(default="", description="with speed_topic: topic of the command of a fan as a number")
-    first_fan: int = Field(default=0, ge=0, description="number of the first fan in topics with `{fan}`")
+    command_topic: str = Field(
+        default="", description="topic of the command of a fan as a number, where topic is that of its speed"
+    )
     send_topic: str = Field(
         default="",
-        description="topic to which commands of `fantwin command` are sent, as JSON, or with `{fan}` in it as a number "
-        "for each fan; without it no commands are sent",
+        description="topic to which commands of `fantwin command` are sent, as JSON, or as a number for each fan if it "
+        "has the first one's in braces; without it no commands are sent",
     )
     client_id: str = Field(
         default="",
@@ -39,16 +51,12 @@ class MqttConfig(SourceConfig, BrokerSettings, frozen=True):
     @property
     def has_values(self) -> bool:
         """Return whether each topic has a number of one fan."""
-        return bool(self.speed_topic)
+        return is_of_each_fan(self.topic)
 
     @property
     def patterns(self) -> tuple[str, ...]:
         """The topics as the configuration has them."""
-        return (self.speed_topic, self.command_topic) if self.has_values else (self.topic,)
-
-    def of_fan(self, topic: str, fan: int) -> str:
-        """The topic of a fan of the tray, counted from 0."""
-        return topic.replace(FAN, str(self.first_fan + fan))
+        return (self.topic, self.command_topic) if self.has_values else (self.topic,)
 
     @property
     def why_no_commands(self) -> str:
@@ -57,18 +65,16 @@ class MqttConfig(SourceConfig, BrokerSettings, frozen=True):
 
     @model_validator(mode="after")
     def _topics_fit(self) -> Self:
-        if bool(self.topic) == bool(self.speed_topic or self.command_topic):
-            raise ValueError("give topic, for samples in JSON, or speed_topic and command_topic, for numbers")
-        if bool(self.speed_topic) != bool(self.command_topic):
-            raise ValueError("give speed_topic and command_topic: without the commands nothing can be judged")
-        for name in ("speed_topic", "command_topic") if self.has_values else ():
+        if self.has_values and not self.command_topic:
+            raise ValueError("give command_topic: without the commands nothing can be judged")
+        for name in ("topic", "command_topic") if self.command_topic else ():
             topic = getattr(self, name)
-            if FAN not in topic or "+" in topic or "#" in topic:
+            if not is_of_each_fan(topic) or "+" in topic or "#" in topic:
                 raise ValueError(
-                    f"{name} needs {{fan}} for the number of the fan, as in plant/fan{{fan}}/rpm, and no + or #"
+                    f"{name} needs the number of the first fan in braces, as in plant/fan{{1}}/rpm, and no + or #"
                 )
-        if self.has_values and self.speed_topic == self.command_topic:
-            raise ValueError("speed_topic and command_topic are the same")
+        if self.topic == self.command_topic:
+            raise ValueError("topic and command_topic are the same")
         if "+" in self.send_topic or "#" in self.send_topic:
             raise ValueError("send_topic: commands go to one topic, without + and #")
         return self

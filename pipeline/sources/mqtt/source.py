@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from fantwin.pipeline.extras import require
 from fantwin.pipeline.sources.json_samples import JsonSamplesError, batches_of, parse_samples
 from fantwin.pipeline.sources.mqtt.client import NOT_REACHED, connection_problems, new_client, refusal
-from fantwin.pipeline.sources.mqtt.config import FAN, MqttConfig
+from fantwin.pipeline.sources.mqtt.config import MqttConfig, is_of_each_fan, of_fan
 from fantwin.pipeline.sources.mqtt.settings import KEEPALIVE_S
 from fantwin.pipeline.sources.source import (
     LinkDown,
@@ -97,7 +97,7 @@ class MqttSource:
         self._receipts = ReceiptTimes()
         self._values = FanValues(context.fans)
         self._topics = {
-            config.of_fan(pattern, fan): (fan, pattern == config.speed_topic)
+            of_fan(pattern, fan): (fan, pattern == config.topic)
             for pattern in config.patterns
             for fan in range(context.fans if config.has_values else 1)
         }
@@ -123,7 +123,7 @@ class MqttSource:
     @property
     def settings_to_check(self) -> str:
         """Settings that may differ from what is published."""
-        names = ("speed_topic", "command_topic") if self._config.has_values else ("topic",)
+        names = ("topic", "command_topic") if self._config.has_values else ("topic",)
         return ", ".join(f"{name} = {getattr(self._config, name)!r}" for name in names)
 
     def start(self, deliver: Callable[[SourceEvent], None]) -> None:
@@ -146,15 +146,15 @@ class MqttSource:
             return self._config.why_no_commands
         if not self._is_up:
             return f"{self.name} is not connected"
-        if FAN not in topic:
+        if not is_of_each_fan(topic):
             given = {"command": command, "set_point": set_point}
             values = {name: [None if math.isnan(x) else x for x in each] for name, each in given.items() if each}
             is_sent = self._publish(topic, json.dumps(values))
         elif not all(map(math.isnan, set_point)):
-            return f"a send_topic with {FAN} in it takes commands, no set-points"
+            return f"{topic} takes commands, no set-points"
         else:
             is_sent = all(
-                self._publish(self._config.of_fan(topic, fan), f"{value:.9g}")
+                self._publish(of_fan(topic, fan), f"{value:.9g}")
                 for fan, value in enumerate(command)
                 if not math.isnan(value)
             )

@@ -8,19 +8,20 @@ from typing import ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
-from fantwin.pipeline.sources.polling import SLOWEST_S, PolledConfig
 from fantwin.pipeline.sources.secret_file import LogIn
+from fantwin.pipeline.sources.source import SourceConfig
 
 
-class RedfishConfig(PolledConfig, LogIn, frozen=True):
+class RedfishConfig(SourceConfig, LogIn, frozen=True):
     """Fans of a server by its baseboard controller. It needs the extra `devices`."""
 
     schemes: ClassVar[Mapping[str, int]] = {"http": 80, "https": 443}
 
     kind: Literal["redfish"] = "redfish"
-    period_s: float = Field(default=1.0, gt=0, le=SLOWEST_S, description="time between two readings")
-    url: str = Field(description="address of the controller, for example https://bmc1, or https://USER@bmc1 to log in")
-    chassis: str = Field(default="", description="id of the chassis; needed where the controller has several")
+    url: str = Field(
+        description="address of the controller, for example https://bmc1, or https://USER@bmc1 to log in; where it has "
+        "several chassis, that of the chassis: https://bmc1/redfish/v1/Chassis/Sled2"
+    )
     fans: tuple[str, ...] = Field(
         default=(),
         description="names or ids of the fans, in the order of the tray; without it all, in the controller's order",
@@ -45,8 +46,13 @@ class RedfishConfig(PolledConfig, LogIn, frozen=True):
 
     @property
     def address(self) -> str:
-        """Its URL without the user."""
-        return self.parts._replace(netloc=self.parts.netloc.rpartition("@")[2]).geturl()
+        """Its URL without the user and the chassis."""
+        return f"{self.parts.scheme}://{self.parts.netloc.rpartition('@')[2]}"
+
+    @property
+    def chassis(self) -> str:
+        """The path of the chassis; empty: the only one with fans."""
+        return self.parts.path.rstrip("/")
 
     @property
     def why_no_commands(self) -> str:

@@ -22,8 +22,10 @@ if TYPE_CHECKING:
     from sushy.main import Sushy
 
 Json = Mapping[str, Any]
+PERIOD_S = 1.0
+"""time between two readings: controllers are slow"""
 TIMEOUT_S = 5.0
-"""longest wait for the answer to a request: controllers are slow"""
+"""longest wait for the answer to a request"""
 
 
 class RedfishSource(PollingSource):
@@ -31,7 +33,7 @@ class RedfishSource(PollingSource):
 
     def __init__(self, config: RedfishConfig, context: SourceContext) -> None:
         """Raises UserError if the extra is missing."""
-        super().__init__(config)
+        super().__init__(config, PERIOD_S)
         require("source redfish", "devices", "sushy")
         self._config = config
         self._fans = context.fans
@@ -42,8 +44,8 @@ class RedfishSource(PollingSource):
 
     @property
     def name(self) -> str:
-        """The address."""
-        return self._config.address
+        """The address, with the chassis."""
+        return f"{self._config.address}{self._config.chassis}"
 
     @property
     def settings_to_check(self) -> str:
@@ -138,20 +140,14 @@ class RedfishSource(PollingSource):
         return found
 
     def _find_chassis(self) -> Json:
-        members = [_link(each) for each in _list(self._get("/redfish/v1/Chassis"), "Members")]
-        found = {}
-        for path in filter(None, members):
-            chassis = self._get(path)
-            if "ThermalSubsystem" in chassis or "Thermal" in chassis:
-                found[str(chassis.get("Id", path))] = chassis
-        wanted = self._config.chassis
-        if wanted and wanted in found:
-            return found[wanted]
-        names = ", ".join(found) or "none"
-        if not wanted and len(found) == 1:
+        members = map(_link, _list(self._get("/redfish/v1/Chassis"), "Members"))
+        paths = [self._config.chassis] if self._config.chassis else [*filter(None, members)]
+        found = {
+            path: chassis for path in paths if {"ThermalSubsystem", "Thermal"} & (chassis := self._get(path)).keys()
+        }
+        if len(found) == 1:
             return next(iter(found.values()))
-        which = f"no chassis {wanted!r} with fans" if wanted else f"{len(found)} chassis with fans"
-        raise DeviceError(f"{which}; there are: {names}; name one by source.chassis")
+        raise DeviceError(f"chassis with fans: {', '.join(found) or 'none'}; let source.url end with the path of one")
 
     def _fan_objects(self) -> list[Json]:
         subsystem = _link(self._chassis.get("ThermalSubsystem"))

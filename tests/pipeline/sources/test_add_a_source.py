@@ -91,7 +91,7 @@ def test_what_a_source_states_to_measure_is_in_its_messages_unless_the_tray_says
         ('{ kind = "toy" }', "'tray.0.source.speeds' is missing"),
         ('{ kind = "toy", speed = 1 }', "unknown key 'speed' of kind 'toy'; known: kind, speeds, average_s"),
         ('{ kind = "serial", baud = 0 }', "tray.0.source.baud = 0"),
-        ('{ kind = "modbus", host = "a", fan = [ { speed = { adress = 1 } } ] }', "adress'; did you mean 'address'?"),
+        ('{ kind = "modbus", line = "a", fan = [ { speed = { adress = 1 } } ] }', "adress'; did you mean 'address'?"),
     ],
 )
 def test_a_mistake_in_the_source_is_one_line_with_the_remedy(source: str, words: str) -> None:

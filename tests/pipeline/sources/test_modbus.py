@@ -50,7 +50,7 @@ def drive() -> Drive:
 
 
 def config(port: int, *fans: dict[str, Any], **settings: Any) -> ModbusConfig:
-    return ModbusConfig.model_validate({"host": f"127.0.0.1:{port}", "fan": fans or (FAN,), **settings})
+    return ModbusConfig.model_validate({"line": f"127.0.0.1:{port}", "fan": fans or (FAN,), **settings})
 
 
 def device(port: int, *fans: dict[str, Any], **settings: Any) -> ModbusSource:
@@ -79,7 +79,7 @@ def test_what_a_drive_refuses_is_nan_or_an_error_and_a_command_must_be_there() -
 
 
 def over_serial(line: SerialLine, **settings: Any) -> tuple[ModbusConfig, SourceContext]:
-    values = {"port": line.host, "framing": "8N1", "fan": (FAN,), **settings}
+    values = {"line": line.host, "framing": "8N1", "fan": (FAN,), **settings}
     return ModbusConfig.model_validate(values), SourceContext(1, "rpm", Path())
 
 
@@ -126,14 +126,14 @@ def test_a_unit_that_is_too_slow_on_a_serial_line_is_a_failed_poll_and_the_next_
 
 def test_a_host_may_have_a_port() -> None:
     addresses = [
-        ModbusConfig.model_validate({"host": host, "fan": (FAN,)}).address
+        ModbusConfig.model_validate({"line": host, "fan": (FAN,)}).address
         for host in ("plc1", "plc1:1502", "[::1]:1502")
     ]
     assert addresses == [("plc1", 502), ("plc1", 1502), ("::1", 1502)]
 
 
 def test_a_source_over_a_serial_port_opens_it_with_the_settings_of_the_line() -> None:
-    settings = {"port": "/dev/ttyUSB7", "baud": 9600, "framing": "8O2", "fan": (FAN,)}
+    settings = {"line": "/dev/ttyUSB7", "baud": 9600, "framing": "8O2", "fan": (FAN,)}
     made = ModbusSource(ModbusConfig.model_validate(settings), SourceContext(1, "rpm", Path()))
     line = made._made_client().comm_params
     assert (line.host, line.baudrate, line.parity, line.stopbits) == ("/dev/ttyUSB7", 9600, "O", 2)

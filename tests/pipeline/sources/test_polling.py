@@ -11,8 +11,8 @@ from types import SimpleNamespace
 import pytest
 
 from fantwin.pipeline.sources import polling
-from fantwin.pipeline.sources.polling import DeviceError, PolledConfig, PollingSource
-from fantwin.pipeline.sources.source import LinkDown, LinkUp, Reading, ReadingBatch, SourceEvent
+from fantwin.pipeline.sources.polling import DeviceError, PollingSource
+from fantwin.pipeline.sources.source import LinkDown, LinkUp, Reading, ReadingBatch, SourceConfig, SourceEvent
 from tests.support.delivered import Delivered
 from tests.support.running_chain import DEADLINE_S
 
@@ -23,7 +23,7 @@ class Device(PollingSource):
     """Does what a list of actions says, one for each reading; the last one goes on."""
 
     def __init__(self, *actions: Callable[[], float], period_s: float = PERIOD_S) -> None:
-        super().__init__(PolledConfig.model_construct(period_s=period_s))
+        super().__init__(SourceConfig.model_construct(), period_s)
         self.actions = list(actions) or [lambda: 1.0]
         self.connected = self.disconnected = 0
         self.written: list[tuple[float, ...]] = []

@@ -45,7 +45,7 @@ def test_the_newer_schema_gives_speed_and_percent() -> None:
         assert reading(made) == Reading((40.0, 42.0), (4000.0, 4200.0), measured={TEMPERATURE: (22.0, 22.0)})
         controller.rpm[1], controller.percent[1] = 0, 100
         assert reading(made).speed == (4000.0, 0.0)
-        chosen = connected(url, 1, fans=["FAN2"], chassis="1U")
+        chosen = connected(f"{url}/redfish/v1/Chassis/1U", 1, fans=["FAN2"])
         assert reading(chosen).command == (100.0,)
         made.disconnect()
         chosen.disconnect()
@@ -70,8 +70,8 @@ def test_what_does_not_fit_the_controller_is_one_line() -> None:
             connected(url, fans=["FAN9", "FAN1"]).read()
         with pytest.raises(DeviceError, match="^2 fans, this tray has 3"):
             connected(url, 3).read()
-        with pytest.raises(DeviceError, match="^no chassis 'Rack' with fans; there are: 1U"):
-            connected(url, chassis="Rack")
+        with pytest.raises(DeviceError, match="^chassis with fans: none; let source.url end with the path of one"):
+            connected(f"{url}/redfish/v1/Chassis/Rack")
 
 
 def test_a_controller_that_fails_or_is_slow_is_a_failed_poll_and_one_that_is_gone_is_lost(monkeypatch) -> None:

@@ -28,7 +28,7 @@ from tests.support.ports import free_port
 from tests.support.running_chain import eventually
 
 SAMPLE = '{"t": 1.0, "command": [0.5, 0.5], "speed": [100, 200]}'
-NUMBERS = {"speed_topic": "plant/fan{fan}/rpm", "command_topic": "plant/fan{fan}/pwm", "first_fan": 1}
+NUMBERS = {"topic": "plant/fan{1}/rpm", "command_topic": "plant/fan{1}/pwm"}
 
 
 @pytest.fixture(scope="module")
@@ -138,7 +138,7 @@ def test_a_changed_command_ends_the_reading_that_waits() -> None:
     ("topic", "expected"),
     [
         ("out", [("out", {"command": [0.5, None]})]),
-        ("out/{fan}", [("out/0", 0.5)]),
+        ("out/{0}", [("out/0", 0.5)]),
     ],
 )
 def test_commands_are_published(broker: MqttBroker, topic: str, expected: list[tuple[str, Any]]) -> None:
@@ -155,7 +155,7 @@ def test_commands_are_published(broker: MqttBroker, topic: str, expected: list[t
     assert "is not connected" in source.send((0.5, math.nan), ())
     with running(source):
         assert source.send((0.5, math.nan), ()) == ""
-        assert ("no set-points" in source.send((), (100.0, 200.0))) == ("{fan}" in topic)
+        assert ("no set-points" in source.send((), (100.0, 200.0))) == ("{0}" in topic)
         eventually(lambda: heard, "it is heard")
     assert heard[:1] == expected
     client.disconnect()
