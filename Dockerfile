@@ -12,9 +12,9 @@ COPY stages stages
 COPY simulation simulation
 COPY twin twin
 RUN pip install --no-cache-dir --no-deps . && useradd --create-home --uid 1000 fantwin \
-    && mkdir -p /runs /authority /certs/ca \
+    && mkdir -p /runs /authority /certs \
     && python -c "from fantwin.pipeline.config.registry import STAGES; print('router operator', *STAGES)" \
-    | xargs -n 1 | xargs -I{} mkdir -p /certs/{} && chown -R fantwin /runs /authority /certs
+    | xargs -n 1 | xargs -I{} mkdir -p /certs-of/{} && chown -R fantwin /runs /authority /certs /certs-of
 COPY pipeline/demo /demo
 # without this, ONNX Runtime sends usage reports to its maker; caches go where a read-only container may write
 ENV ORT_DISABLE_TELEMETRY=1 MPLCONFIGDIR=/tmp/matplotlib

@@ -26,8 +26,9 @@ def connect(endpoint: str = "tcp/127.0.0.1:7447", site: str = "site", **bus: Any
     """Connect to the bus of a site.
 
     endpoint: `bus.endpoint` of the configuration. site: its `site`. bus: other settings of its `[bus]`, such as
-    `mode="client"` where processes meet at `fantwin router`, and `security={"ca": ..., "certificate": ..., "key": ...}`
-    where it has certificates, of role `source`, for clients only; relative paths start at the working directory.
+    `mode="client"` where processes meet at `fantwin router`, and `security={"folder": ...}` where it has
+    certificates: the folder has ca.pem, source.pem and source.key, of role `source`, and a relative one starts at the
+    working directory.
 
     Raises:
         BusError: the endpoint cannot be used, or nobody answers there as fantwin does.

@@ -22,7 +22,7 @@ import zenoh
 
 from fantwin.pipeline.bus.errors import BusError
 from fantwin.pipeline.certificates import Certificate, check_pair, read_certificate, require_valid
-from fantwin.pipeline.config.settings import ROLE_PLACE, SecurityConfig
+from fantwin.pipeline.config.settings import SecurityConfig
 from fantwin.pipeline.errors import UserError
 from fantwin.schemas.codec import CodecError, decode_header
 from fantwin.schemas.topics import key_in_words, topic_of
@@ -54,12 +54,12 @@ def checked_credentials(security: SecurityConfig, roles: Sequence[str]) -> Crede
     Raises:
         BusError: a file is missing or cannot be used: one line that says which, why, and what to do.
     """
-    places = {role: of_role(security.certificate, role) for role in roles}
+    places = {role: security.certificate(role) for role in roles}
     role = next((each for each, path in places.items() if path.exists()), "")
     if not role:
         names = " or ".join(map(str, dict.fromkeys(places.values())))
         raise BusError(f"{names}: no such certificate: `fantwin certs issue` makes it")
-    ca, certificate, key = (of_role(path, role) for path in (security.ca, security.certificate, security.key))
+    ca, certificate, key = security.ca, security.certificate(role), security.key(role)
     try:
         own, authority = check_pair(certificate, key, ca), read_certificate(ca)
     except UserError as error:
@@ -72,11 +72,6 @@ def checked_credentials(security: SecurityConfig, roles: Sequence[str]) -> Crede
         except UserError as error:
             raise BusError(f"{error}: {_renewal(each)}") from error
     return Credentials(ca, certificate, key, own, authority)
-
-
-def of_role(path: Path, role: str) -> Path:
-    """A path of `bus.security` for one role."""
-    return Path(str(path).replace(ROLE_PLACE, role))
 
 
 def warning(certificate: Certificate) -> str:

@@ -82,25 +82,17 @@ def _joined(value: object) -> object:
     return value
 
 
-ROLE_PLACE = "{role}"
-"""in a path of `bus.security`: the name of the role of a process"""
-
-
 OWN_ROLES = ("operator", "viewer", "source", "replay", "router")
 """roles of people and programs that are no stages"""
 
 
 class SecurityConfig(Section):
-    """Mutual TLS and roles. Each process shows a certificate that names its role; `fantwin certs` makes them. `{role}`
-    in a path stands for the role of the process."""
+    """Mutual TLS and roles. Each process shows a certificate that names its role; `fantwin certs` makes them."""
 
-    ca: Path = Field(default=Path("certs/ca.pem"), description="certificate of the site's authority")
-    certificate: Path = Field(
-        default=Path("certs/{role}.pem"), description="certificate of a process; `{role}` is the name of its role"
-    )
-    key: Path = Field(
-        default=Path("certs/{role}.key"),
-        description="private key of that certificate; only its owner may be able to read it",
+    folder: Path = Field(
+        default=Path("certs"),
+        description="where the certificates are: ca.pem of the site's authority, ROLE.pem of each process, and its "
+        "private key ROLE.key, which only its owner may be able to read",
     )
     controllers: tuple[Name, ...] = Field(
         default=(), description="roles of programs that command fans: each has the rights of `operator`"
@@ -115,9 +107,21 @@ class SecurityConfig(Section):
         return value
 
     def within(self, folder: Path) -> Self:
-        """The same with absolute paths: relative ones start at `folder`."""
-        paths = {name: folder.absolute() / getattr(self, name) for name in ("ca", "certificate", "key")}
-        return self.model_copy(update=paths)
+        """The same with an absolute path: a relative one starts at `folder`."""
+        return self.model_copy(update={"folder": folder.absolute() / self.folder})
+
+    @property
+    def ca(self) -> Path:
+        """The certificate of the site's authority."""
+        return self.folder / "ca.pem"
+
+    def certificate(self, role: str) -> Path:
+        """The certificate of a process of this role."""
+        return self.folder / f"{role}.pem"
+
+    def key(self, role: str) -> Path:
+        """Its private key."""
+        return self.folder / f"{role}.key"
 
 
 class BusConfig(Section):

@@ -251,9 +251,9 @@ def test_a_certificate_that_may_not_publish_is_named_with_its_role(tmp_path: Pat
             ("source.b", "'source.b', which may not publish reading of a"),
             ("stranger", f"'stranger': {unknown}"),
         ):
-            files = {name: tmp_path / f"{role}.{end}" for name, end in (("certificate", "pem"), ("key", "key"))}
-            security = {"ca": tmp_path / "ca.pem", **files}
-            expected = f"tray a: .*{role}.pem is a certificate of role {why}; use one of role 'source', "
+            site.certificates.show_as("source", role)
+            security = {"folder": tmp_path}
+            expected = f"tray a: .*source.pem is a certificate of role {why}; use one of role 'source', "
             with (
                 fantwin.client.connect(site.endpoint, "site", mode="client", security=security) as client,
                 pytest.raises(fantwin.client.NotAllowedError, match=expected),
@@ -265,9 +265,8 @@ def test_with_certificates_a_source_publishes(endpoint: str, tmp_path: Path) -> 
     certificates = SiteCertificates(tmp_path)
     certificates.issue("acquisition", "source", "router")
     endpoint = endpoint.replace("tcp/", "tls/")
-    security = certificates.security.model_dump(exclude={"controllers"})
-    lines = "\n".join(f'{name} = "{path}"' for name, path in security.items())
-    of_peers = push_config(endpoint, tmp_path, more=f"[bus.security]\n{lines}\n")
+    security = {"folder": tmp_path}
+    of_peers = push_config(endpoint, tmp_path, more=f'[bus.security]\nfolder = "{tmp_path}"\n')
     config = parse_config(of_peers.text, of_peers.path, ("bus.mode='client'",))
     with pytest.raises(BusError, match='security needs mode="client"'):
         fantwin.client.connect(endpoint, SITE, security=security)

@@ -40,8 +40,7 @@ PAIR: dict[str, Any] = {"certificate": Path(CERTIFICATE), "key": Path(KEY)}
 
 def problems_of_bus(folder: Path) -> list[str]:
     try:
-        files: dict[str, Any] = {"ca": folder / CA, "certificate": folder / CERTIFICATE, "key": folder / KEY}
-        checked_credentials(SecurityConfig(**files), ("own",))
+        checked_credentials(SecurityConfig(folder=folder), ("own",))
     except UserError as error:
         return [str(error)]
     return []

@@ -10,7 +10,6 @@ from typing import Any
 
 import pytest
 
-from fantwin.pipeline.bus.identity import of_role
 from fantwin.pipeline.config.loading import parse_config
 from fantwin.pipeline.config.registry import STAGES
 from tests.support.fantwin_words import parsed
@@ -158,8 +157,9 @@ def test_a_pod_has_the_certificate_of_its_own_role_only_and_only_pods_of_the_sit
         assert (volume["secret"]["secretName"], files) == ("plant-certs", {"ca.pem", f"{role}.pem", f"{role}.key"})
         words = container(pods)["args"]
         settings = parse_config(CONFIGURATION, Path("fantwin.toml"), parsed(words)["overrides"], stages=())
-        assert settings.bus.security
-        wanted = [of_role(getattr(settings.bus.security, name), role) for name in ("ca", "certificate", "key")]
+        security = settings.bus.security
+        assert security
+        wanted = (security.ca, security.certificate(role), security.key(role))
         assert {str(path) for path in wanted} == {f"/etc/fantwin/certs/{name}" for name in files}
     assert "--listen=tls/0.0.0.0:7447" in container(router)["args"]
 

@@ -27,9 +27,7 @@ site = "site"
 mode = "client"
 endpoint = "{endpoint}"
 [bus.security]
-ca = "ca.pem"
-certificate = "{{role}}.pem"
-key = "{{role}}.key"
+folder = "."
 controllers = ["dcim"]
 [[tray]]
 name = "a"

@@ -24,13 +24,15 @@ class SiteCertificates:
         self.authority = authority or Authority.new("site", 10 * DAY)
         if is_new:
             write_whole(folder / "ca.pem", self.authority.certificate.public_bytes(Encoding.PEM))
-        self.security = SecurityConfig(
-            ca=folder / "ca.pem", certificate=folder / "{role}.pem", key=folder / "{role}.key"
-        )
+        self.security = SecurityConfig(folder=folder)
 
     def issue(self, *roles: str, lifetime: timedelta = 5 * DAY, authority: Authority | None = None) -> None:
         """Make the certificates of these roles."""
         for role in roles:
             signed, key = (authority or self.authority).issue(role, HOSTS, lifetime)
-            files = self.folder / f"{role}.pem", self.folder / f"{role}.key"
-            write_pair(*files, signed, key, replace=True)
+            write_pair(self.security.certificate(role), self.security.key(role), signed, key, replace=True)
+
+    def show_as(self, role: str, other: str) -> None:
+        """Let whoever is of a role show the certificate of another one."""
+        for of_role in (self.security.certificate, self.security.key):
+            of_role(role).write_bytes(of_role(other).read_bytes())

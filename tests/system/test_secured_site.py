@@ -25,9 +25,7 @@ FAULTY = 2
 
 @pytest.fixture
 def chain(tmp_path: Path, endpoint: str, new_chain: Callable[..., Chain]) -> Chain:
-    files = {"ca": "ca.pem", "certificate": "{role}.pem", "key": "{role}.key"}
-    security = [f"bus.security.{name}='{tmp_path}/certs/{file}'" for name, file in files.items()]
-    settings = ["bus.mode=client", *security, "twin_integrator.warm_up_s=2"]
+    settings = ["bus.mode=client", f"bus.security.folder='{tmp_path}/certs'", "twin_integrator.warm_up_s=2"]
     return new_chain(*settings, endpoint=endpoint.replace("tcp/", "tls/"))
 
 

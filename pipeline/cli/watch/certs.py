@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import glob
 import re
 import socket
 from collections.abc import Iterable, Sequence
@@ -15,7 +14,7 @@ from typing import Annotated
 import typer
 from cryptography.hazmat.primitives.serialization import Encoding
 
-from fantwin.pipeline.bus.identity import of_role, warning
+from fantwin.pipeline.bus.identity import warning
 from fantwin.pipeline.certificates import (
     LONGEST_NAME,
     Authority,
@@ -29,7 +28,7 @@ from fantwin.pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOptio
 from fantwin.pipeline.cli.printing import show, table_of
 from fantwin.pipeline.config.loading import load_config
 from fantwin.pipeline.config.roles import default_roles, roles_of
-from fantwin.pipeline.config.settings import ROLE_PLACE, Config, SecurityConfig, nearest
+from fantwin.pipeline.config.settings import Config, SecurityConfig, nearest
 from fantwin.pipeline.errors import UsageError, UserError
 from fantwin.pipeline.files import PUBLIC, write_whole
 
@@ -96,8 +95,9 @@ def certs(
 
     A role is a stage, operator (may command and send requests), viewer (may look), router, source (may push samples),
     replay, or a controller named in bus.security. With --tray it is for one tray only, and called, for example,
-    acquisition.tray1. Files are where bus.security says: certs/ROLE.pem and certs/ROLE.key. Give a host only the files
-    of its own processes, and keep the folder of the authority elsewhere: whoever has its key can act in every role.
+    acquisition.tray1. Files are in the folder of bus.security: certs/ROLE.pem and certs/ROLE.key. Give a host only the
+    files of its own processes, and keep the folder of the authority elsewhere: whoever has its key can act in every
+    role.
 
     Exit code 1 if show finds a certificate that has expired or is not valid yet.
 
@@ -164,9 +164,7 @@ def _init(request: _Request) -> tuple[list[Certificate], list[Path]]:
 
 
 def _issue(request: _Request) -> tuple[list[Certificate], list[Path]]:
-    files = {
-        role: of_role(request.security.certificate, role) for role in request.roles or default_roles(request.config)
-    }
+    files = {role: request.security.certificate(role) for role in request.roles or default_roles(request.config)}
     stays = [] if request.roles or request.replace else [path for path in files.values() if path.exists()]
     wanted = [role for role, path in files.items() if path not in stays]
     return [_make(request, role, _hosts(request), replace=request.replace) for role in wanted], stays
@@ -174,11 +172,11 @@ def _issue(request: _Request) -> tuple[list[Certificate], list[Path]]:
 
 def _renew(request: _Request) -> tuple[list[Certificate], list[Path]]:
     if request.roles:
-        old = [read_certificate(of_role(request.security.certificate, role)) for role in request.roles]
+        old = [read_certificate(request.security.certificate(role)) for role in request.roles]
     else:
         old = [each for each in _issued(request) if not each.is_authority]
     if not old:
-        raise UserError(f"{request.security.certificate.parent}: no certificates: `fantwin certs issue` makes them")
+        raise UserError(f"{request.security.folder}: no certificates: `fantwin certs issue` makes them")
     return [
         _make(request, each.role, (*each.hosts, *request.hosts), each.not_after - each.not_before, replace=True)
         for each in old
@@ -189,8 +187,6 @@ def _make(
     request: _Request, role: str, hosts: Iterable[str], valid: timedelta = timedelta(_DAYS), *, replace: bool
 ) -> Certificate:
     security = request.security
-    if ROLE_PLACE not in str(security.certificate) and len(request.roles) != 1:
-        raise UsageError(f"{security.certificate}: name the one role of this file, or write {ROLE_PLACE} into its path")
     authority = Authority.read(request.authority)
     try:
         known = security.ca.read_bytes()
@@ -199,8 +195,8 @@ def _make(
     if authority.certificate.public_bytes(Encoding.PEM) != known:
         raise UserError(f"{security.ca} is not the certificate of {request.authority}: use the files of one site")
     signed, key = authority.issue(role, list(dict.fromkeys(hosts)), timedelta(request.days) if request.days else valid)
-    certificate = of_role(security.certificate, role)
-    write_pair(certificate, of_role(security.key, role), signed, key, replace=replace)
+    certificate = security.certificate(role)
+    write_pair(certificate, security.key(role), signed, key, replace=replace)
     return read_certificate(certificate)
 
 
@@ -219,9 +215,8 @@ def _issued(request: _Request) -> list[Certificate]:
         UserError: the file of a role, or of the authority, is no certificate.
     """
     security = request.security
-    pattern = glob.escape(str(security.certificate)).replace(ROLE_PLACE, "*")
-    paths = [security.ca, *map(Path, sorted(glob.glob(pattern)))]  # noqa: PTH207  the role may be a folder
-    own = {security.ca, *(of_role(security.certificate, role) for role in roles_of(request.config))}
+    paths = [security.ca, *sorted(security.folder.glob("*.pem"))]
+    own = {security.ca, *map(security.certificate, roles_of(request.config))}
     found: list[Certificate] = []
     for path in dict.fromkeys(paths):
         try:
@@ -235,11 +230,11 @@ def _issued(request: _Request) -> list[Certificate]:
 
 def _show(request: _Request, *, json_output: bool) -> None:
     if request.roles:
-        found = [read_certificate(of_role(request.security.certificate, role)) for role in request.roles]
+        found = [read_certificate(request.security.certificate(role)) for role in request.roles]
     else:
         found = _issued(request)
     if not found:
-        raise UserError(f"{request.security.certificate.parent}: no certificates: start with `fantwin certs init`")
+        raise UserError(f"{request.security.folder}: no certificates: start with `fantwin certs init`")
     now, roles = datetime.now(UTC), roles_of(request.config)
     table = table_of((), (), ("role", "until", "days", "used by", *(["hosts"] if request.roles else [])))
     for column in table.columns:

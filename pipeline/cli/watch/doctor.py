@@ -20,7 +20,6 @@ from rich.text import Text
 
 from fantwin.pipeline.bus.endpoint import accepts_connections, endpoint_problem, foreign_program
 from fantwin.pipeline.bus.errors import BusError, NoAnswerError
-from fantwin.pipeline.bus.identity import of_role
 from fantwin.pipeline.bus.opening import credentials_of
 from fantwin.pipeline.bus.rights import SiteRoles
 from fantwin.pipeline.bus.session import join_bus
@@ -207,9 +206,9 @@ def _check_certificates(settings: Config) -> Iterator[tuple[bool, str]]:
         return
     answers = settings.bus.mode == "client" and accepts_connections(settings.bus.endpoint)
     roles = [role for row in process_list(settings) for role in role_names(row.stage, row.shard)]
-    here = [role for role in dict.fromkeys((*roles, *READERS)) if of_role(security.certificate, role).exists()]
+    here = [role for role in dict.fromkeys((*roles, *READERS)) if security.certificate(role).exists()]
     if not here:
-        yield False, f"{security.certificate}: no certificate of any role here: `fantwin certs issue` makes them"
+        yield False, f"{security.folder}: no certificate of any role here: `fantwin certs issue` makes them"
     for role in here:
         try:
             credentials = credentials_of(settings.bus, (role,))

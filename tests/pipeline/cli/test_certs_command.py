@@ -128,16 +128,6 @@ def test_a_renewed_certificate_is_valid_for_as_long_as_the_one_before_and_needs_
     assert str(certs(path, "renew", "viewer").exception).endswith("`fantwin certs init` makes it")
 
 
-def test_each_role_may_have_a_folder_of_its_own(path):
-    folders = 'certificate = "certs/{role}/certificate.pem"\nkey = "certs/{role}/key.pem"\ncontrollers'
-    path.write_text(CONFIG.replace("controllers", folders))
-    certs(path, "init")
-    roles = made(certs(path, "issue", "--json"))
-    assert (path.parent / "certs" / "scorer" / "certificate.pem").is_file()
-    assert sorted(made(certs(path, "renew", "--json"))) == sorted(roles)
-    assert all(role in certs(path, "show").stdout for role in roles)
-
-
 def test_an_expired_certificate_is_shown_and_ends_the_command_with_1(path):
     SiteCertificates(path.parent / "certs").issue("viewer", lifetime=-timedelta(minutes=1))
     result = certs(path, "show")

@@ -30,11 +30,9 @@ def fewer_rights(site: SecuredSite) -> SiteRoles:
 
 
 def test_a_stage_with_a_certificate_of_another_role_ends_with_1_and_one_line(site):
-    other = site.certificates.folder / "viewer"
-    words = [f"bus.security.{name}='{other}.{end}'" for name, end in (("certificate", "pem"), ("key", "key"))]
+    site.certificates.show_as("resampler", "viewer")
     with site.running():
-        settings = (w for word in words for w in ("--set", word))
-        done = as_typed("up", "--only", "resampler", "-c", site.config.path, *settings)
+        done = as_typed("up", "--only", "resampler", "-c", site.config.path)
     assert done.returncode == 1
     assert done.stderr.startswith("fantwin: its certificate says 'viewer', which may not publish grid of a"), (
         done.stderr
@@ -43,12 +41,10 @@ def test_a_stage_with_a_certificate_of_another_role_ends_with_1_and_one_line(sit
 
 
 def test_whoever_may_not_command_is_told_the_role_that_may_in_words_of_the_documentation(site):
-    other = site.certificates.folder / "viewer"
-    words = [f"bus.security.{name}='{other}.{end}'" for name, end in (("certificate", "pem"), ("key", "key"))]
+    site.certificates.show_as("operator", "viewer")
     source = "tray.0.source={kind = 'serial', port = '/dev/none'}"
     with site.running():
-        given = ("--tray", "a", "--fan", "0", "0.5", "--set", source, *(w for word in words for w in ("--set", word)))
-        done = called("command", "-c", site.config.path, *given)
+        done = called("command", "-c", site.config.path, "--tray", "a", "--fan", "0", "0.5", "--set", source)
     assert str(done.exception) == (
         "its certificate says 'viewer', which may not publish command of a; use the certificate of role 'operator'"
     )
@@ -86,7 +82,7 @@ def test_doctor_without_a_router_says_until_when_certificates_hold_and_where_the
     for path in site.certificates.folder.glob("*.pem"):
         path.unlink()
     assert examined(site)[1] == [
-        f"{site.certificates.folder}/{{role}}.pem: no certificate of any role here: `fantwin certs issue` makes them"
+        f"{site.certificates.folder}: no certificate of any role here: `fantwin certs issue` makes them"
     ]
 
 

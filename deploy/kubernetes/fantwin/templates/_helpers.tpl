@@ -37,9 +37,7 @@ new set takes the place of the old one; a rolling update would wait for pods tha
 {{- end }}
 
 {{- define "fantwin.security" -}}
-- --set=bus.security.ca=/etc/fantwin/certs/ca.pem
-- --set=bus.security.certificate=/etc/fantwin/certs/{role}.pem
-- --set=bus.security.key=/etc/fantwin/certs/{role}.key
+- --set=bus.security.folder=/etc/fantwin/certs
 {{- end }}
 
 {{- /* The certificate of one role, and no other: (dict "root" $ "role" "scorer") */}}
