@@ -61,13 +61,12 @@ class MqttCore(SiteCore):
     ) -> None:
         config: MqttConfig = context.config
         super().__init__(model, desk)
-        self._config, self._topics, self._link = config, topics, link
+        self._topics, self._link = topics, link
         self._states = FanStates(model)
         self._outbox = Outbox()
         self._history, self._queue = alarms, TransitionQueue(alarms, MOST_WAITING)
         self._requests = Requests(topics, model.trays, config.accept, desk)
-        self._home_assistant = HomeAssistant(config, topics, model.trays)
-        self._devices = self._home_assistant.messages() if config.home_assistant != "off" else {}
+        self._devices = HomeAssistant(config, topics, model.trays).messages() if config.home_assistant else {}
         self._numbers: dict[int, int] = {}
         """transitions under way: by the number of the message, that of the transition"""
         self._changed_alarms: set[Fan] = set()
@@ -123,13 +122,6 @@ class MqttCore(SiteCore):
             **super().counters(),
             **self._requests.counts,
         }
-
-    def notes(self) -> Sequence[str]:
-        """Fans that are left out of Home Assistant."""
-        left_out = self._home_assistant.left_out if self._config.home_assistant == "publish" else 0
-        if not left_out:
-            return ()
-        return (f"Home Assistant: {left_out} fans have no entities; home_assistant_trays chooses those that have",)
 
     def problem(self) -> str:
         """Problem of the broker or the history."""
@@ -227,9 +219,9 @@ def check(context: Context) -> list[str]:
         client = new_client(config, context.folder)
     except UserError as error:
         return [str(error)]
-    unknown = sorted(set(config.home_assistant_trays) - {tray.name for tray in context.trays})
+    unknown = sorted(set(config.home_assistant) - {tray.name for tray in context.trays})
     return [
-        *(f"[mqtt] home_assistant_trays: there is no tray {name}" for name in unknown if context.instance == ALL_TRAYS),
+        *(f"[mqtt] home_assistant: there is no tray {name}" for name in unknown if context.instance == ALL_TRAYS),
         *connection_problems(client, config, f"broker {config.host}:{config.port}"),
     ]
 

@@ -74,7 +74,7 @@ def _serve(context: Context, model: SiteModel, desk: RequestDesk) -> OpcuaServer
     if config.certificate and config.key:
         certificate, key = context.resolve(config.certificate), context.resolve(config.key)
     else:
-        hosts = (socket.gethostname(), *config.names, "localhost", *([config.host] if config.is_loopback else []))
+        hosts = (socket.gethostname(), "localhost", *([config.host] if config.is_loopback else []))
         certificate, key = context.own_file(CERTIFICATE), context.own_file(KEY)
         make_self_signed(certificate, key, "fantwin OPC UA server", application_uri(context.site), hosts)
     shown = check_pair(certificate, key, needs_rsa=True)

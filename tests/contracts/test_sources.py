@@ -193,7 +193,7 @@ IMPOSSIBLE: list[tuple[str, dict[str, Any], str]] = [
     ("modbus", {"line": "", "fan": [FAN]}, "give plc1, plc1:1502"),
     ("modbus", {"line": "drive:port", "fan": [FAN]}, "give plc1, plc1:1502"),
     ("modbus", {"line": "fe80::1", "fan": [FAN]}, "or [fe80::1]"),
-    ("modbus", {"line": "/dev/ttyUSB0", "framing": "7E1", "fan": [FAN]}, "framing"),
+    ("modbus", {"line": "/dev/ttyUSB0", "serial": "9600 7E1", "fan": [FAN]}, "serial"),
     ("redfish", {"url": "https://a:b@bmc1"}, "a configuration is recorded"),
     ("redfish", {"url": "bmc1"}, "write the address"),
     ("redfish", {"url": "https://a@bmc1"}, "needs password_file"),

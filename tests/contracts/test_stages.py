@@ -227,7 +227,7 @@ class FakeLink:
 def test_the_mqtt_stage_survives_any_message_and_request_and_publishes_only_json(
     session: list[Message], tray: str, asked: list[tuple[str, bytes]]
 ) -> None:
-    config = MqttConfig(url="mqtt://broker", accept=("acknowledge",), home_assistant="publish")
+    config = MqttConfig(url="mqtt://broker", accept=("acknowledge",), home_assistant=("tray1",))
     received = [Received(f"fantwin/site/tray1/{fan}/request", payload, is_retained=False) for fan, payload in asked]
     link: Any = FakeLink(received)
     with TemporaryDirectory() as folder:

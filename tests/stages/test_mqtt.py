@@ -231,7 +231,7 @@ def test_home_assistant_knows_the_fans(tmp_path, broker, started):
         found = [topic for topic, text in retained_by(broker.port).items() if text and topic.startswith("homeassist")]
         return {topic.removeprefix(f"homeassistant/device/fantwin_{SITE}/").removesuffix("/config") for topic in found}
 
-    started(tmp_path, broker.port, fans=2, home_assistant="publish")
+    started(tmp_path, broker.port, fans=2, home_assistant=["tray1"])
     eventually(lambda: devices() == {"site", f"{TRAY}-0", f"{TRAY}-1"}, "it has all devices")
 
 
@@ -277,7 +277,7 @@ def test_a_broker_that_refuses_a_password_or_whose_certificate_is_unknown_is_nam
 
 def test_doctor_names_a_broker_that_is_not_there_and_a_tray_that_there_is_not(tmp_path):
     port = free_port()
-    config = MqttConfig(url=f"mqtt://127.0.0.1:{port}", home_assistant_trays=("tray9",))
+    config = MqttConfig(url=f"mqtt://127.0.0.1:{port}", home_assistant=("tray9",))
     unknown, away = check(Context(SITE, (TrayConfig(name=TRAY, fans=4),), config, tmp_path, tmp_path, 0))
-    assert unknown == "[mqtt] home_assistant_trays: there is no tray tray9"
+    assert unknown == "[mqtt] home_assistant: there is no tray tray9"
     assert away == f"broker 127.0.0.1:{port}: cannot be reached: Connection refused; check url"

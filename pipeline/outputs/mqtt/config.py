@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
 from pydantic import Field
 
 from fantwin.pipeline.config.settings import Name
@@ -18,9 +16,6 @@ class MqttConfig(StageConfig, BrokerSettings, frozen=True):  # pyright: ignore[r
     accept: tuple[OperatorAction, ...] = Field(
         default=(), description="actions that may be requested by MQTT; by default none, and no request is read"
     )
-    home_assistant: Literal["off", "publish"] = Field(
-        default="off", description="publish: fans become devices in Home Assistant"
-    )
-    home_assistant_trays: tuple[Name, ...] = Field(
-        default=(), description="trays whose fans become devices, all of them; empty: the first 64 fans of all trays"
+    home_assistant: tuple[Name, ...] = Field(
+        default=(), description="trays whose fans become devices in Home Assistant; by default none"
     )

@@ -23,17 +23,11 @@ DISCOVERY_PREFIX = "homeassistant"
 """where Home Assistant looks for devices"""
 SITE_DEVICE = "site"
 ONLINE, OFFLINE = "online", "offline"
-MOST_FANS = 64
-"""fans that are devices where nobody has chosen trays: with thousands of entities, Home Assistant becomes slow"""
 _QOS = 1
 
 
 class HomeAssistant:
-    """The devices of the fans that the configuration chooses.
-
-    Attributes:
-        left_out: fans that have no device because there are too many.
-    """
+    """The devices of the fans of the trays that the configuration names."""
 
     def __init__(self, config: MqttConfig, topics: Topics, trays: Sequence[TrayConfig]) -> None:
         self._topics = topics
@@ -46,11 +40,8 @@ class HomeAssistant:
         node = re.sub(r"[^A-Za-z0-9_-]", "_", topics.root)
         self._node = node if topics.instance == ALL_TRAYS else f"{node}_{topics.instance}"
         self._path = f"{DISCOVERY_PREFIX}/device/{self._node}"
-        chosen = config.home_assistant_trays or [tray.name for tray in trays]
-        of_chosen = [tray for tray in trays if tray.name in chosen]
-        fans = [(Fan(tray.name, number), tray.speed_unit) for tray in of_chosen for number in range(tray.fans)]
-        self._fans = fans if config.home_assistant_trays else fans[:MOST_FANS]
-        self.left_out = len(fans) - len(self._fans)
+        chosen = [tray for tray in trays if tray.name in config.home_assistant]
+        self._fans = [(Fan(tray.name, number), tray.speed_unit) for tray in chosen for number in range(tray.fans)]
 
     def messages(self) -> Mapping[str, str]:
         """The text of each device by its topic."""

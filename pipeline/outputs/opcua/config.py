@@ -19,12 +19,11 @@ class OpcuaConfig(StageConfig):
     host: str = Field(default="127.0.0.1", description="address to listen on")
     port: int = Field(default=4840, ge=1, le=65535, description="port; shard K uses the K-th from here on")
     certificate: Path | None = Field(
-        default=None, description="PEM or DER file: the server's certificate; without it, the stage makes one"
+        default=None,
+        description="PEM or DER file: the server's certificate; without it, the stage makes one for the "
+        "name of this host",
     )
     key: Path | None = Field(default=None, description="PEM file: its private key")
-    names: tuple[str, ...] = Field(
-        default=(), description="names under which clients reach this host, for the certificate that the stage makes"
-    )
     users: Path | None = Field(
         default=None, description="file of users, written by `fantwin users`; without it nobody can act over OPC UA"
     )

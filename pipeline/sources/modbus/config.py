@@ -62,9 +62,10 @@ class ModbusConfig(PolledConfig, frozen=True):
         description="for Modbus TCP a name or address, plc1:1502 if its port is not 502; for Modbus RTU the path of a "
         "serial port, /dev/ttyUSB0"
     )
-    baud: int = Field(default=19200, gt=0, description="speed of the serial port, bits a second")
-    framing: Literal["8N1", "8E1", "8O1", "8N2", "8E2", "8O2"] = Field(
-        default="8E1", description="data bits, parity and stop bits of the serial port"
+    serial: str = Field(
+        default="19200 8E1",
+        pattern=r"^[1-9][0-9]{1,6} 8[NEO][12]$",
+        description="of a serial port: bits a second, data bits (8), parity (N, E or O) and stop bits (1 or 2)",
     )
     fan: tuple[ModbusFan, ...] = Field(min_length=1, description="one [[tray.source.fan]] for each fan, in their order")
 
@@ -83,6 +84,11 @@ class ModbusConfig(PolledConfig, frozen=True):
                 "give plc1, plc1:1502 or [fe80::1] for Modbus TCP, or a path, /dev/ttyUSB0, for Modbus RTU"
             )
         return value
+
+    @property
+    def baud(self) -> int:
+        """Speed of the serial port, bits a second."""
+        return int(self.serial.split()[0])
 
     @property
     def port(self) -> str:

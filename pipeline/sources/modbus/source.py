@@ -62,7 +62,7 @@ class ModbusSource(PollingSource):
     def settings_to_check(self) -> str:
         """Settings that may differ between the two ends."""
         config = self._config
-        line = "" if not config.port else f'baud = {config.baud}, framing = "{config.framing}", '
+        line = "" if not config.port else f'serial = "{config.serial}", '
         return f"{line}unit and registers"
 
     def connect(self) -> None:
@@ -123,8 +123,8 @@ class ModbusSource(PollingSource):
         return ModbusSerialClient(
             self._port,
             baudrate=config.baud,
-            parity=config.framing[1],
-            stopbits=int(config.framing[2]),
+            parity=config.serial[-2],
+            stopbits=int(config.serial[-1]),
             timeout=TIMEOUT_S,
             retries=0,
         )

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import ClassVar, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import Field, StrictBool, model_validator
 
 from fantwin.pipeline.sources.secret_file import LogIn
 from fantwin.pipeline.sources.source import SourceConfig
@@ -35,8 +35,10 @@ class RedfishConfig(SourceConfig, LogIn, frozen=True):
         default="",
         description="sensor of the air: its name (Thermal), or a key of TemperatureSummaryCelsius (ThermalSubsystem)",
     )
-    verify: bool = Field(default=True, description="whether the certificate of the controller is checked")
-    ca: Path | None = Field(default=None, description="certificate of the authority that signed the controller's")
+    verify: StrictBool | Path = Field(
+        default=True,
+        description="whether the certificate of the controller is checked; or that of the authority that signed it",
+    )
 
     @model_validator(mode="after")
     def _has_password(self) -> Self:

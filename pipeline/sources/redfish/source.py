@@ -64,7 +64,7 @@ class RedfishSource(PollingSource):
             raise DeviceError(f"{config.address} would send the password in the clear: use https")
         # sushy takes 0 for its own number of attempts, and waits between them; the poller tries again by itself
         options: dict[str, Any] = {
-            "verify": str(self._folder / config.ca) if config.ca and config.verify else config.verify,
+            "verify": config.verify if isinstance(config.verify, bool) else str(self._folder / config.verify),
             "read_timeout": TIMEOUT_S,
             "connect_timeout": TIMEOUT_S,
             "server_side_retries": 1,
@@ -123,7 +123,7 @@ class RedfishSource(PollingSource):
         except exceptions.ConnectionError as error:
             text = str(error)
             if "CERTIFICATE_VERIFY_FAILED" in text or "certificate" in text.lower():
-                why = "its certificate cannot be verified: name the authority by source.ca"
+                why = "its certificate cannot be verified: name the authority by source.verify"
             else:
                 why = f"does not answer within {TIMEOUT_S:g} s, or cannot be reached"
             raise DeviceError(f"{why}; waiting for it", is_lost=True) from error

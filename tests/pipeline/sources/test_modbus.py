@@ -79,7 +79,7 @@ def test_what_a_drive_refuses_is_nan_or_an_error_and_a_command_must_be_there() -
 
 
 def over_serial(line: SerialLine, **settings: Any) -> tuple[ModbusConfig, SourceContext]:
-    values = {"line": line.host, "framing": "8N1", "fan": (FAN,), **settings}
+    values = {"line": line.host, "serial": "19200 8N1", "fan": (FAN,), **settings}
     return ModbusConfig.model_validate(values), SourceContext(1, "rpm", Path())
 
 
@@ -133,7 +133,7 @@ def test_a_host_may_have_a_port() -> None:
 
 
 def test_a_source_over_a_serial_port_opens_it_with_the_settings_of_the_line() -> None:
-    settings = {"line": "/dev/ttyUSB7", "baud": 9600, "framing": "8O2", "fan": (FAN,)}
+    settings = {"line": "/dev/ttyUSB7", "serial": "9600 8O2", "fan": (FAN,)}
     made = ModbusSource(ModbusConfig.model_validate(settings), SourceContext(1, "rpm", Path()))
     line = made._made_client().comm_params
     assert (line.host, line.baudrate, line.parity, line.stopbits) == ("/dev/ttyUSB7", 9600, "O", 2)

@@ -108,7 +108,7 @@ def test_a_password_comes_from_a_file_of_its_owner_and_goes_over_a_verified_line
     controller = Controller(is_new=True, user="operator", password=SECRET)
     with redfish_server(controller, tls) as address:
         url = address.replace("//", "//operator@")
-        settings = {"folder": tmp_path, "ca": "ca.pem", "password_file": "bmc.secret"}
+        settings = {"folder": tmp_path, "verify": "ca.pem", "password_file": "bmc.secret"}
         with pytest.raises(UserError, match="others may read it: chmod 600"):
             connected(url, **settings)
         assert "others may read it" in device(url, **settings).check()[0]
@@ -116,7 +116,9 @@ def test_a_password_comes_from_a_file_of_its_owner_and_goes_over_a_verified_line
         made = connected(url, **settings)
         assert reading(made).speed == (4000.0, 4200.0)
         made.disconnect()
-        with pytest.raises(DeviceError, match="^its certificate cannot be verified: name the authority by source.ca"):
+        with pytest.raises(
+            DeviceError, match="^its certificate cannot be verified: name the authority by source.verify"
+        ):
             connected(url, folder=tmp_path, password_file="bmc.secret")
         file.write_text(f"{SECRET}-not\n")
         with pytest.raises(DeviceError, match="^user or password is refused") as caught:

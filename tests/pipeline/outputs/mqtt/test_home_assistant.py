@@ -39,7 +39,9 @@ REQUIRED = {"binary_sensor": "state_topic", "sensor": "state_topic", "button": "
 
 def devices_of(topics: Topics | None = None, **settings: Any) -> dict[str, dict[str, Any]]:
     """The devices by the last part of their topics."""
-    config = MqttConfig.model_validate({"url": "mqtt://broker", "home_assistant": "publish"} | settings)
+    config = MqttConfig.model_validate(
+        {"url": "mqtt://broker", "home_assistant": [tray.name for tray in TRAYS]} | settings
+    )
     messages = HomeAssistant(config, topics or Topics("hall"), TRAYS).messages()
     found: dict[str, dict[str, Any]] = {}
     for topic, text in messages.items():
@@ -82,12 +84,8 @@ def test_entities_have_a_unit_and_are_unavailable_when_the_stage_is_gone_but_for
     assert "availability_topic" not in devices_of()["site"]["components"]["running"]
 
 
-def test_only_chosen_trays_or_the_first_fans_are_devices(monkeypatch):
-    monkeypatch.setattr("fantwin.pipeline.outputs.mqtt.home_assistant.MOST_FANS", 1)
-    assert devices_of(home_assistant_trays=("tray-2",)).keys() == {"site", "tray-2-0", "tray-2-1", "tray-2-2"}
-    assert devices_of().keys() == {"site", "tray1-0"}
-    config = MqttConfig(url="mqtt://broker", home_assistant="publish")
-    assert HomeAssistant(config, Topics("hall"), TRAYS).left_out == 4
+def test_only_the_fans_of_named_trays_are_devices():
+    assert devices_of(home_assistant=("tray-2",)).keys() == {"site", "tray-2-0", "tray-2-1", "tray-2-2"}
 
 
 def test_a_button_acknowledges_where_that_is_accepted():
