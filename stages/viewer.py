@@ -16,9 +16,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Literal
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from fantwin.pipeline.config.registry import STAGES
 from fantwin.pipeline.config.settings import TrayConfig, nearest
@@ -29,6 +28,8 @@ from fantwin.pipeline.runtime.stage import BuiltStage, Context, Stage, StageConf
 from fantwin.pipeline.site.fleet import Fan
 from fantwin.pipeline.site.loopback import check_free
 
+PAGE_BELOW_DATA = 9876 - 9090
+"""between the port of the data and that of the page, as between those that Rerun takes by itself"""
 FILE_BYTES = 1_000_000_000
 """size at which the view's file ends"""
 
@@ -45,19 +46,24 @@ class ViewerConfig(StageConfig):
         default=9876,
         ge=0,
         le=65535,
-        description="port on this host (127.0.0.1) for the data of live viewers, native and in a browser; shard K uses "
-        "the K-th port from here on; 0: no live viewers",
-    )
-    web_port: int = Field(
-        default=9090, ge=0, le=65535, description="port of the browser viewer's page, for shards as above; 0: no page"
-    )
-    layout: Literal["all", "alarms", "wear"] = Field(
-        default="all",
-        description="all: every fan; alarms: only the fans that are or have been in alarm; wear: change over days",
+        description="port on this host (127.0.0.1) for the data of live viewers, native and in a browser; the page of "
+        "the latter has the port 786 below it, 9090; shard K uses the K-th ports from there on; 0: no live viewers",
     )
     show: tuple[str, ...] = Field(
         default=(), max_length=64, description='fans of a fleet that always have a plot: ["tray1/3", "tray2/0"]'
     )
+
+    @property
+    def web_port(self) -> int:
+        """The port of the browser viewer's page; 0: no page."""
+        return self.grpc_port - PAGE_BELOW_DATA if self.grpc_port else 0
+
+    @field_validator("grpc_port")
+    @classmethod
+    def _leaves_one_for_the_page(cls, value: int) -> int:
+        if 0 < value <= PAGE_BELOW_DATA:
+            raise ValueError(f"0, or above {PAGE_BELOW_DATA}: the page has the port {PAGE_BELOW_DATA} below it")
+        return value
 
 
 def shown_fans(names: Iterable[str], trays: Sequence[TrayConfig]) -> list[Fan]:
@@ -91,11 +97,12 @@ def build(context: Context) -> BuiltStage:
     from fantwin.pipeline.outputs.rerun.viewer_core import view_of_site  # noqa: PLC0415  an extra
 
     config: ViewerConfig = context.config
+    ports = _ports(context)
     options = ViewOptions(
-        layout=config.layout,
         show=shown_fans(config.show, context.trays),
         file_bytes=FILE_BYTES,
-        **_ports(context),
+        grpc_port=ports.get("grpc_port"),
+        web_port=ports.get("web_port"),
     )
     file = context.own_file(Path(config.file)) if config.file else None
     return BuiltStage(view_of_site(context.site, context.trays, context.started_t_ns, file, options))

@@ -143,7 +143,7 @@ def _publishers(bus: Bus, tray: str) -> dict[bool, Callable[[Any], None]]:
 def _config(endpoint: str, fans: int, block_s: float, folder: Path) -> Config:
     trays = FleetScores(fans, block_s=block_s).trays
     port = free_endpoint().rpartition(":")[2]
-    lines = [f'site = "{SITE}"', f'[bus]\nendpoint = "{endpoint}"', f"[viewer]\ngrpc_port = {port}\nweb_port = 0"]
+    lines = [f'site = "{SITE}"', f'[bus]\nendpoint = "{endpoint}"', f"[viewer]\ngrpc_port = {port}"]
     lines += [f'[[tray]]\nname = "{tray.name}"\nfans = {tray.fans}\nspeed_unit = "rpm"' for tray in trays]
     return parse_config("\n".join(lines), folder / "fantwin.toml", stages=("viewer",))
 

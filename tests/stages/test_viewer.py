@@ -110,7 +110,7 @@ def test_an_existing_view_is_not_overwritten_and_a_file_that_cannot_be_written_i
 
 def test_live_viewers_are_served_on_the_loopback_only_and_a_second_shard_takes_another_port(tmp_path: Path) -> None:
     port = free_port()
-    live = context(tmp_path, grpc_port=port, web_port=0)
+    live = context(tmp_path, grpc_port=port)
     core = build(live).core
     with socket.create_connection(("127.0.0.1", port), timeout=5):
         listening = Path("/proc/net/tcp")
@@ -124,6 +124,6 @@ def test_live_viewers_are_served_on_the_loopback_only_and_a_second_shard_takes_a
     with pytest.raises(
         StageError, match=rf"^viewer\.grpc_port: {taken} .*; set another one, or viewer\.grpc_port = 0$"
     ):
-        build(context(tmp_path / "other", grpc_port=port, web_port=0))
+        build(context(tmp_path / "other", grpc_port=port))
     assert not (tmp_path / "other").exists(), "no file was begun"
     core.close()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -35,9 +34,9 @@ def last_t_ns(message: Score | Alarm) -> int:
     return int(np.max(message.t_ns))
 
 
-def live_view(folder: Path, layout: str = "all", **config: Any) -> Path:
+def live_view(folder: Path) -> Path:
     """What the stage writes while messages come one by one."""
-    core = build(context(folder, layout=layout, **config)).core
+    core = build(context(folder)).core
     for number, message in enumerate(messages()):
         core.step(sent(message))
         core.tick(START_NS + number * 37_000_000)
@@ -55,5 +54,6 @@ def recording(folder: Path) -> Path:
 
 
 def recorded_view(folder: Path, layout: str = "all") -> Path:
+    folder.mkdir(exist_ok=True)
     view([recording(folder)], folder / "recorded.rrd", ViewLayout(layout), json_output=True)
     return folder / "recorded.rrd"

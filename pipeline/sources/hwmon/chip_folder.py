@@ -24,8 +24,9 @@ class ChipFolder:
     name: str
     device: str
 
-    def is_called(self, name: str, device: str) -> bool:
-        """Return whether it is the chip of a configuration."""
+    def is_called(self, words: str) -> bool:
+        """Whether it is the chip of a configuration: NAME, or NAME@END with the end of the path of its device."""
+        name, _, device = words.partition("@")
         return self.name == name and (not device or f"/{self.device}".endswith(f"/{device.strip('/')}"))
 
     @cached_property
@@ -81,14 +82,14 @@ def chip_folders(root: Path) -> list[ChipFolder]:
     return sorted(found, key=lambda chip: (chip.name, chip.device, chip.path.name))
 
 
-def device_words(chip: ChipFolder, all_chips: Sequence[ChipFolder]) -> str:
-    """The end of the path of its device that no other chip of its name has; empty if it is the only one."""
+def chip_words(chip: ChipFolder, all_chips: Sequence[ChipFolder]) -> str:
+    """Its name, and where others have the same one, the end of the path of its device that none of them has."""
     others = [other for other in all_chips if other.name == chip.name and other is not chip]
     if not others or not chip.device:
-        return ""
+        return chip.name
     parts = chip.device.split("/")
     for count in range(1, len(parts) + 1):
-        end = "/".join(parts[-count:])
-        if not any(other.is_called(chip.name, end) for other in others):
-            return end
-    return chip.device
+        words = f"{chip.name}@{'/'.join(parts[-count:])}"
+        if not any(other.is_called(words) for other in others):
+            return words
+    return f"{chip.name}@{chip.device}"

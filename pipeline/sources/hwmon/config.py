@@ -21,11 +21,9 @@ class HwmonConfig(PolledConfig, frozen=True):
 
     kind: Literal["hwmon"] = "hwmon"
     chip: str = Field(
-        min_length=1, description="`name` of the chip, for example nct6798; `fantwin doctor find` lists them"
-    )
-    device: str = Field(
-        default="",
-        description="end of the path of its device; needed where several chips have the same name",
+        min_length=1,
+        description="`name` of the chip, for example nct6798; where several have the same name, with the end of the "
+        "path of its device: emc2305@1-002f. `fantwin doctor find` lists them",
     )
     fans: tuple[Number, ...] = Field(
         default=(),
@@ -51,6 +49,11 @@ class HwmonConfig(PolledConfig, frozen=True):
     root: Path = Field(default=ROOT, description="folder of the chips")
 
     @property
+    def chip_name(self) -> str:
+        """The name of the chip, without its device."""
+        return self.chip.partition("@")[0]
+
+    @property
     def why_no_commands(self) -> str:
         """Commands are written only if `writable` is set."""
         return "" if self.writable else "its source does not have writable = true"
@@ -58,5 +61,5 @@ class HwmonConfig(PolledConfig, frozen=True):
     @property
     def stated_tachos(self) -> tuple[Tacho, ...]:
         """Tachos as the driver of the chip measures, where that is known."""
-        chip = chip_of(self.chip)
+        chip = chip_of(self.chip_name)
         return (chip.tacho,) if chip and chip.tacho else ()

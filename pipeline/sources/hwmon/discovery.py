@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from fantwin.pipeline.sources.hwmon.chip_folder import ChipFolder, chip_folders, device_words
+from fantwin.pipeline.sources.hwmon.chip_folder import ChipFolder, chip_folders, chip_words
 from fantwin.pipeline.sources.hwmon.chip_table import chip_of
 from fantwin.pipeline.sources.hwmon.config import ROOT
 
@@ -117,9 +117,7 @@ def _of_chip(chip: ChipFolder, chips: Sequence[ChipFolder], root: Path, names: s
     notes.append(f"measures {row.tacho} ({row.source})" if row and row.tacho else _unknown(chip.name))
     if row and row.note:
         notes.append(row.note)
-    source: dict[str, Any] = {"kind": "hwmon", "chip": chip.name}
-    if device := device_words(chip, chips):
-        source["device"] = device
+    source: dict[str, Any] = {"kind": "hwmon", "chip": chip_words(chip, chips)}
     source["fans"] = fans
     if writable:
         source["writable"] = True

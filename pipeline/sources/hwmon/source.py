@@ -18,7 +18,7 @@ from pydantic import BaseModel, ValidationError
 
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.files import replace_file
-from fantwin.pipeline.sources.hwmon.chip_folder import ChipFolder, chip_folders, device_words
+from fantwin.pipeline.sources.hwmon.chip_folder import ChipFolder, chip_folders, chip_words
 from fantwin.pipeline.sources.hwmon.chip_table import chip_of
 from fantwin.pipeline.sources.hwmon.config import HwmonConfig
 from fantwin.pipeline.sources.polling import DeviceError, PollingSource
@@ -59,7 +59,7 @@ class HwmonSource(PollingSource):
         super().__init__(config, config.period_s)
         self._config = config
         self._root = context.folder / config.root
-        self._quirks = chip_of(config.chip)
+        self._quirks = chip_of(config.chip_name)
         self._units_per_rpm = context.units_per_rpm
         fans = config.fans or tuple(range(1, context.fans + 1))
         if len(fans) != context.fans:
@@ -185,15 +185,14 @@ class HwmonSource(PollingSource):
             chips = chip_folders(self._root)
         except OSError as error:
             raise DeviceError(f"{self._root}: {error.strerror}; correct root") from error
-        found = [chip for chip in chips if chip.is_called(config.chip, config.device)]
+        found = [chip for chip in chips if chip.is_called(config.chip)]
         if len(found) > 1:
-            devices = ", ".join(repr(device_words(chip, chips)) for chip in found)
-            raise DeviceError(f"{len(found)} chips are called {config.chip}: name one by device = {devices}")
+            names = ", ".join(repr(chip_words(chip, chips)) for chip in found)
+            raise DeviceError(f"{len(found)} chips are called {config.chip}: name one by chip = {names}")
         if not found:
             there = ", ".join(dict.fromkeys(chip.name for chip in chips)) or "none"
-            of_device = f" with device {config.device}" if config.device else ""
             raise DeviceError(
-                f"no chip is called {config.chip}{of_device} in {self._root}; there are: {there}; load its driver, or "
+                f"no chip is called {config.chip} in {self._root}; there are: {there}; load its driver, or "
                 "see `fantwin doctor find`"
             )
         return found[0]

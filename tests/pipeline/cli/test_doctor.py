@@ -132,7 +132,6 @@ def test_the_ports_of_the_own_running_site_are_no_problem_and_those_of_a_strange
         settings = [f"tray.0.port='{port}'", f"run_folder='{tmp_path}'", f"bus.endpoint='{endpoint}'"]
         settings += [
             f"viewer.grpc_port={viewer_port}",
-            "viewer.web_port=0",
             "launcher.stages=['resampler', 'viewer']",
         ]
         code, found = examine(DEMO / "demo.toml", *settings)

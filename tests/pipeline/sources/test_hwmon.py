@@ -77,11 +77,13 @@ def test_two_chips_of_one_name_are_told_apart_by_their_devices(root: Path) -> No
     board(root, 0, "i2c-1/1-002f")
     other = board(root, 1, "i2c-1/1-0020")
     (other / "fan1_input").write_text("450\n")
-    with pytest.raises(DeviceError, match="2 chips are called nct6798: name one by device = '1-0020', '1-002f'"):
+    with pytest.raises(
+        DeviceError, match="2 chips are called nct6798: name one by chip = 'nct6798@1-0020', 'nct6798@1-002f'"
+    ):
         connected(root)
-    assert reading(connected(root, device="1-0020")).speed[0] == 450.0
-    with pytest.raises(DeviceError, match="no chip is called nct6798 with device 1-00 in"):
-        connected(root, device="1-00")
+    assert reading(connected(root, chip="nct6798@1-0020")).speed[0] == 450.0
+    with pytest.raises(DeviceError, match="no chip is called nct6798@1-00 in"):
+        connected(root, chip="nct6798@1-00")
 
 
 def test_files_that_cannot_be_read_are_nan_but_without_its_command_a_reading_is_refused(root: Path) -> None:

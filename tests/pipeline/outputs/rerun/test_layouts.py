@@ -53,7 +53,7 @@ def test_each_layout_of_a_live_view_a_recording_and_a_fleet_opens_without_a_repo
 ) -> None:
     made = {
         live_view(tmp_path / "all"): plots("tray1/0", "tray1/1", "tray1/2") | {"temperature (°C)"},
-        live_view(tmp_path / "wear", "wear"): {"tray1 / speed since commissioning (%)"},
+        recorded_view(tmp_path / "wear", "wear"): {"tray1 / speed since commissioning (%)"},
         recorded_view(tmp_path, "alarms"): plots("tray1/2") | {"temperature (°C)"},
     }
     monkeypatch.setattr("fantwin.pipeline.outputs.rerun.fleet_view.FLEET_ABOVE", 3)
@@ -74,7 +74,7 @@ def test_each_layout_of_a_live_view_a_recording_and_a_fleet_opens_without_a_repo
 def test_a_live_viewer_follows_an_old_recording(tmp_path: Path) -> None:
     scores, _ = made_up_tray(seconds=5)
     port = free_port()
-    core = build(context(tmp_path, grpc_port=port, web_port=0)).core
+    core = build(context(tmp_path, grpc_port=port)).core
     with headless_viewer() as viewer:
         viewer.open(f"rerun+http://127.0.0.1:{port}/proxy")
         for number, item in enumerate(scores):

@@ -37,7 +37,7 @@ def test_each_chip_with_fans_is_a_tray_that_reads_what_is_there(root: Path) -> N
         assert isinstance(tray.source, HwmonConfig) and not tray.source.writable
         assert build_source(tray.source, SourceContext(tray.fans, tray.speed_unit, Path())).check() == []
     first = found[0]
-    assert first.tray["source"]["device"] == "1-002f" and first.tray["source"]["fans"] == [1, 2]
+    assert first.tray["source"]["chip"].endswith("@1-002f") and first.tray["source"]["fans"] == [1, 2]
     assert "fan3 at 0 rpm although commanded to turn, left out: not connected?" in first.missing
     assert first.notes[:2] == ("fan 0 is fan1_input: 900 rpm", "fan 1 is fan2_input: 1200 rpm")
     assert "# fan 0 is fan1_input: 900 rpm\n" in first.toml
