@@ -23,8 +23,6 @@ from fantwin.pipeline.recordings.scan import Contents, scan
 from fantwin.schemas.enums import StageStatus
 from tests.support.running_chain import DEADLINE_S, FANTWIN, eventually
 
-FLUSH_S = 1.0
-
 
 @dataclass
 class Outcome:
@@ -71,7 +69,7 @@ class Kills:
         tables = "".join(f'[[tray]]\nname = "tray{number + 1}"\nfans = {fans}\n' for number in range(trays))
         self._config.write_text(
             f'site = "{SITE}"\nrun_folder = "runs"\n[bus]\nendpoint = "{endpoint}"\n'
-            f"[recorder]\nflush_interval_s = {FLUSH_S}\ntopics = {list(TOPICS)}\n{tables}"
+            f"[recorder]\ntopics = {list(TOPICS)}\n{tables}"
         )
         self._sent = folder / "sent.json"
         words = [sys.executable, str(Path(__file__).with_name("recorder_feed.py"))]
