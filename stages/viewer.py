@@ -28,7 +28,7 @@ from fantwin.pipeline.runtime.stage import BuiltStage, Context, Stage, StageConf
 from fantwin.pipeline.site.fleet import Fan
 from fantwin.pipeline.site.loopback import check_free
 
-PAGE_BELOW_DATA = 9876 - 9090
+PAGE_ABOVE_DATA = 100
 """between the port of the data and that of the page, as between those that Rerun takes by itself"""
 FILE_BYTES = 1_000_000_000
 """size at which the view's file ends"""
@@ -45,9 +45,9 @@ class ViewerConfig(StageConfig):
     grpc_port: int = Field(
         default=9876,
         ge=0,
-        le=65535,
+        le=65435,
         description="port on this host (127.0.0.1) for the data of live viewers, native and in a browser; the page of "
-        "the latter has the port 786 below it, 9090; shard K uses the K-th ports from there on; 0: no live viewers",
+        "the latter has the port 100 above it, 9976; shard K uses the K-th ports from there on; 0: no live viewers",
     )
     show: tuple[str, ...] = Field(
         default=(), max_length=64, description='fans of a fleet that always have a plot: ["tray1/3", "tray2/0"]'
@@ -56,7 +56,7 @@ class ViewerConfig(StageConfig):
     @property
     def web_port(self) -> int:
         """The port of the browser viewer's page; 0: no page."""
-        return self.grpc_port - PAGE_BELOW_DATA if self.grpc_port else 0
+        return self.grpc_port + PAGE_ABOVE_DATA if self.grpc_port else 0
 
     @field_validator("grpc_port")
     @classmethod

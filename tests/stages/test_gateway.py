@@ -291,7 +291,7 @@ def test_a_fan_shows_its_wear_its_advice_and_where_rerun_is(opened, tmp_path):
     assert "filter" in worn["alarm"]["advice"]
     assert client.ask("GET", f"/api/v1/fans/{TRAY}/1")[1]["wear"] == []
     (tray,) = client.ask("GET", "/api/v1/site")[1]["trays"]
-    assert tray["viewer_url"] == "http://127.0.0.1:9090/?url=rerun%2Bhttp%3A%2F%2F127.0.0.1%3A9876%2Fproxy"
+    assert tray["viewer_url"] == "http://127.0.0.1:9976/?url=rerun%2Bhttp%3A%2F%2F127.0.0.1%3A9876%2Fproxy"
 
 
 RAISED_NS = 1_800_000_000_000_000_000
