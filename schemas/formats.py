@@ -37,6 +37,6 @@ class Format:
 RECORDING = Format("a recording", 3, (3,), "read it with the version of fantwin that wrote it, or record again")
 TWIN_CARD = Format("a twin card", 1, (1,), "train the twin again")
 SNAPSHOT = Format(
-    "a scorer's snapshot", 5, (5,), "remove it to start without one; what was learned of the fans is then learned again"
+    "a scorer's snapshot", 6, (6,), "remove it to start without one; what was learned of the fans is then learned again"
 )
 CONFIGURATION = Format("a configuration", 1, (1,), "write format = 1, or leave it out")

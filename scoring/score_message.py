@@ -11,6 +11,7 @@ from fantwin.schemas.channels import measured_columns
 from fantwin.schemas.enums import FanState, InvalidReason, Statistic
 from fantwin.schemas.messages import Array, Prediction, Score
 from fantwin.scoring.samples import BALANCE_COUNTS, among, arrived
+from fantwin.scoring.saved import Saved
 
 BAND_SIGMAS = 2.0
 NONE, WARMING_UP = np.uint8(InvalidReason.NONE), np.uint8(InvalidReason.WARMING_UP)
@@ -24,10 +25,14 @@ IDLE_STATES = (
 """reasons of a fan that is not scored because its command stops it, or has just started it"""
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class ScoreColumns:
+@dataclass(eq=False, kw_only=True)
+class ScoreColumns(Saved):
     """Decisions on fans: (fans,) each, or (n, fans) for the rows of a block."""
 
+    KEPT = (
+        *("score", "statistic", "is_active", "is_returning"),
+        *("expected_residual_rad_s", "expected_balance_command"),
+    )
     SUSPECT_FROM: ClassVar[float] = 0.5
     """score from which a fan is suspect"""
     score: Array

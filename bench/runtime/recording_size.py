@@ -13,7 +13,7 @@ import json
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -144,12 +144,12 @@ def snapshots_with_wear(recorded: Sequence[Envelope], points: int) -> list[Envel
     rng = np.random.default_rng(1)
     found: list[Envelope] = []
     for number in range(SNAPSHOTS):
-        for fan in state["wear"]["fans"]:
-            series = WearSeries()
+        for fan in range(len(state["wear"]["series"])):
+            series = WearSeries([], [], [])
             for point in range(points):
                 t_ns = START_NS + point * WEAR_EVERY_NS + int(rng.integers(WEAR_EVERY_NS))
                 series.add(t_ns, rng.normal(0.0, 0.02), rng.uniform(0.005, 0.02))
-            fan["series"] = series.snapshot()
+            state["wear"]["series"][fan] = asdict(series)
         message = replace(snapshot, state_json=json.dumps(state))
         found.append(Envelope.of(last.key, message, START_NS + 60 * number * NS_PER_S))
     return found

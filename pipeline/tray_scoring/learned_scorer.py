@@ -14,36 +14,23 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Protocol
 
 from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.prediction.new_samples import BEGINNING_NS, are_newer
 from fantwin.pipeline.prediction.tray_twin import TrayTwin, tray_twin, without_metadata
 from fantwin.pipeline.runtime.stage import Core, StageError
+from fantwin.pipeline.tray_scoring.scorer_core import ScorerCore
 from fantwin.pipeline.tray_scoring.snapshot_store import SnapshotStore
 from fantwin.pipeline.tray_scoring.tray_scorer import JudgedShare
 from fantwin.schemas.blocks import select
 from fantwin.schemas.messages import Message, ModelCard, Prediction, Request, ScorerSnapshot
 from fantwin.scoring.score_message import unscored
 
-
-class ScorerOfTwin(Core, Protocol):
-    """The scorer of one twin."""
-
-    def restore(self, snapshot: ScorerSnapshot) -> Sequence[Message]:
-        """Continue from a snapshot; returns the messages that report it."""
-        ...
-
-    def last_snapshot(self) -> Sequence[ScorerSnapshot]:
-        """The current state; empty before the first sample."""
-        ...
-
-
 MOST_HELD = 4096
 """messages that wait for their twin: 40 s at 100 Hz"""
 LIMITS = ("name", "calibration")
 """the entries of a card that do not affect predictions"""
-CoreOf = Callable[[TrayTwin, ScorerSnapshot | None], ScorerOfTwin]
+CoreOf = Callable[[TrayTwin, ScorerSnapshot | None], ScorerCore]
 """the core of a twin, which continues from the last snapshot of the one before it"""
 
 
@@ -55,7 +42,7 @@ class LearnedTwinScorer(Core):
         self._tray = tray
         self._core_of = core_of
         self._store = store
-        self._core: ScorerOfTwin | None = None
+        self._core: ScorerCore | None = None
         self._twin = ""
         """the name of the twin of the core"""
         self._cards: dict[str, ModelCard] = {}

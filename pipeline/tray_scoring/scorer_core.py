@@ -5,11 +5,9 @@ See docs/explanation/deciding.md.
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -17,7 +15,8 @@ from fantwin.pipeline.prediction.new_samples import BEGINNING_NS, NewSamples
 from fantwin.pipeline.runtime.stage import Core, never
 from fantwin.pipeline.tray_scoring.healthy_twin import HealthyTwin
 from fantwin.pipeline.tray_scoring.scorer_config import ScorerConfig
-from fantwin.pipeline.tray_scoring.snapshot_store import SnapshotStore, with_times_moved
+from fantwin.pipeline.tray_scoring.scorer_state import ScorerState, with_times_moved
+from fantwin.pipeline.tray_scoring.snapshot_store import SnapshotStore
 from fantwin.pipeline.tray_scoring.tray_scorer import JudgedShare, TrayScorer
 from fantwin.schemas.enums import Transition
 from fantwin.schemas.messages import Alarm, Message, ModelCard, Prediction, Request, Score, ScorerSnapshot
@@ -34,17 +33,17 @@ REST_NS_PER_FAN = 5_000_000  # between snapshots with alarms of a larger tray: e
 NOT_JUDGED_S = 10.0  # health names a fan that has had no score for this long: beyond the start of a free run
 SHOWN_NS = 60 * NS_PER_S  # how long health says that a snapshot was not used
 NEW_START = "what was learned of the fans, alarms and wear start from the beginning"
-WEAR_CONTINUES = "what was learned of the fans and alarms start from the beginning, wear continues"
-OPERATORS_KEPT = "shelved and out of service are kept"
-ANOTHER_TWIN = f"the snapshot is of another twin: {NEW_START}; {OPERATORS_KEPT}"
-EARLIER_TWIN = f"the snapshot is of the previous twin: {WEAR_CONTINUES}; {OPERATORS_KEPT}"
-READ_IN_PART = "the snapshot can be read in part only: {}; " + OPERATORS_KEPT
+ANOTHER_TWIN = f"the snapshot is of another twin: {NEW_START}; shelved and out of service are kept"
+EARLIER_TWIN = (
+    "the snapshot is of the previous twin: what was learned of the fans and alarms start from the beginning, wear "
+    "continues; shelved and out of service are kept"
+)
 NOT_READ = f"the snapshot cannot be read: {NEW_START}, and nothing is shelved or out of service"
 NOT_CALIBRATED = (
     "the twin is not calibrated: its alarms rest on what fans have in common, and their rate is not checked; "
     "see fantwin calibrate"
 )
-RESTORE_ERRORS = (ValueError, LookupError, TypeError, AttributeError, OverflowError, RecursionError)
+RESTORE_ERRORS = (ValueError, LookupError, TypeError, AttributeError, OverflowError)
 SET_BACK_NS = NS_PER_S  # a snapshot further ahead of the present is of a clock that was set back since
 
 
@@ -107,43 +106,27 @@ class ScorerCore(Core):
     def restore(self, snapshot: ScorerSnapshot) -> list[Alarm | ScorerSnapshot]:
         """Continue from a snapshot. Returns the messages that report it.
 
-        If it is of another twin, or what was learned of the fans cannot be read, as after an update, only what
-        belongs to operators is restored: shelved, out of service, and the requests already answered. The
-        wear is restored as well, if it can be read and the twin is the same or a learned one.
+        Of one by another twin only what belongs to operators is restored: shelved, out of service, and the requests
+        already answered; if the twin is a learned one, the wear as well. One that is damaged is refused as a whole.
         """
+        same_twin = snapshot.twin_sha256 == self._twin.sha256
+        self._start_new()
         try:
-            state = json.loads(snapshot.state_json)
-            self.tray.alarms.restore(state["alarms"])
-            input_producer = str(state["input_producer"])
+            state = ScorerState.of(snapshot)
+            self.tray.continue_from(state, same_twin=same_twin, keeps_wear=self._is_learned)
         except RESTORE_ERRORS:
             self._start_new()
             self._counts["snapshots_not_understood"] += 1
             self._not_restored = NOT_READ
             return []
-        if snapshot.twin_sha256 != self._twin.sha256:
+        if not same_twin:
             self._counts["snapshots_of_another_twin"] += 1
-            self._not_restored = EARLIER_TWIN if self._is_learned and self._restore_wear(state) else ANOTHER_TWIN
-        else:
-            try:
-                self.tray.restore_model(state)
-            except RESTORE_ERRORS:
-                self._start_new()
-                self.tray.alarms.restore(state["alarms"])
-                self._counts["snapshots_not_understood"] += 1
-                self._not_restored = READ_IN_PART.format(WEAR_CONTINUES if self._restore_wear(state) else NEW_START)
+            self._not_restored = EARLIER_TWIN if self._is_learned else ANOTHER_TWIN
         self._samples.last_t_ns = self._snapshot_t_ns = snapshot.t_ns
-        self._input_producer, self._is_restored = input_producer, True
+        self._input_producer, self._is_restored = state.input_producer, True
         if self._not_restored:
             return [replace(snapshot, restored=True), *self.tray.alarms.discard_all(snapshot.t_ns, keep_silenced=True)]
         return [replace(snapshot, restored=True), *self.tray.alarms.republish()]
-
-    def _restore_wear(self, state: Mapping[str, Any]) -> bool:
-        """Continue the wear, with a model that knows nothing of the fans yet; False if it cannot be read."""
-        try:
-            self.tray.wear.restore_of_earlier_twin(state["wear"])
-        except RESTORE_ERRORS:
-            return False
-        return True
 
     def _continued(self, snapshot: ScorerSnapshot) -> list[Alarm | ScorerSnapshot]:
         """Take over from another core; returns what has changed. Of another twin, only wear and what belongs to
@@ -242,9 +225,7 @@ class ScorerCore(Core):
         if item.header.producer == self._input_producer or ahead_ns < 0:
             return
         t_ns = first_t_ns - item.period_ns - 2 * round(FORGETS_S * NS_PER_S)
-        state = with_times_moved(self._state(), t_ns - self._samples.last_t_ns)
-        self._start_new()
-        self._at_start = self.restore(self._snapshot_of(t_ns, state))
+        self._at_start = self.restore(with_times_moved(self._snapshot(), t_ns - self._samples.last_t_ns))
         self._snapshot_t_ns = 0  # saved at once: a restart must not set back the same one again
         self._counts["snapshots_set_back"] += 1
         self._set_back_until_t_ns = first_t_ns + SHOWN_NS
@@ -298,14 +279,11 @@ class ScorerCore(Core):
     def _take_snapshot(self) -> list[ScorerSnapshot]:
         """The state for a restart."""
         self._snapshot_t_ns, self._owes_snapshot = self._samples.last_t_ns, False
-        snapshot = self._snapshot_of(max(self._samples.last_t_ns, 0), self._state())
+        snapshot = self._snapshot()
         if self._snapshot_store:
             self._snapshot_store.save(snapshot)
         return [snapshot]
 
-    def _snapshot_of(self, t_ns: int, state: Mapping[str, Any]) -> ScorerSnapshot:
-        state_json = json.dumps(state, allow_nan=False)
-        return ScorerSnapshot(t_ns=t_ns, twin_sha256=self._twin.sha256, state_json=state_json)
-
-    def _state(self) -> dict[str, Any]:
-        return {**self.tray.snapshot(), "input_producer": self._input_producer}
+    def _snapshot(self) -> ScorerSnapshot:
+        state = self.tray.state(self._input_producer)
+        return state.snapshot(max(self._samples.last_t_ns, 0), self._twin.sha256)

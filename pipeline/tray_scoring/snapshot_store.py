@@ -11,7 +11,6 @@ import os
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 from fantwin.pipeline.files import replace_file
 from fantwin.pipeline.runtime.stage import StageError
@@ -19,28 +18,6 @@ from fantwin.schemas.codec import CodecError, decode, encode
 from fantwin.schemas.formats import SNAPSHOT
 from fantwin.schemas.messages import ScorerSnapshot
 from fantwin.schemas.units import NS_PER_S
-
-NEVER_NS = 1 << 62  # times from here on, and those up to 0, are marks and no times
-
-
-def with_times_moved(state: Any, by_ns: int, *, is_time: bool = False) -> Any:
-    """A snapshot's state, as JSON values, with all absolute times moved by `by_ns`.
-
-    It is for a host clock that was set back while the site was stopped. Durations, values and arrays stay.
-    """
-    if isinstance(state, dict):
-        return {
-            name: with_times_moved(entry, by_ns, is_time=is_time or name.endswith("t_ns"))
-            if name != "arrays"
-            else entry
-            for name, entry in state.items()
-        }
-    if isinstance(state, list):
-        return [with_times_moved(entry, by_ns, is_time=is_time) for entry in state]
-    if is_time and isinstance(state, int) and 0 < state < NEVER_NS:
-        return max(1, state + by_ns)
-    return state
-
 
 RECENT_NS = 120 * NS_PER_S
 """a file that is no older, two periods of snapshots, is that of the last session, unless somebody knows a newer one"""

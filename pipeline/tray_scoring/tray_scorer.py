@@ -10,12 +10,12 @@ See docs/explanation/deciding.md.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 
 from fantwin.pipeline.tray_scoring.healthy_twin import HealthyTwin
 from fantwin.pipeline.tray_scoring.scorer_config import ScorerConfig
+from fantwin.pipeline.tray_scoring.scorer_state import ScorerState
 from fantwin.schemas.enums import InvalidReason, Severity, Statistic
 from fantwin.schemas.messages import Alarm, Array, Diagnosis, Prediction, Score
 from fantwin.schemas.units import NS_PER_S
@@ -28,8 +28,8 @@ from fantwin.scoring.diagnosis.ranked_causes import KNOWN_SOON, CauseWords, Poss
 from fantwin.scoring.diagnosis.standstill_causes import Standing, standstill_causes
 from fantwin.scoring.model.bins import Bin, Bins, bin_ns_of
 from fantwin.scoring.model.decision import Decision
-from fantwin.scoring.model.saved import as_json, from_json, part, within
 from fantwin.scoring.samples import IDLE, among, arrived
+from fantwin.scoring.saved import Saved, part
 from fantwin.scoring.score_message import ScoreColumns, score_of
 from fantwin.scoring.standing.against_command import KINDS, AgainstCommand
 from fantwin.scoring.standing.stands_still import Falls
@@ -68,8 +68,6 @@ class JudgedShare:
         return [f"{100 * self._judged / samples:.1f} % of the fans' samples judged{because}"]
 
 
-KEPT = ("seen", "command", "kind", "stands")
-"""arrays of a fan that a snapshot holds beside those of what the scorer consists of"""
 WEAR_EVERY_S = 600.0
 """between two points of the wear of a fan, which takes days to months"""
 NO_READING = KINDS.index(Standing.NO_READING)
@@ -77,8 +75,13 @@ NAMED_AFTER_S, FALLING_S = 3.0, 4.0
 """age of an onset from which a cause is named; time after an alarm in which a fan that lost much speed may stop"""
 
 
-class TrayScorer:
+class TrayScorer(Saved):
     """The scores, alarms and wear of one tray's fans. What it tells of a fan is that of the end of the last bin."""
+
+    KEPT = (
+        *("_period_ns", "_decision", "_bins", "_falls", "_against", "_now", "wear"),
+        *("_seen", "_command", "_kind", "_stands"),
+    )
 
     def __init__(self, fans: int, text: AlarmText, config: ScorerConfig, twin: HealthyTwin) -> None:
         """Begin with fans of which nothing is known but their twin, and without an alarm."""
@@ -284,49 +287,30 @@ class TrayScorer:
         self._seen[::2] = np.where(was_active, lowest, now[::2])
         self._seen[1::2] = np.where(was_active, highest, now[1::2])
 
-    def snapshot(self) -> dict[str, Any]:
-        """The state to continue from, as JSON values."""
-        times, arrays = self._decision.snapshot()
-        open_t_ns, of_bins = self._bins.snapshot()
-        arrays |= {
-            **within("bins", of_bins),
-            **within("falls", self._falls.arrays()),
-            **within("now", vars(self._now)),
-            **{name: getattr(self, f"_{name}") for name in KEPT},
-        }
-        if self._against:
-            arrays |= within("against", self._against.kept())
-        return {
-            "model": {
-                "period_ns": self._period_ns,
-                "open_t_ns": open_t_ns,
-                **times,
-                "arrays": as_json(arrays),
-            },
-            "alarms": self.alarms.snapshot(),
-            "wear": self.wear.snapshot(),
-        }
+    def state(self, input_producer: str) -> ScorerState:
+        """The state to continue from. input_producer: of the last block."""
+        return ScorerState(input_producer, self.arrays(), self.alarms.state, self.wear.state)
 
-    def restore_model(self, state: Mapping[str, Any]) -> None:
-        """Restore what was learned, of a snapshot of the same twin: all but the alarms' conditions.
+    def continue_from(self, state: ScorerState, *, same_twin: bool, keeps_wear: bool) -> None:
+        """Continue from a state.
+
+        same_twin: it is by this twin; else only the alarms are restored. keeps_wear: and the wear, as that of the same
+        fans by another twin.
 
         Raises:
-            ValueError, LookupError, TypeError, AttributeError, OverflowError, RecursionError: it cannot be read. Then
-                a part may have been restored.
+            ValueError, LookupError: it is damaged, or of other fans. A part may have been taken then.
         """
-        self.wear.restore(state["wear"])
-        of_model = state["model"]
-        stored = from_json(of_model["arrays"])
-        self._open(int(of_model["period_ns"]) or NS_PER_S)
-        self._decision.restore(stored, int(of_model["t_ns"]))
-        self._bins.restore(int(of_model["open_t_ns"]), part("bins", stored))
-        self._falls.restore(part("falls", stored))
-        if self._against:
-            self._against.restore(part("against", stored))
-        now = ScoreColumns(**part("now", stored))
-        fans = {stored[name].shape[-1:] for name in KEPT} | {column.shape for column in vars(now).values()}
-        if fans != {(self.fans,)}:
-            raise ValueError("what was seen of another number of fans")
-        self._now = now
-        for name in KEPT:
-            setattr(self, f"_{name}", stored[name])
+        if len(state.alarms.stood) != self.fans:
+            raise ValueError("a state of another number of fans")
+        self.alarms.state = state.alarms
+        if same_twin or keeps_wear:
+            self.wear.continue_from(state.wear, part("wear", state.arrays), same_twin=same_twin)
+        if same_twin:
+            self.restore(state.arrays)
+
+    def restore(self, stored: Mapping[str, Array]) -> None:
+        """See Saved."""
+        if stored["_period_ns"] < 0 or not np.isin(stored["_kind"], np.arange(len(KINDS))).all():
+            raise ValueError("an unknown period, or a fan that does something unknown")
+        self._open(int(stored["_period_ns"]) or NS_PER_S)
+        super().restore(stored)

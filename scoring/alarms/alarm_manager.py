@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any, Protocol
 
 import numpy as np
-from pydantic import TypeAdapter
 
 from fantwin.schemas.enums import Severity, Statistic, Transition
+from fantwin.schemas.fields import OpenEnum
 from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Alarm, Array, Diagnosis, Request
 from fantwin.schemas.units import NS_PER_S
 from fantwin.scoring.alarms.alarm_state import AlarmState, is_listed
 from fantwin.scoring.alarms.alarm_text import AlarmText
-from fantwin.scoring.alarms.alarms_of_tray import AlarmsOfTray, Decided, KeptConditions
+from fantwin.scoring.alarms.alarms_of_tray import AlarmsOfTray, Decided
 from fantwin.scoring.diagnosis.ranked_causes import says_more
+from fantwin.scoring.saved import Flags
 
 AGAIN_AFTER_S = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512)
 """times after an alarm was raised, or has another kind, at which its causes are looked at again; then each time the
@@ -61,40 +61,60 @@ class FanFacts(Protocol):
         ...
 
 
+@dataclass(eq=False)
+class AlarmsState:
+    """State of the alarms of a tray."""
+
+    conditions: AlarmsOfTray
+    stood: Flags
+    """(fans,) true where a fan stood or turned against its command at the last look"""
+    due_t_ns: dict[int, list[int]] = field(default_factory=dict)
+    """times at which the causes of each alarm are looked at again"""
+    last_emitted: dict[int, Alarm] = field(default_factory=dict)
+    """the last message about each fan"""
+    answered: dict[str, int] = field(default_factory=dict)
+    """sequence of the first request that is not answered, for each producer of requests"""
+
+    def __post_init__(self) -> None:
+        """Raises ValueError: it is damaged."""
+        fans = range(len(self.conditions.conditions))
+        if len(self.stood) != len(fans) or not {*self.due_t_ns} <= {*self.last_emitted} <= {*fans}:
+            raise ValueError("alarms of another number of fans")
+        if not all(self.due_t_ns.values()) or any(fan != alarm.fan for fan, alarm in self.last_emitted.items()):
+            raise ValueError("an alarm without times, or of another fan")
+        states = (condition.alarm_state for condition in self.conditions.conditions)
+        for each in (*states, *self.last_emitted.values()):
+            for value in (getattr(each, one.name) for one in fields(each)):
+                if isinstance(value, OpenEnum):
+                    type(value).known(value)
+
+
 class AlarmManager:
     """Keeps the alarms of a tray."""
 
     def __init__(self, fans: int, alarm_text: AlarmText) -> None:
         self._fans = fans
-        self._conditions = AlarmsOfTray(fans)
+        self.state = AlarmsState(AlarmsOfTray.begin(fans), np.zeros(fans, np.bool_))
         self._alarm_text = alarm_text
-        self._last_emitted: dict[int, Alarm] = {}
-        """the last message about each fan"""
-        self._stood = np.zeros(fans, np.bool_)
-        """(fans,) true where a fan stood or turned against its command at the last look"""
-        self._due_t_ns: dict[int, list[int]] = {}
-        """times at which the causes of each alarm are looked at again"""
-        self._answered: dict[str, int] = {}
-        """sequence of the first request that is not answered, for each producer of requests"""
         self.raised = self.cleared = 0
 
     @property
     def active(self) -> Array:
         """Return which fans have an active alarm, (fans,)."""
-        return self._conditions.active
+        return self.state.conditions.active
 
     def update(self, now: Decided, facts: FanFacts) -> list[Alarm]:
         """Process what was decided at the end of a bin; returns the messages."""
         alarms: list[Alarm] = []
-        for event in self._conditions.update(now):
+        for event in self.state.conditions.update(now):
             fan, before = event.fan, self._next_message(event.fan)
             changed, measured = _state_fields(event.alarm_state), facts.measured(fan)
             if not event.alarm_state.active:
                 self.cleared += event.transition == Transition.CLEARED
-                self._due_t_ns.pop(fan, None)
+                self.state.due_t_ns.pop(fan, None)
                 measured = replace(measured, statistic=before.statistic)  # nothing speaks for a fault any more
             elif event.transition == Transition.RAISED or (now.judged[fan] and _is_other(measured.statistic, before)):
-                self._due_t_ns[fan] = _again_after(now.t_ns)
+                self.state.due_t_ns[fan] = _again_after(now.t_ns)
                 changed["causes"] = facts.causes(fan)
             self.raised += event.transition == Transition.RAISED
             if event.transition != Transition.DATA_LOST:
@@ -105,22 +125,22 @@ class AlarmManager:
     def _diagnosed(self, now: Decided, facts: FanFacts) -> list[Alarm]:
         """The messages on causes that are news."""
         stands = facts.stands_against_command
-        begins = np.flatnonzero(stands & ~self._stood & now.active).tolist()
-        self._stood = stands.copy()
-        due = {fan for fan, times in self._due_t_ns.items() if times[0] <= now.t_ns}
+        begins = np.flatnonzero(stands & ~self.state.stood & now.active).tolist()
+        self.state.stood = stands.copy()
+        due = {fan for fan, times in self.state.due_t_ns.items() if times[0] <= now.t_ns}
         for fan in due:
-            left = [t_ns for t_ns in self._due_t_ns[fan] if t_ns > now.t_ns]
-            self._due_t_ns[fan] = left or [now.t_ns + AGAIN_AFTER_S[-1] * NS_PER_S]
+            left = [t_ns for t_ns in self.state.due_t_ns[fan] if t_ns > now.t_ns]
+            self.state.due_t_ns[fan] = left or [now.t_ns + AGAIN_AFTER_S[-1] * NS_PER_S]
         alarms: list[Alarm] = []
-        for fan in self._due_t_ns:
-            before = self._last_emitted[fan]
+        for fan in self.state.due_t_ns:
+            before = self.state.last_emitted[fan]
             if not before.active or before.stale or not now.judged[fan]:
                 continue
             is_other = _is_other(facts.statistic(fan), before)
             if not (is_other or fan in due or fan in begins):
                 continue
             if is_other:
-                self._due_t_ns[fan] = _again_after(now.t_ns)
+                self.state.due_t_ns[fan] = _again_after(now.t_ns)
             causes = facts.causes(fan, () if is_other else before.causes)
             if is_other or _is_news(causes, before.causes):
                 changed = {"t_ns": now.t_ns, "transition": Transition.DIAGNOSED, "causes": causes}
@@ -134,7 +154,7 @@ class AlarmManager:
         """
         if not self._is_new(request.header):
             return []
-        answers = self._conditions.request(
+        answers = self.state.conditions.request(
             request.action,
             range(self._fans) if request.fan < 0 else (request.fan,),
             last_t_ns or request.t_ns,
@@ -154,8 +174,8 @@ class AlarmManager:
                 request=f"{request.header.producer}/{request.header.sequence}",
                 operator_name=request.operator_name,
                 comment=request.comment,
-                marked_onset_t_ns=self._conditions.onset_meant(fan, request.onset_t_ns) if is_marked else 0,
-                **(_state_fields(self._conditions.alarm_state(fan)) if exists else {}),
+                marked_onset_t_ns=self.state.conditions.onset_meant(fan, request.onset_t_ns) if is_marked else 0,
+                **(_state_fields(self.state.conditions.alarm_state(fan)) if exists else {}),
             )
             alarms.append(self._emit(alarm, refusal) if exists else replace(alarm, message=f"fan {fan}: {refusal}"))
         return alarms
@@ -170,61 +190,37 @@ class AlarmManager:
         keep_silenced: shelved and out of service stay as set.
         """
         fans = self._listed()
-        self._conditions.discard_all(keep_silenced=keep_silenced)
-        self._last_emitted, self._due_t_ns = {}, {}
+        self.state.conditions.discard_all(keep_silenced=keep_silenced)
+        self.state.last_emitted, self.state.due_t_ns = {}, {}
         alarms: list[Alarm] = []
         for fan in fans:
-            fields = _state_fields(self._conditions.alarm_state(fan))
-            self._last_emitted[fan] = replace(self._next_message(fan), t_ns=t_ns, **fields)
+            now = _state_fields(self.state.conditions.alarm_state(fan))
+            self.state.last_emitted[fan] = replace(self._next_message(fan), t_ns=t_ns, **now)
             alarms.append(self._republished(fan))
         return alarms
 
     def _listed(self) -> list[int]:
         """Fans with a message whose alarm is retained or silenced."""
-        return [fan for fan in sorted(self._last_emitted) if is_listed(self._conditions.alarm_state(fan))]
+        return [fan for fan in sorted(self.state.last_emitted) if is_listed(self.state.conditions.alarm_state(fan))]
 
     def _republished(self, fan: int) -> Alarm:
-        now = self._conditions.alarm_state(fan)
+        now = self.state.conditions.alarm_state(fan)
         alarm = replace(self._next_message(fan), transition=Transition.REPUBLISHED)
         return self._emit(replace(alarm, operator_name=now.acknowledged_by, comment=now.comment))
 
-    def snapshot(self) -> dict[str, Any]:
-        """The whole state, as JSON values."""
-        stood = self._stood.tolist()
-        kept = _Kept(self._conditions.kept, self._due_t_ns, stood, self._last_emitted, self._answered)
-        return dict(_KEPT.dump_python(kept, mode="json", exclude_defaults=True))
-
-    def restore(self, stored: Mapping[str, Any]) -> None:
-        """Continue from a snapshot of the same number of fans. Nothing has changed if this raises.
-
-        Raises:
-            ValueError, OverflowError: it is not such a snapshot.
-        """
-        kept = _KEPT.validate_python(stored)
-        named = {*kept.due_t_ns, *kept.last_emitted}
-        if not named <= set(range(self._fans)) or not all(kept.due_t_ns.values()):
-            raise ValueError("an alarm of a fan that does not exist, or without times")
-        if any(fan != alarm.fan for fan, alarm in kept.last_emitted.items()):
-            raise ValueError("an alarm of another fan")
-        if len(kept.stood) != self._fans:
-            raise ValueError(f"a snapshot of alarms, but not of {self._fans} fans")
-        self._conditions.restore(kept.conditions)
-        self._due_t_ns, self._last_emitted, self._answered = kept.due_t_ns, kept.last_emitted, kept.answered
-        self._stood = np.array(kept.stood)
-
     def _is_new(self, header: Header) -> bool:
         """Return whether a request is not yet answered. A restarted scorer receives again what producers still hold."""
-        if header.sequence < self._answered.get(header.producer, 0):
+        if header.sequence < self.state.answered.get(header.producer, 0):
             return False
-        self._answered.pop(header.producer, None)  # re-inserted at the end: the latest requesters are kept
-        self._answered[header.producer] = header.sequence + 1
-        while len(self._answered) > MAX_REQUESTERS:
-            del self._answered[next(iter(self._answered))]
+        self.state.answered.pop(header.producer, None)  # re-inserted at the end: the latest requesters are kept
+        self.state.answered[header.producer] = header.sequence + 1
+        while len(self.state.answered) > MAX_REQUESTERS:
+            del self.state.answered[next(iter(self.state.answered))]
         return True
 
     def _next_message(self, fan: int) -> Alarm:
         """The last message about a fan without the fields of that event alone: the template of the next one."""
-        last = self._last_emitted.get(fan) or Alarm(
+        last = self.state.last_emitted.get(fan) or Alarm(
             fan=fan,
             active=False,
             severity=Severity.NONE,
@@ -247,14 +243,14 @@ class AlarmManager:
             and other.statistic == alarm.statistic != Statistic.MISSING_READINGS
             and _is_slower(other) == _is_slower(alarm)
             and abs(other.onset_t_ns - alarm.onset_t_ns) <= AT_ONCE_NS
-            for fan, other in self._last_emitted.items()
+            for fan, other in self.state.last_emitted.items()
         )
         return found if found >= max(2, self._fans // 2) else 0
 
     def _emit(self, alarm: Alarm, refusal: str = "") -> Alarm:
         is_of_size = alarm.transition in (Transition.RAISED, Transition.SEVERITY)
         alarm = replace(alarm, message=self._alarm_text.of(alarm, refusal, self._alike(alarm) if is_of_size else 0))
-        self._last_emitted[alarm.fan] = alarm
+        self.state.last_emitted[alarm.fan] = alarm
         return alarm
 
 
@@ -281,17 +277,3 @@ def _is_slower(alarm: Alarm) -> bool:
 def _state_fields(state: AlarmState) -> dict[str, Any]:
     """The fields of an alarm message that carry its state."""
     return {name: value for name, value in asdict(state).items() if name not in ("acknowledged_by", "comment")}
-
-
-@dataclass(frozen=True)
-class _Kept:
-    """What a snapshot keeps of an AlarmManager: its fields, by the same names."""
-
-    conditions: KeptConditions
-    due_t_ns: dict[int, list[int]]
-    stood: list[bool]
-    last_emitted: dict[int, Alarm]
-    answered: dict[str, int]
-
-
-_KEPT = TypeAdapter(_Kept)

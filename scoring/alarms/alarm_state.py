@@ -80,23 +80,13 @@ class AlarmState:
     feedback_reason: str = ""
 
 
-@dataclass(frozen=True)
-class KeptCondition:
-    """What a snapshot keeps of a condition."""
-
-    state: AlarmState = AlarmState()
-    earlier_onsets_t_ns: tuple[int, ...] = ()
-    """onsets of the alarms before the present one, oldest first"""
-
-
+@dataclass
 class FanCondition:
     """Alarm of one fan, as a condition of OPC UA Part 9."""
 
-    def __init__(self, kept: KeptCondition | None = None) -> None:
-        """Continue from a state; None: an alarm that was never raised."""
-        kept = kept or KeptCondition()
-        self.alarm_state = kept.state
-        self._earlier_onsets_t_ns = kept.earlier_onsets_t_ns
+    alarm_state: AlarmState = AlarmState()
+    earlier_onsets_t_ns: tuple[int, ...] = ()
+    """onsets of the alarms before the present one, oldest first"""
 
     def update(self, *, active: bool, severity: Severity, onset_t_ns: int) -> Sequence[tuple[Transition, AlarmState]]:
         """Process what was decided, on data; returns the transitions, in order.
@@ -151,7 +141,7 @@ class FanCondition:
         operators may still give feedback on the alarms of before."""
         self._keep_onset()
         if not keep_silenced:
-            self._earlier_onsets_t_ns = ()
+            self.earlier_onsets_t_ns = ()
         before, self.alarm_state = self.alarm_state, AlarmState()
         if keep_silenced:
             self.alarm_state = AlarmState(
@@ -168,7 +158,7 @@ class FanCondition:
     def onset_meant(self, onset_t_ns: int) -> int:
         """The onset of the alarm that feedback is about, ns: of the one nearest to `onset_t_ns` within the tolerance,
         or of the last one where that is 0. 0: there is none."""
-        known = (*self._earlier_onsets_t_ns, *self._own_onset())
+        known = (*self.earlier_onsets_t_ns, *self._own_onset())
         if not onset_t_ns:
             return known[-1] if known else 0
         nearest = min(known, key=lambda each: abs(each - onset_t_ns), default=0)
@@ -209,19 +199,14 @@ class FanCondition:
         self.alarm_state = replace(self.alarm_state, **changed, comment=comment or self.alarm_state.comment)
         return transition, ""
 
-    @property
-    def kept(self) -> KeptCondition:
-        """The whole state."""
-        return KeptCondition(self.alarm_state, self._earlier_onsets_t_ns)
-
     def _own_onset(self) -> tuple[int, ...]:
         """The onset of the present occurrence, if an alarm was raised."""
         return () if self.alarm_state.severity == Severity.NONE else (self.alarm_state.onset_t_ns,)
 
     def _keep_onset(self) -> None:
         """The present occurrence becomes an earlier one."""
-        known = (*self._earlier_onsets_t_ns, *self._own_onset())
-        self._earlier_onsets_t_ns = known[-EARLIER_ALARMS:]
+        known = (*self.earlier_onsets_t_ns, *self._own_onset())
+        self.earlier_onsets_t_ns = known[-EARLIER_ALARMS:]
 
     def _take_feedback(
         self, action: Action, operator_name: str, reason: str, onset_t_ns: int

@@ -8,19 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 
 from fantwin.schemas.enums import Action, Severity, Transition
 from fantwin.schemas.messages import Array
-from fantwin.scoring.alarms.alarm_state import (
-    DATA_LOST_AFTER_NS,
-    UNTIL_IT_CLEARS_T_NS,
-    AlarmState,
-    FanCondition,
-    KeptCondition,
-)
+from fantwin.scoring.alarms.alarm_state import DATA_LOST_AFTER_NS, UNTIL_IT_CLEARS_T_NS, AlarmState, FanCondition
 from fantwin.scoring.column_state import NEVER_NS
+from fantwin.scoring.saved import Times
 
 
 @dataclass(frozen=True)
@@ -48,33 +44,34 @@ class Decided:
     """time between two decisions"""
 
 
-@dataclass(frozen=True)
-class KeptConditions:
-    """What a snapshot keeps of the conditions of a tray."""
-
-    fans: list[KeptCondition]
-    judged_t_ns: list[int]
-    """time when each was judged last"""
-
-
+@dataclass(eq=False)
 class AlarmsOfTray:
     """Conditions of a tray, one for each fan."""
 
-    def __init__(self, fans: int) -> None:
-        self._conditions = [FanCondition() for _ in range(fans)]
-        self._judged_t_ns = np.full(fans, NEVER_NS, np.int64)
-        """(fans,) time when each was judged last"""
+    conditions: list[FanCondition]
+    judged_t_ns: Times
+    """(fans,) time when each was judged last"""
+
+    def __post_init__(self) -> None:
+        """Raises ValueError, OverflowError: there are others of fans or of times."""
+        if len(self.judged_t_ns) != len(self.conditions):
+            raise ValueError(f"times of {len(self.judged_t_ns)} fans, and alarms of {len(self.conditions)}")
         self._refresh_all()
+
+    @classmethod
+    def begin(cls, fans: int) -> Self:
+        """Conditions of fans whose alarms were never raised."""
+        return cls([FanCondition() for _ in range(fans)], np.full(fans, NEVER_NS, np.int64))
 
     def update(self, now: Decided) -> list[AlarmEvent]:
         """Process a decision; returns the events, sorted by fan."""
-        judged, since_ns = now.judged, now.t_ns - self._judged_t_ns
+        judged, since_ns = now.judged, now.t_ns - self.judged_t_ns
         longest_ns = max(DATA_LOST_AFTER_NS, now.every_ns * 3 // 2)
-        lost = self._active & (self._judged_t_ns != NEVER_NS) & (since_ns > longest_ns)
+        lost = self._active & (self.judged_t_ns != NEVER_NS) & (since_ns > longest_ns)
         unshelved = self._shelved_until_t_ns <= now.t_ns
         events: list[AlarmEvent] = []
         for fan in np.flatnonzero(lost | unshelved | (judged & (self._active | now.active))).tolist():
-            condition = self._conditions[fan]
+            condition = self.conditions[fan]
             transitions = list(condition.lose_data()) if lost[fan] else []
             if unshelved[fan]:
                 transitions.append(condition.unshelve())
@@ -85,7 +82,7 @@ class AlarmsOfTray:
                 )
             events += [AlarmEvent(fan, *transition) for transition in transitions]
             self._refresh(fan)
-        self._judged_t_ns = np.where(judged, now.t_ns, self._judged_t_ns)
+        self.judged_t_ns = np.where(judged, now.t_ns, self.judged_t_ns)
         return events
 
     def request(
@@ -105,17 +102,17 @@ class AlarmsOfTray:
         """
         answers: list[tuple[int, Transition, str]] = []
         for fan in fans:
-            if not 0 <= fan < len(self._conditions):
-                answers.append((fan, Transition.REFUSED, f"there are fans 0 to {len(self._conditions) - 1}"))
+            if not 0 <= fan < len(self.conditions):
+                answers.append((fan, Transition.REFUSED, f"there are fans 0 to {len(self.conditions) - 1}"))
                 continue
-            answer = self._conditions[fan].request(action, now_t_ns, duration_ns, operator_name, comment, onset_t_ns)
+            answer = self.conditions[fan].request(action, now_t_ns, duration_ns, operator_name, comment, onset_t_ns)
             answers.append((fan, *answer))
             self._refresh(fan)
         return answers
 
     def onset_meant(self, fan: int, onset_t_ns: int) -> int:
         """The onset of the alarm of a fan that feedback is about, see FanCondition.onset_meant."""
-        return self._conditions[fan].onset_meant(onset_t_ns)
+        return self.conditions[fan].onset_meant(onset_t_ns)
 
     @property
     def active(self) -> Array:
@@ -124,40 +121,22 @@ class AlarmsOfTray:
 
     def alarm_state(self, fan: int) -> AlarmState:
         """The present state of a fan's alarm."""
-        return self._conditions[fan].alarm_state
+        return self.conditions[fan].alarm_state
 
     def discard_all(self, *, keep_silenced: bool) -> None:
         """Return all alarms to never raised. keep_silenced: shelved and out of service stay as set."""
-        for condition in self._conditions:
+        for condition in self.conditions:
             condition.discard(keep_silenced=keep_silenced)
         self._refresh_all()
 
-    @property
-    def kept(self) -> KeptConditions:
-        """The whole state."""
-        return KeptConditions([condition.kept for condition in self._conditions], self._judged_t_ns.tolist())
-
-    def restore(self, kept: KeptConditions) -> None:
-        """Continue from a state. Nothing has changed if this raises.
-
-        Raises:
-            ValueError, OverflowError: it is one of another number of fans, or of impossible times.
-        """
-        if not len(kept.fans) == len(kept.judged_t_ns) == len(self._conditions):
-            raise ValueError(f"a snapshot of {len(kept.fans)} fans, here are {len(self._conditions)}")
-        np.array([fan.state.shelved_until_t_ns for fan in kept.fans], np.int64)  # raises
-        self._judged_t_ns = np.array(kept.judged_t_ns, np.int64)
-        self._conditions = [FanCondition(fan) for fan in kept.fans]
-        self._refresh_all()
-
     def _refresh_all(self) -> None:
-        self._active = np.zeros(len(self._conditions), np.bool_)
-        self._shelved_until_t_ns = np.full(len(self._conditions), UNTIL_IT_CLEARS_T_NS, np.int64)
-        for fan in range(len(self._conditions)):
+        self._active = np.zeros(len(self.conditions), np.bool_)
+        self._shelved_until_t_ns = np.full(len(self.conditions), UNTIL_IT_CLEARS_T_NS, np.int64)
+        for fan in range(len(self.conditions)):
             self._refresh(fan)
 
     def _refresh(self, fan: int) -> None:
         """Keep the columns by which `update` finds the fans to process; it skips the others."""
-        condition = self._conditions[fan]
+        condition = self.conditions[fan]
         self._active[fan] = condition.alarm_state.active
         self._shelved_until_t_ns[fan] = condition.alarm_state.shelved_until_t_ns or UNTIL_IT_CLEARS_T_NS

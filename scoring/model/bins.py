@@ -16,6 +16,7 @@ from fantwin.schemas.enums import InvalidReason
 from fantwin.schemas.messages import Array, Prediction
 from fantwin.schemas.units import NS_PER_S
 from fantwin.scoring.samples import BALANCE_COUNTS, NO_SPEED, among, reading_missing_of, reading_repeated_of
+from fantwin.scoring.saved import Saved
 from fantwin.scoring.unseen_error import UnseenError
 
 SHORTEST_S = 0.1
@@ -29,20 +30,8 @@ HAIR = 1e-3
 """share of a reading by which two samples must differ to be two readings"""
 RANKED_FROM = 4
 """least number of samples in a bin among which wrong ones are looked for"""
-COLUMNS = (
-    "measured",
-    "predicted",
-    "half_range",
-    "unseen",
-    "unseen_balance",
-    "command",
-    "balance",
-    "counts",
-    "another",
-    "missing",
-    "after_missing",
-    "pair",
-)
+VALUES = ("measured", "predicted", "half_range", "unseen", "unseen_balance", "command", "balance")
+FLAGS = ("counts", "another", "missing", "after_missing", "pair")
 """columns that are collected of samples, (n, fans) each"""
 READS = (int(InvalidReason.NONE), int(InvalidReason.WARMING_UP), NO_SPEED)
 """states in which a tacho should give readings"""
@@ -92,14 +81,18 @@ class Bin:
     """(fans, 4) readings after a reading, and those of them that are missing; after a missing one, and missing"""
 
 
-class Bins:
+class Bins(Saved):
     """Collects the samples of one tray."""
+
+    KEPT = ("_open_t_ns", "_open", "_before", "_newest_rad_s")
 
     def __init__(self, bin_ns: int, top_rad_s: Array, reads_balance: Array, unseen: UnseenError | None) -> None:
         """Begin without a sample. top_rad_s: (fans,); reads_balance: (fans,) as in `Fans`."""
         self._bin_ns, self._top, self._reads_balance, self._unseen = bin_ns, top_rad_s, reads_balance, unseen
-        self._parts: list[dict[str, Array]] = []
-        self._number = 0
+        self._open_t_ns = 0
+        """beginning of the open bin"""
+        self._open = self._unknown(0)
+        """its samples, (n, fans) each"""
         self.unseen_rad_s: Array | float = 0.0
         """(n, fans) error of the twin where it was not trained, in the samples of the last block"""
         self._before = np.zeros((2, len(top_rad_s)), np.bool_)
@@ -109,38 +102,26 @@ class Bins:
 
     def take(self, block: Prediction) -> Iterator[Bin]:
         """The bins that end with a sample of a block, or before it."""
-        columns, numbers = self._columns(block), block.t_ns // self._bin_ns
-        for rows in np.split(np.arange(len(numbers)), np.flatnonzero(np.diff(numbers)) + 1):
-            number = int(numbers[rows[0]])
-            if self._parts and number != self._number:
+        columns, begins_ns = self._columns(block), block.t_ns // self._bin_ns * self._bin_ns
+        for rows in np.split(np.arange(len(begins_ns)), np.flatnonzero(np.diff(begins_ns)) + 1):
+            begin_ns = int(begins_ns[rows[0]])
+            if len(self._open["measured"]) and begin_ns != self._open_t_ns:
                 yield self._close(int(rows[0]))
-            self._number = number
-            self._parts.append({name: column[rows] for name, column in columns.items()})
-            if int(block.t_ns[rows[-1]]) + block.period_ns >= (number + 1) * self._bin_ns:
+            self._open_t_ns = begin_ns
+            self._open = {name: np.concatenate((self._open[name], column[rows])) for name, column in columns.items()}
+            if int(block.t_ns[rows[-1]]) + block.period_ns >= begin_ns + self._bin_ns:
                 yield self._close(int(rows[-1]))
 
-    def snapshot(self) -> tuple[int, dict[str, Array]]:
-        """The time of the open bin, ns, 0 for none, and its samples."""
-        if not self._parts:
-            return 0, {"before": self._before, "newest": self._newest_rad_s}
-        return self._number * self._bin_ns, {"before": self._before, "newest": self._newest_rad_s, **self._open()}
+    def restore(self, stored: Mapping[str, Array]) -> None:
+        """See Saved."""
+        measured = stored["_open.measured"]
+        self._open = self._unknown(len(measured) if measured.size else 0)
+        super().restore(stored)
 
-    def restore(self, open_t_ns: int, stored: Mapping[str, Array]) -> None:
-        """Continue from a snapshot.
-
-        Raises:
-            KeyError, ValueError: it is of another number of fans.
-        """
-        kept = [stored[name] for name in COLUMNS] if open_t_ns else []
-        shapes = {stored["before"].shape[1:], stored["newest"].shape, *(each.shape[1:] for each in kept)}
-        if shapes != {self._top.shape}:
-            raise ValueError("samples of another number of fans")
-        self._before[...], self._newest_rad_s[...] = stored["before"], stored["newest"]
-        self._number = open_t_ns // self._bin_ns
-        self._parts = [{name: stored[name] for name in COLUMNS}] if open_t_ns else []
-
-    def _open(self) -> dict[str, Array]:
-        return {name: np.concatenate([part[name] for part in self._parts]) for name in self._parts[0]}
+    def _unknown(self, rows: int) -> dict[str, Array]:
+        """Columns of samples of which nothing is known."""
+        shape = (rows, len(self._top))
+        return {name: np.full(shape, np.nan) for name in VALUES} | {name: np.zeros(shape, np.bool_) for name in FLAGS}
 
     def _columns(self, block: Prediction) -> dict[str, Array]:
         fastest, reason = FASTEST * self._top, block.invalid_reason
@@ -183,8 +164,7 @@ class Bins:
         return known & differ(before, measured)
 
     def _close(self, row: int) -> Bin:
-        rows = self._open()
-        self._parts = []
+        rows, self._open = self._open, self._unknown(0)
         deviation = np.where(rows["counts"], rows["measured"] - rows["predicted"], np.nan)
         wrong = self._wrong(deviation, rows["half_range"])
         counts = rows["counts"] & ~wrong
@@ -194,7 +174,7 @@ class Bins:
         pair, after, missing = rows["pair"], rows["after_missing"], rows["missing"]
         transitions = (pair & ~after, pair & ~after & missing, pair & after, pair & after & missing)
         return Bin(
-            t_ns=(self._number + 1) * self._bin_ns,
+            t_ns=self._open_t_ns + self._bin_ns,
             row=row,
             judged=np.asarray((rows["counts"] | has_balance).any(axis=0)),
             deviations_rad_s=deviation,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,8 +17,8 @@ from fantwin.scoring.model.missing import MissingReadings
 from fantwin.scoring.model.onsets import Evidence, Hypotheses
 from fantwin.scoring.model.operation import Fans, Inputs, Operation
 from fantwin.scoring.model.priors import Priors
-from fantwin.scoring.model.saved import Saved, part, within
 from fantwin.scoring.model.wrong import FAR_SIGMAS, WrongReadings
+from fantwin.scoring.saved import Saved
 
 AGREED_SIGMAS = 8.0
 """standard deviations to which the filter clips the distance of a reading of a fan in alarm"""
@@ -57,21 +56,14 @@ class Change:
 class Decision(Saved):
     """Alarms of the fans of one tray. What it tells of a fan is that of the end of the last bin."""
 
+    LEARNED = (
+        *("model", "missing", "active", "_peak", "_over_s", "is_returning", "in_balance", "deviation_rad_s"),
+        *("deviation_std_rad_s", "_shape", "_is_probable", "_shows"),
+    )
+    """all that bins of another length go on with"""
     KEPT = (
-        "log_statistic",
-        "active",
-        "_raised",
-        "_peak",
-        "_over_s",
-        "onset",
-        "is_returning",
-        "in_balance",
-        "deviation_rad_s",
-        "deviation_std_rad_s",
-        "_shape",
-        "_is_probable",
-        "_shows",
-        "_newest",
+        *LEARNED,
+        *("log_statistic", "_raised", "onset", "_newest", "operation", "wrong", "_evidence", "alarms"),
     )
 
     def __init__(
@@ -174,11 +166,9 @@ class Decision(Saved):
 
     def go_on_from(self, before: Decision) -> None:
         """Take over what another one has learned, whose bins are of another length; evidence begins again."""
-        super().restore(before.arrays())
-        self.model.restore(before.model.arrays())
-        self.missing.restore(before.missing.arrays())
-        self.log_statistic[:] = -np.inf
-        self._raised[:] = self.onset[:] = self._newest[:] = 0
+        learned = before.arrays()
+        for name in self.LEARNED:
+            self.restore_one(name, learned)
         self._is_probable[:, self._hypotheses.stuck_rows] = False
 
     @property
@@ -196,37 +186,10 @@ class Decision(Saved):
             self.model.begin_again(fan)
             self._forget(fan)
 
-    def snapshot(self) -> tuple[dict[str, int], dict[str, Array]]:
-        """The state: times in ns, and arrays. Evidence that is small is not kept."""
-        kept = np.flatnonzero(self.score > KEPT_FROM)
-        arrays = {
-            **within("decision", self.arrays()),
-            **within("operation", self.operation.arrays()),
-            **within("model", self.model.arrays()),
-            **within("missing", self.missing.arrays()),
-            **within("wrong", self.wrong.arrays()),
-            **within("evidence", self._evidence.kept(kept)),
-        }
-        if len(self.alarms.fans):
-            arrays |= within("alarms", self.alarms.kept())
-        return {"t_ns": self.operation.t_ns}, arrays
-
-    def restore(self, stored: Mapping[str, Array], t_ns: int = 0) -> None:
-        """Continue from a snapshot.
-
-        Raises:
-            KeyError, ValueError: it is of another number of fans, or none.
-        """
-        super().restore(part("decision", stored))
-        self.operation.restore(part("operation", stored))
-        self.model.restore(part("model", stored))
-        self.missing.restore(part("missing", stored))
-        self.wrong.restore(part("wrong", stored))
-        self._evidence.restore_kept(part("evidence", stored))
-        self.operation.t_ns = t_ns
-        self.alarms.clear()
-        if of_alarms := part("alarms", stored):
-            self.alarms.restore(of_alarms)
+    def arrays(self) -> dict[str, Array]:
+        """See Saved. Evidence that is small is not kept, nor that of an alarm, which is in `alarms`."""
+        self._evidence.large = ~self.active & (self.log_statistic > KEPT_FROM * self.log_limit)
+        return super().arrays()
 
     def _rest(self, bins: int) -> None:
         """Let a gap pass."""

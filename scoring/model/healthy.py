@@ -34,7 +34,6 @@ counts. Nothing else widens a limit.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -42,7 +41,7 @@ import numpy as np
 from fantwin.schemas.messages import Array
 from fantwin.scoring.model.operation import Fans, Inputs
 from fantwin.scoring.model.priors import Priors
-from fantwin.scoring.model.saved import Saved
+from fantwin.scoring.saved import Saved
 
 KNOTS = np.array([0.09, 0.14, 0.2, 0.28, 0.38, 0.5, 0.63, 0.77, 0.9, 1.02])
 """shares of the top speed"""
@@ -93,7 +92,8 @@ class Innovation:
 class HealthyFans(Saved):
     """The filter, all fans as columns of one state: mean (fans, STATES) and covariance (fans, STATES, STATES)."""
 
-    KEPT = ("mean", "_has_begun", "_turns", "_before_rad_s")
+    KEPT = ("mean", "half_covariance", "_has_begun", "_turns", "_before_rad_s")
+    OF_FANS = ("mean", "covariance", "_has_begun", "_turns", "_before_rad_s")
 
     def __init__(self, fans: Fans, priors: Priors, bin_s: float, period_s: float) -> None:
         """Begin with the priors. period_s: of the samples."""
@@ -142,27 +142,25 @@ class HealthyFans(Saved):
     def of(self, fans: Array) -> HealthyFans:
         """A copy for some fans, (n,) by number."""
         copied = HealthyFans(self.fans.of(fans), self._priors, self._bin_s, self._period_s)
-        copied.mean, copied.covariance = self.mean[fans], self.covariance[fans]
-        for name in self.KEPT[1:]:
+        for name in self.OF_FANS:
             setattr(copied, name, getattr(self, name)[fans])
         return copied
 
     def continue_as(self, other: HealthyFans) -> None:
         """Take the states of the first fans from another of fewer fans."""
-        first = slice(len(other.mean))
-        self.covariance[first] = other.covariance
-        for name in self.KEPT:
-            getattr(self, name)[first] = getattr(other, name)
+        for name in self.OF_FANS:
+            getattr(self, name)[: len(other.mean)] = getattr(other, name)
 
-    def arrays(self) -> dict[str, Array]:
-        """See Saved. Half of a covariance is the other half."""
-        return {**super().arrays(), "covariance": self.covariance[:, *HALF]}
+    @property
+    def half_covariance(self) -> Array:
+        """Lower triangles of `covariance`, one after another: it is symmetric."""
+        half: Array = self.covariance[:, *HALF]
+        return half
 
-    def restore(self, stored: Mapping[str, Array]) -> None:
-        """See Saved."""
-        super().restore(stored)
-        self.covariance[:, *HALF] = stored["covariance"]
-        self.covariance[:, *HALF[::-1]] = stored["covariance"]
+    @half_covariance.setter
+    def half_covariance(self, half: Array) -> None:
+        self.covariance[:, *HALF] = half
+        self.covariance[:, *HALF[::-1]] = half
 
     def begin_again(self, fan: int) -> None:
         """Return a fan to the priors."""

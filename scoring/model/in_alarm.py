@@ -21,7 +21,7 @@ from fantwin.scoring.model.faults import BEFORE_GROWTH, GROWS_S, UNSTEADY, force
 from fantwin.scoring.model.healthy import HealthyFans
 from fantwin.scoring.model.onsets import Evidence, Hypotheses, Sums
 from fantwin.scoring.model.operation import Inputs
-from fantwin.scoring.model.saved import part, within
+from fantwin.scoring.saved import Saved
 
 ENDS_S = np.array([15.0, 30.0, 60.0, 120.0, 240.0, 480.0, np.inf])
 """times after its onset at which a fault may stop growing, equally probable"""
@@ -35,22 +35,28 @@ OF_ONSETS = {"ends_s": np.inf, "ages_s": 0.0, "then_rad_s": 0.0, "log_weight": -
 """what is known of each onset, and its value where there is none"""
 
 
-class FansInAlarm:
+class FansInAlarm(Saved):
     """Fans of a tray that have an alarm, side by side: n of them, with m onsets each."""
+
+    KEPT = ("fans", "_onsets", "_varies", "_model", "_sums")
 
     def __init__(self, model: HealthyFans, hypotheses: Hypotheses) -> None:
         """Begin without one. model, hypotheses: of the tray."""
         self._of_tray, self._of_all = model, hypotheses
-        self.fans = np.zeros(0, np.int64)
+        self._begin(np.zeros(0, np.int64), 0)
+
+    def _begin(self, fans: Array, onsets: int) -> None:
+        """Begin with these fans and a number of onsets, of which nothing is known."""
+        self.fans = fans
         """(n,) their numbers, in the order of their alarms"""
-        self._onsets = {name: np.full((0, 0), value) for name, value in OF_ONSETS.items()}
+        self._onsets = {name: np.full((len(fans), onsets), value) for name, value in OF_ONSETS.items()}
         """(n, m) each"""
-        self._varies = np.zeros((2, 2, 0))
+        self._varies = np.zeros((2, 2, len(fans)))
         """(2, 2, n) from a healthy fan since the alarm, and from one with its fault lately: squares of distances, in
         standard deviations, and their number"""
-        self._model, self._hypotheses = model.of(self.fans), hypotheses.of(self.fans)
-        self._sums = Sums(0, 0, hypotheses.columns, hypotheses.pairs)
-        self._terms = np.zeros((0, 0, len(hypotheses.faults)))
+        self._model, self._hypotheses = self._of_tray.of(fans), self._of_all.of(fans)
+        self._sums = Sums(len(fans), onsets, self._of_all.columns, self._of_all.pairs)
+        self._terms = np.zeros((len(fans), onsets, len(self._of_all.faults)))
         """(n, m, faults) log terms as in `Hypotheses`, with the weight of the onset"""
 
     def add(self, fan: int, evidence: Evidence) -> None:
@@ -60,7 +66,7 @@ class FansInAlarm:
         places = onsets[which]
         weight = evidence.weight[onsets] / np.bincount(which, minlength=len(onsets))
         own = FansInAlarm(self._of_tray, self._of_all)
-        own.fans = np.array([fan])
+        own._begin(np.array([fan]), len(places))
         own._onsets = {
             "ends_s": ENDS_S[np.newaxis, end],
             "ages_s": evidence.age_s[np.newaxis, places],
@@ -68,9 +74,7 @@ class FansInAlarm:
             "log_weight": np.log(weight)[np.newaxis, which],
             "has_changed": evidence.has_changed[[fan]][:, places],
         }
-        own._varies = np.zeros((2, 2, 1))
         own._sums = evidence.sums.of(own.fans, places[np.newaxis])
-        own._hypotheses = self._of_all.of(own.fans)
         own._weigh()
         self._join(own)
 
@@ -146,25 +150,20 @@ class FansInAlarm:
             found.append(PossibleCause(cause, share, times * float(sizes[0]), times * float(covariance[0, 0]) ** 0.5))
         return sorted(found, key=lambda each: -each.probability)
 
-    def kept(self) -> dict[str, Array]:
-        """The state."""
-        own = {"fans": self.fans, "varies": self._varies, **self._onsets}
-        sums = self._sums.kept(np.arange(len(self.fans)))
-        return {**own, **within("model", self._model.arrays()), **within("sums", sums)}
+    def arrays(self) -> dict[str, Array]:
+        """See Saved; nothing without an alarm."""
+        return super().arrays() if len(self.fans) else {}
 
     def restore(self, stored: Mapping[str, Array]) -> None:
-        """Continue from a state.
-
-        Raises:
-            KeyError, ValueError: it is not such a state.
-        """
-        self.fans, self._varies = stored["fans"], stored["varies"]
-        self._onsets = {name: stored[name] for name in OF_ONSETS}
-        self._model, self._hypotheses = self._of_tray.of(self.fans), self._of_all.of(self.fans)
-        self._model.restore(part("model", stored))
-        self._sums = Sums(*self._onsets["ages_s"].shape, self._hypotheses.columns, self._hypotheses.pairs)
-        self._sums.restore(np.arange(len(self.fans)), part("sums", stored))
-        self._terms = self._log_terms()
+        """See Saved."""
+        self.clear()
+        if stored:
+            fans, onsets = stored["fans"], stored["_onsets.ages_s"]
+            if not np.isin(fans, np.arange(len(self._of_tray.mean))).all():
+                raise ValueError("an alarm of a fan that does not exist")
+            self._begin(fans, onsets.shape[-1] if onsets.size else 0)
+            super().restore(stored)
+            self._terms = self._log_terms()
 
     @property
     def _grown_s(self) -> Array:

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from fantwin.schemas.messages import Array
-from fantwin.scoring.model.saved import Saved
+from fantwin.scoring.saved import Saved
 
 SHARES = np.array([0.03, 0.07, 0.15, 0.35, 0.7, 0.95])
 """shares of missing readings of a loose wire, equally probable"""

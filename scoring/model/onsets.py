@@ -28,6 +28,7 @@ import numpy as np
 from fantwin.schemas.messages import Array
 from fantwin.scoring.model.faults import OF_TACHO, STUCK, Fault
 from fantwin.scoring.model.healthy import CARRIED, FOLLOWING, STATES, HealthyFans, Innovation
+from fantwin.scoring.saved import Saved, alike
 
 ONSETS = 20
 LONGEST_S = 900.0
@@ -44,12 +45,14 @@ LARGEST_LOG = 80.0
 """largest logarithm that is exponentiated: single precision overflows at 88"""
 
 
-class Sums:
+class Sums(Saved):
     """Sums of the evidence for each onset, of all fans side by side: A and B of the module, and what they follow from.
 
     The effect of each column on the states, less what the filter has absorbed, is `_factors` times `_parts`. The parts
     are this effect at the last gathering and, for each bin since, the effect on the rotor and rho.
     """
+
+    KEPT = ("on_states", "squares", "crossed", "products")
 
     def __init__(self, fans: int, onsets: int, columns: int, pairs: Sequence[tuple[int, int]]) -> None:
         """Begin without a reading. pairs: of columns, those that a fault has together."""
@@ -84,7 +87,7 @@ class Sums:
         fans, columns = len(self._rows), self.squares.shape[2]
         found = Sums(fans + len(other._rows), max(self.squares.shape[1], other.squares.shape[1]), columns, self._pairs)
         for each, rows in ((self, slice(fans)), (other, slice(fans, None))):
-            each._gather()
+            each.on_states = each.on_states
             own = slice(each.squares.shape[1] * columns)
             found._parts[rows, :CARRIED, own] = each._parts[:, :CARRIED]
             onsets = slice(each.squares.shape[1])
@@ -93,26 +96,18 @@ class Sums:
                 crossed[rows, onsets] = each.crossed[pair]
         return found
 
-    def kept(self, fans: Array) -> dict[str, Array]:
-        """The state of some fans."""
-        taken = self._factors[fans, :CARRIED, : self._used] @ self._parts[fans, : self._used]
-        return {
-            "taken": taken.astype(np.float32),  # half as large
-            "squares": self.squares[fans],
-            "products": self.products[fans],
-            "crossed": np.array([each[fans] for each in self.crossed.values()]),
-        }
+    @property
+    def on_states(self) -> Array:
+        """Effect (fans, CARRIED, onsets * columns) on the states, less what the filter has absorbed; to set it is to
+        gather the parts."""
+        found: Array = self._factors[:, :CARRIED, : self._used] @ self._parts[:, : self._used]
+        return found
 
-    def restore(self, fans: Array, stored: Mapping[str, Array]) -> None:
-        """Continue for some fans from a state.
-
-        Raises:
-            KeyError, ValueError: it is not such a state.
-        """
-        self._parts[fans, :CARRIED] = stored["taken"]
-        self.squares[fans], self.products[fans] = stored["squares"], stored["products"]
-        for each, crossed in zip(self.crossed.values(), stored["crossed"], strict=True):
-            each[fans] = crossed
+    @on_states.setter
+    def on_states(self, gathered: Array) -> None:
+        self._parts[:, :CARRIED] = gathered
+        self._factors[:, :CARRIED, :CARRIED] = np.eye(CARRIED)
+        self._used = CARRIED
 
     def _of(self, onset: int) -> slice:
         """The place of an onset among the parts."""
@@ -135,7 +130,7 @@ class Sums:
         """Add the readings of a bin. forces: (fans, onsets, columns); gain: of the model, 0 where a reading does not
         count; distance_rad_s: (fans,), clipped."""
         if self._used == self._parts.shape[1]:
-            self._gather()
+            self.on_states = self.on_states
         done, read, self._used = self._used, self._used + 1, self._used + 2
         parts, factors = self._parts[:, : self._used], self._factors[:, :, : self._used]
         both = forces.reshape(len(forces), -1)
@@ -156,11 +151,6 @@ class Sums:
             self.crossed[one, other] += rho[:, :, one] * rho[:, :, other]
         self.products += rho * (weight * distance_rad_s).astype(np.float32)[:, np.newaxis, np.newaxis]
         self.squares += np.square(rho, out=rho)
-
-    def _gather(self) -> None:
-        self._parts[:, :CARRIED] = self._factors[:, :CARRIED, : self._used] @ self._parts[:, : self._used]
-        self._factors[:, :CARRIED, :CARRIED] = np.eye(CARRIED)
-        self._used = CARRIED
 
 
 def log_erfc(values: Array) -> Array:
@@ -289,8 +279,11 @@ def _without_others(fault: Fault, sums: Sums) -> tuple[Array, Array, Array]:
     return found, np.maximum(squares[0, 0], 1.0), products[0]
 
 
-class Evidence:
+class Evidence(Saved):
     """Onsets and the evidence for each, of all fans side by side."""
+
+    KEPT = ("number", "began", "weight", "since", "then_rad_s", "has_changed", "sums")
+    OF_TRAY = KEPT[:3]
 
     def __init__(self, fans: int, hypotheses: Hypotheses, bin_s: float) -> None:
         """Begin without a reading."""
@@ -307,6 +300,8 @@ class Evidence:
         """(fans, ONSETS) true where the reading has changed since the bin of the onset"""
         self.since = np.full(fans, NEVER)
         """(fans,) bin after which onsets count"""
+        self.large = np.zeros(fans, np.bool_)
+        """(fans,) true where the evidence is large enough for a snapshot"""
         self._log_bayes_factors = np.zeros((len(hypotheses.faults), fans, ONSETS), np.float32)
         self.number = 0
 
@@ -359,32 +354,23 @@ class Evidence:
         """Begin again for a fan."""
         self.since[fan] = self.number
 
-    def kept(self, fans: Array) -> dict[str, Array]:
-        """Return the state of some fans; `restore_kept` starts the others again."""
+    def arrays(self) -> dict[str, Array]:
+        """See Saved; of the fans `large`, whose evidence a snapshot keeps."""
         return {
-            "fans": fans,
-            "number": np.array(self.number),
-            "began": self.began,
-            "weight": self.weight,
-            "then_rad_s": self.then_rad_s[fans],
-            "has_changed": self.has_changed[fans],
-            "since": self.since[fans],
-            **self.sums.kept(fans),
-        }
+            name: array if name in self.OF_TRAY else array[self.large] for name, array in super().arrays().items()
+        } | {"large": self.large}
 
-    def restore_kept(self, stored: Mapping[str, Array]) -> None:
-        """Continue from such a state.
-
-        Raises:
-            KeyError, ValueError: it is not such a state.
-        """
-        fans, self.number = stored["fans"], int(stored["number"])
-        self.began, self.weight = stored["began"].copy(), stored["weight"].copy()
+    def restore(self, stored: Mapping[str, Array]) -> None:
+        """See Saved; the evidence of the fans that are not large begins again."""
+        whole, large = super().arrays(), alike(self.large, stored, "large")
+        whole["since"][:] = stored["number"]
+        for name, array in whole.items():
+            if name in self.OF_TRAY:
+                whole[name] = stored[name]
+            else:
+                array[large] = alike(array[large], stored, name)
+        super().restore(whole)
         self._order = np.argsort(self.began, kind="stable").tolist()
-        self.since[:] = self.number
-        self.since[fans], self.then_rad_s[fans] = stored["since"], stored["then_rad_s"]
-        self.has_changed[fans] = stored["has_changed"]
-        self.sums.restore(fans, stored)
 
     def log_statistic(self) -> Array:
         """Log R, (fans,)."""

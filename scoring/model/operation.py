@@ -9,7 +9,7 @@ import numpy as np
 from fantwin.schemas.messages import Array
 from fantwin.schemas.units import NS_PER_S
 from fantwin.scoring.model.bins import Bin
-from fantwin.scoring.model.saved import Saved
+from fantwin.scoring.saved import Saved
 
 BACKLASH = 0.01
 """share of the top speed, or of the largest command, below which a movement is ignored: a speed loop makes it from the
@@ -119,7 +119,7 @@ class Inputs:
 class Operation(Saved):
     """Follows the fans of one tray from bin to bin."""
 
-    KEPT = ("_held", "_speed", "_was_balance", "_moved_to", "_command", "_largest")
+    KEPT = ("t_ns", "_held", "_speed", "_was_balance", "_moved_to", "_command", "_largest")
 
     def __init__(self, fans: Fans, bin_ns: int) -> None:
         """Begin with fans that stand."""

@@ -13,7 +13,7 @@ import numpy as np
 
 from fantwin.schemas.messages import Array
 from fantwin.scoring.model.operation import Fans
-from fantwin.scoring.model.saved import Saved
+from fantwin.scoring.saved import Saved
 
 FAR_SIGMAS = 4.5
 """distance from the expected reading, in standard deviations, beyond which a reading is far"""

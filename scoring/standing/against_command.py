@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -12,8 +12,8 @@ from fantwin.schemas.tacho import Tacho
 from fantwin.schemas.units import NS_PER_S
 from fantwin.scoring.column_state import NEVER_NS
 from fantwin.scoring.diagnosis.standstill_causes import Standing
-from fantwin.scoring.model.saved import Saved, part, within
 from fantwin.scoring.samples import arrived
+from fantwin.scoring.saved import Saved
 from fantwin.scoring.standing import runs_on, stands_still
 from fantwin.scoring.standing.runs_on import RunsOn
 from fantwin.scoring.standing.stands_still import StandsStill
@@ -30,7 +30,7 @@ class AgainstCommand(Saved):
     """Check of each fan of a tray against its command. Samples that show neither obeying nor disobeying change
     nothing."""
 
-    KEPT = ("_arrived_t_ns", "_obeyed_ns", "_is_against")
+    KEPT = ("_arrived_t_ns", "_obeyed_ns", "_is_against", "_stands", "_runs")
 
     def __init__(self, healthy: Standstill, tachos: Sequence[Tacho]) -> None:
         """Begin without knowledge of the fans. tachos: of each fan."""
@@ -53,11 +53,6 @@ class AgainstCommand(Saved):
         n = len(block.t_ns)
         self.active, self.score = np.zeros(speed.shape, np.bool_), np.zeros(speed.shape)
         self.kind = np.zeros(speed.shape, np.int64)
-        is_ahead = self._arrived_t_ns > block.t_ns[0]  # of a clock that was set back since: how long ago is not known
-        if is_ahead.any():
-            self._arrived_t_ns[is_ahead] = NEVER_NS
-            self._stands.forget(is_ahead)
-            self._runs.forget(is_ahead)
         missed_ns = self._missed_ns(block.t_ns, block.period_ns, is_here)
         ends = [*np.flatnonzero((missed_ns > 0).any(axis=1)).tolist(), n]
         begin = 0
@@ -75,20 +70,6 @@ class AgainstCommand(Saved):
         self._stands.forget(fans)
         self._runs.forget(fans)
         self._is_against[:, fans] = False
-
-    def kept(self) -> dict[str, Array]:
-        """The state."""
-        return {
-            **within("own", self.arrays()),
-            **within("stands", self._stands.arrays()),
-            **within("runs", self._runs.arrays()),
-        }
-
-    def restore(self, stored: Mapping[str, Array]) -> None:
-        """Continue from a state, see Saved."""
-        super().restore(part("own", stored))
-        self._stands.restore(part("stands", stored))
-        self._runs.restore(part("runs", stored))
 
     def _judge(self, rows: slice, command: Array, speed: Array, counts: Durations) -> None:
         kinds = (stands_still.KINDS, runs_on.KINDS)

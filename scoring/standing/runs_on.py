@@ -21,7 +21,7 @@ from fantwin.schemas.standstill import SLOWED_SHARE, Standstill
 from fantwin.schemas.tacho import Tacho
 from fantwin.schemas.units import NS_PER_S
 from fantwin.scoring.diagnosis.standstill_causes import Standing
-from fantwin.scoring.model.saved import Saved
+from fantwin.scoring.saved import Saved
 from fantwin.scoring.standing.time_limits import Durations, coast_limit_s, lag_s, slowing_limit_s
 
 PEAK_STEPS = 64.0  # in a rad/s: peaks are rounded, so that sums with the next are exact, however blocks are cut

@@ -18,7 +18,7 @@ from fantwin.schemas.tacho import Tacho
 from fantwin.schemas.units import NS_PER_S
 from fantwin.scoring.diagnosis.standstill_causes import Fall, Standing
 from fantwin.scoring.model.operation import Fans, Inputs
-from fantwin.scoring.model.saved import Saved
+from fantwin.scoring.saved import Saved
 from fantwin.scoring.standing.time_limits import Durations, lapse_limit_s, start_limit_s
 
 STANDS, FALLS = 0.08, 0.85

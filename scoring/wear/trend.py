@@ -20,14 +20,16 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
+from pydantic import FiniteFloat
 
 from fantwin.schemas.messages import Array
 from fantwin.schemas.units import NS_PER_S
+from fantwin.scoring.model.priors import Positive
 
 NS_PER_DAY = 86_400 * NS_PER_S
 CAPACITY = 128
@@ -87,49 +89,66 @@ class Point(NamedTuple):
     std_error: float
 
 
+@dataclass
 class WearSeries:
-    """The points of one fan, at most CAPACITY."""
+    """The points of one fan, at most CAPACITY: a column of each of their fields."""
 
-    def __init__(self) -> None:
-        self._points: list[Point] = []
-        self._points_per_stored = 1
-        self._points_in_last = 0
-        """points in the last stored one, which may be incomplete"""
+    t_ns: list[int]
+    value: list[FiniteFloat]
+    std_error: list[Positive]
+    points_per_stored: int = 1
+    points_in_last: int = 0
+    """points in the last stored one, which may be incomplete"""
+
+    def __post_init__(self) -> None:
+        """Raises ValueError: it is damaged."""
+        if not len(self.t_ns) == len(self.value) == len(self.std_error) <= CAPACITY:
+            raise ValueError("columns of different lengths, or too many points")
 
     def __len__(self) -> int:
-        return len(self._points)
+        return len(self.t_ns)
+
+    @property
+    def points(self) -> list[Point]:
+        """The points, oldest first."""
+        return list(map(Point, self.t_ns, self.value, self.std_error))
+
+    @points.setter
+    def points(self, points: Sequence[Point]) -> None:
+        self.t_ns, self.value, self.std_error = map(list, zip(*points, strict=True))
 
     def add(self, t_ns: int, value: float, std_error: float) -> bool:
         """Add a point. False, and nothing is added: it is not finite, not newer than the last, or without an error."""
-        is_newer = not self._points or t_ns > self._points[-1].t_ns
+        is_newer = not self.t_ns or t_ns > self.t_ns[-1]
         if not (is_newer and math.isfinite(value) and math.isfinite(std_error) and std_error > 0.0):
             return False
-        point = Point(t_ns, value, std_error)
-        if 0 < self._points_in_last < self._points_per_stored:
-            self._points[-1] = mean_of([self._points[-1], point], [self._points_in_last, 1])
-            self._points_in_last += 1
+        points, point = self.points, Point(t_ns, value, std_error)
+        if 0 < self.points_in_last < self.points_per_stored:
+            points[-1] = mean_of([points[-1], point], [self.points_in_last, 1])
+            self.points_in_last += 1
         else:
-            if len(self._points) == CAPACITY:
-                pairs = zip(self._points[::2], self._points[1::2], strict=True)
-                self._points = [_rounded(mean_of(pair)) for pair in pairs]
-                self._points_per_stored *= 2
-            self._points.append(point)
-            self._points_in_last = 1
-        if self._points_in_last == self._points_per_stored:
-            self._points[-1] = _rounded(self._points[-1])
+            if len(points) == CAPACITY:
+                points = [_rounded(mean_of(pair)) for pair in zip(points[::2], points[1::2], strict=True)]
+                self.points_per_stored *= 2
+            points.append(point)
+            self.points_in_last = 1
+        if self.points_in_last == self.points_per_stored:
+            points[-1] = _rounded(points[-1])
+        self.points = points
         return True
 
     def mean_from(self, from_ns: int, days: float) -> Point:
         """The mean of the points of some days, or the next point if there is none. The series must not be empty."""
-        later = [point for point in self._points if point.t_ns >= from_ns] or self._points[-1:]
+        points = self.points
+        later = [point for point in points if point.t_ns >= from_ns] or points[-1:]
         until_ns = max(from_ns + round(days * NS_PER_DAY), later[0].t_ns)
         return mean_of([point for point in later if point.t_ns <= until_ns])
 
     def trend(self) -> Trend | None:
         """The line through the points; None while there are too few independent points."""
-        std_error = np.array([point.std_error for point in self._points])
+        std_error = np.array(self.std_error)
         largest = MAX_ERROR_RATIO * np.median(std_error) if len(std_error) else 0.0
-        known = [point for point in self._points if point.std_error <= largest]
+        known = [point for point in self.points if point.std_error <= largest]
         n = len(known)
         if n < MIN_POINTS:
             return None
@@ -161,26 +180,6 @@ class WearSeries:
             t_quantile=t_quantile,
             days=float(day[-1] - day[0]),
         )
-
-    def snapshot(self) -> dict[str, list[Any]]:
-        """The whole state as JSON values: a list for each column of the points, and two counts."""
-        columns = {name: [getattr(point, name) for point in self._points] for name in Point._fields}
-        return {**columns, "count": [self._points_per_stored, self._points_in_last]}
-
-    @classmethod
-    def restore(cls, snapshot: Mapping[str, Any]) -> WearSeries:
-        """The series of a snapshot.
-
-        Raises:
-            ValueError, KeyError, TypeError: it is not a snapshot of a series.
-        """
-        series = cls()
-        columns = zip(*(snapshot[name] for name in Point._fields), strict=True)
-        series._points = [Point(int(t_ns), float(value), float(error)) for t_ns, value, error in columns]
-        series._points_per_stored, series._points_in_last = (int(count) for count in snapshot["count"])
-        if len(series._points) > CAPACITY:
-            raise ValueError(f"a series has at most {CAPACITY} points")
-        return series
 
 
 def forecast_limit(trend: Trend, limit: float, now_ns: int) -> LimitForecast:

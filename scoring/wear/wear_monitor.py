@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from fantwin.schemas.messages import Array
 from fantwin.schemas.units import NS_PER_S
+from fantwin.scoring.saved import Saved
 from fantwin.scoring.wear.recorded_wear import shown
 from fantwin.scoring.wear.slow_change import LIMIT_SHARE, SlowChange, limit_ahead, own_change, shared_change
 from fantwin.scoring.wear.trend import NS_PER_DAY, REACHED, LimitForecast, Point, Trend, WearSeries, forecast_limit
@@ -34,10 +35,18 @@ TOGETHER_NS = 1800 * NS_PER_S
 """fans whose first points are no farther apart were commissioned together"""
 REPORT_WITHIN_DAYS = 7.0
 """health reports a limit that is likely to be reached sooner"""
-KEPT = ("due_t_ns", "first_t_ns", "t_ns", "value", "std_error", "shift", "has_shift", "joined_variance", "is_over")
 
 
-class WearMonitor:
+@dataclass
+class WearState:
+    """The wear in a snapshot beside arrays: the present change of each fan for people (scoring.wear.recorded_wear), and
+    its points."""
+
+    fans: list[dict[str, Any]]
+    series: list[WearSeries]
+
+
+class WearMonitor(Saved):
     """The wear of one tray's fans. The result does not depend on how samples are cut into messages.
 
     All (fans,). due_t_ns: of the next point; 0: not known yet. first_t_ns: of the first point. t_ns, value, std_error:
@@ -45,6 +54,11 @@ class WearMonitor:
     joined_variance: of the value, by the takeovers of other twins. is_over: the change has surely reached LIMIT_SHARE,
     and has not come back since. change, change_std_error: since commissioning.
     """
+
+    KEPT = (
+        *("due_t_ns", "first_t_ns", "t_ns", "value", "std_error", "shift", "has_shift"),
+        *("joined_variance", "is_over"),
+    )
 
     def __init__(self, fans: int, every_s: float) -> None:
         """Begin without a point. every_s: interval between the points of a fan."""
@@ -55,7 +69,7 @@ class WearMonitor:
         self.value, self.std_error, self.shift, self.joined_variance = np.zeros((4, fans))
         self.has_shift, self.is_over = np.zeros((2, fans), np.bool_)
         self.change, self.change_std_error = np.zeros((2, fans))
-        self._series = [WearSeries() for _ in range(fans)]
+        self._series = [WearSeries([], [], []) for _ in range(fans)]
         self._trends: dict[int, Trend | None] = {}
         """those that were asked for since the newest point of their fan"""
 
@@ -143,11 +157,11 @@ class WearMonitor:
 
     def forget(self, fans: Array, t_ns: int) -> None:
         """Start again for some fans, (fans,) of bool, that are commissioned again after t_ns, the last sample."""
-        for name in (*KEPT, "change", "change_std_error"):
+        for name in (*self.KEPT, "change", "change_std_error"):
             getattr(self, name)[fans] = 0
         self.due_t_ns[fans] = t_ns + self._settling_ns[fans]
         for fan in np.flatnonzero(fans).tolist():
-            self._series[fan] = WearSeries()
+            self._series[fan] = WearSeries([], [], [])
 
     def problem(self, now_ns: int) -> str:
         """Line about a fan that will likely reach its limit within REPORT_WITHIN_DAYS, or may have; empty otherwise,
@@ -197,33 +211,27 @@ class WearMonitor:
                 found.append(fan)
         return found
 
-    def snapshot(self) -> dict[str, Any]:
-        """The whole state as JSON values, and with it the present changes for people (scoring.wear.recorded_wear)."""
-        state = {name: getattr(self, name).tolist() for name in KEPT}
-        fans = [{**shown(self.of(fan)), "series": series.snapshot()} for fan, series in enumerate(self._series)]
-        return {"state": state, "fans": fans}
+    @property
+    def state(self) -> WearState:
+        """What a snapshot holds beside the arrays."""
+        fans = [{**shown(self.of(fan)), "value": value} for fan, value in enumerate(self.value.tolist())]
+        return WearState(fans, self._series)
 
-    def restore(self, snapshot: Mapping[str, Any]) -> None:
-        """Continue from a snapshot of the same twin and number of fans. Nothing has changed if this raises.
+    def continue_from(self, state: WearState, stored: Mapping[str, Array], *, same_twin: bool = True) -> None:
+        """Continue from the state and arrays of another. same_twin: else the changes go on by another twin.
 
         Raises:
-            ValueError, KeyError, TypeError, AttributeError: it is not such a snapshot.
+            ValueError, KeyError: they are damaged, or of other fans. A part may have been taken then.
         """
-        series = [WearSeries.restore(fan["series"]) for fan in snapshot["fans"]]
-        state = {name: np.array(snapshot["state"][name], getattr(self, name).dtype) for name in KEPT}
-        if any(column.shape != self.t_ns.shape for column in state.values()) or len(series) != len(self._series):
-            raise ValueError("wear of another number of fans")
-        if [len(each) > 0 for each in series] != (state["t_ns"] > 0).tolist():
-            raise ValueError("a series without its newest point")
-        vars(self).update(state)
-        self._series = series
+        self.restore(stored)
+        has_points = [len(series) > 0 for _, series in zip(state.fans, state.series, strict=True)]
+        if has_points != (self.t_ns > 0).tolist():
+            raise ValueError("series of other fans, or without their newest point")
+        self._series = state.series
         for fan in np.flatnonzero(self.t_ns).tolist():
             self._measure(fan)
-
-    def restore_of_earlier_twin(self, snapshot: Mapping[str, Any]) -> None:
-        """Continue from a snapshot of another twin of the same fans: their changes go on. Raises: as `restore`."""
-        self.restore(snapshot)
-        self.due_t_ns[:], self.has_shift[:] = 0, False
+        if not same_twin:
+            self.due_t_ns[:], self.has_shift[:] = 0, False
 
 
 def _noticed_from(std_error: float) -> float:

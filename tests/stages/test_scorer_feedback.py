@@ -94,7 +94,7 @@ def test_after_a_restart_alarms_of_before_can_still_be_marked(is_of_another_twin
     marked = asked(core, Action.FALSE_ALARM, "test run")
     successor = scorer()
     if is_of_another_twin:
-        successor.tray.alarms.restore(core.tray.alarms.snapshot())
+        successor.tray.alarms.state = core.tray.alarms.state
         successor.tray.alarms.discard_all(onsets[1] + NS_PER_S, keep_silenced=True)
         answer = asked(successor, Action.TRUE_ALARM)
         assert (answer.marked_onset_t_ns, answer.feedback) == (onsets[1], Feedback.NONE)

@@ -23,7 +23,6 @@ from fantwin.schemas.messages import Alarm, Score, ScorerSnapshot
 from fantwin.schemas.units import NS_PER_S
 from fantwin.scoring.alarms.alarm_state import is_listed, is_retained, is_silenced
 from fantwin.scoring.alarms.current_alarms import CurrentAlarm
-from fantwin.scoring.model.saved import as_json, from_json
 from fantwin.scoring.wear.wear_monitor import WearMonitor
 from tests.support.scored_blocks import (
     EPOCH_NS,
@@ -170,34 +169,30 @@ def standing_of(emitted: Sequence[Any]) -> list[CurrentAlarm]:
     return book.all()
 
 
-@pytest.mark.parametrize("lost", ["twin", "model", "wear"])
-def test_operator_settings_outlive_a_snapshot_of_another_twin_or_read_in_part_and_health_says_so_for_a_minute(
-    lost: str,
+@pytest.mark.parametrize("is_learned", [False, True])
+def test_operator_settings_outlive_a_snapshot_of_another_twin_and_wear_one_of_a_learned_twin_and_health_says_so(
+    is_learned: bool,
 ) -> None:
-    state = json.loads(raised().state_json)
-    worn = WearMonitor(3, 600.0)
+    before = core_of(3)
+    before.restore(raised())
+    before.tray.wear = WearMonitor(3, 600.0)
     for day in range(2):
         at_ns = EPOCH_NS + (day - 2) * 86_400 * NS_PER_S
-        worn.update(at_ns, np.ones(3, np.bool_), lambda: (np.full(3, -0.08), np.full(3, 0.007)))
-    before = state["wear"] = worn.snapshot()
-    state.pop(lost, None)
-    successor = core_of(3, sha256="another" if lost == "twin" else "twin")
-    memory, *emitted = successor.restore(replace(raised(), state_json=json.dumps(state)))
+        before.tray.wear.update(at_ns, np.ones(3, np.bool_), lambda: (np.full(3, -0.08), np.full(3, 0.007)))
+    successor = core_of(3, sha256="another", is_learned=is_learned)
+    memory, *emitted = successor.restore(snapshot_of(before))
     assert isinstance(memory, ScorerSnapshot) and memory.restored
-    counter, why = "snapshots_not_understood", "can be read in part only"
-    if lost == "twin":
-        counter, why = "snapshots_of_another_twin", "the snapshot is of another twin"
-    assert successor.counters()[counter] == 1 and why in successor.problem()
+    why = f"the snapshot is of {'the previous' if is_learned else 'another'} twin"
+    assert successor.counters()["snapshots_of_another_twin"] == 1 and why in successor.problem()
     acknowledged, shelved = standing_of(emitted)
     assert (is_retained(acknowledged.newest), acknowledged.newest.message) == (False, "fan 0: no alarm")
     assert (is_silenced(shelved.newest), shelved.newest.message) == (True, "fan 1: no alarm, shelved")
     assert successor.step(request_of(Action.SHELVE, 1, sequence=1, duration_s=60.0)) == [], "it was answered"
     (score,), _ = feed(successor, [prediction_of(np.zeros((1, 3)), first=100)])
     assert (score.state == FanState.NORMAL).all() and not score.expected_residual_rad_s.any()
-    of_wear = json.loads(snapshot_of(successor).state_json)["wear"]
-    is_kept = of_wear["fans"] == before["fans"]
-    assert is_kept == (lost == "model"), "wear starts again where it cannot be read, or the twin is another"
-    assert not any(of_wear["state"]["has_shift"]), "what the model says of the fans from now on joins what was measured"
+    wear = successor.tray.wear
+    assert (wear.state == before.tray.wear.state) == is_learned
+    assert not any(wear.has_shift), "what the model says of the fans from now on joins what was measured"
     _, (unshelved,) = feed(successor, [request_of(Action.UNSHELVE, 1, sequence=2)])
     assert unshelved.transition == Transition.UNSHELVED
     feed(successor, [prediction_of(np.zeros((1, 3)), first=6098)])
@@ -237,20 +232,6 @@ def test_only_a_replay_of_earlier_samples_makes_a_snapshot_be_discarded(
         assert not scores or scores[0].t_ns[0] > prediction_of(np.zeros(1), first=99).t_ns[0]
     successor.step(prediction_of(np.zeros((20, 3)), first=-2 * HOUR, producer="integrator-3"))
     assert successor.counters().get("snapshots_of_other_times", 0) == is_discarded, "only the first one can tell"
-
-
-def test_a_snapshot_in_which_one_array_is_of_another_number_of_fans_is_refused() -> None:
-    before = core_of(3)
-    feed(before, [prediction_of(np.zeros((105, 3)))])  # a bin is open
-    state = json.loads(snapshot_of(before).state_json)
-    arrays = from_json(state["model"]["arrays"])
-    of_fans = [name for name, array in arrays.items() if 3 in array.shape and not name.startswith("evidence.")]
-    assert {"seen", "now.score", "bins.measured", "bins.newest", "model.mean"} <= set(of_fans)
-    for name in of_fans:
-        cut = np.take(arrays[name], [0, 1], axis=arrays[name].shape.index(3))
-        state["model"]["arrays"] = as_json(arrays | {name: cut})
-        with pytest.raises(ValueError):
-            core_of(3).tray.restore_model(state)
 
 
 @pytest.mark.parametrize("twin", ["twin", "another"])

@@ -85,6 +85,7 @@ def core_of(
     *,
     snapshot_store: SnapshotStore | None = None,
     is_replayed: bool = False,
+    is_learned: bool = False,
     started_t_ns: int | None = None,
     config: Mapping[str, Any] | None = None,
     **twin: Any,
@@ -98,6 +99,7 @@ def core_of(
         twin_of(fans, **twin),
         snapshot_store,
         started_t_ns=started_t_ns,
+        is_learned=is_learned,
         is_replayed=lambda: is_replayed,
     )
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import asdict
 
 import numpy as np
 
@@ -76,5 +77,5 @@ def worn_monitor(fans: int, worn_fan: int, days: float = DAYS_OF_WEAR, start_ns:
 def worn_snapshot(tray: str, fans: int, worn_fan: int, t_ns: int, days: float = DAYS_OF_WEAR) -> ScorerSnapshot:
     """A scorer's snapshot with the wear of these days up to `t_ns`."""
     monitor = worn_monitor(fans, worn_fan, days, t_ns - round(days * NS_PER_DAY))
-    state = json.dumps({"wear": monitor.snapshot()})
+    state = json.dumps({"wear": asdict(monitor.state)})
     return ScorerSnapshot(header=Header("scorer", 0, tray), t_ns=t_ns, twin_sha256="", restored=False, state_json=state)

@@ -36,11 +36,11 @@ def wear_points(snapshot: ScorerSnapshot) -> list[WearPoints]:
     found: list[WearPoints] = []
     try:
         wear = json.loads(snapshot.state_json)["wear"]
-        for number, (fan, newest) in enumerate(zip(wear["fans"], wear["state"]["value"], strict=True)):
-            t_ns = np.array(fan["series"]["t_ns"], np.int64)
-            value, error = (np.array(fan["series"][name], np.float64) for name in ("value", "std_error"))
+        for number, (fan, series) in enumerate(zip(wear["fans"], wear["series"], strict=True)):
+            t_ns = np.array(series["t_ns"], np.int64)
+            value, error = (np.array(series[name], np.float64) for name in ("value", "std_error"))
             if len(t_ns) and t_ns.shape == value.shape == error.shape:
-                change = value - newest + fan["change"]
+                change = value - fan["value"] + fan["change"]
                 found.append(WearPoints(number, t_ns, 100.0 * change, 100.0 * error))
     except (ValueError, KeyError, TypeError, AttributeError, OverflowError):
         return []

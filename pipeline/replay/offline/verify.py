@@ -25,7 +25,7 @@ from fantwin.schemas.enums import Transition
 from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.fields import columns
 from fantwin.schemas.messages import Alarm, Array, Grid, Message, Prediction, Score, ScorerSnapshot
-from fantwin.scoring.model.saved import from_json
+from fantwin.scoring.saved import from_json
 
 Samples: TypeAlias = Grid | Prediction | Score
 
@@ -325,8 +325,7 @@ def first_difference(
 def _state(snapshot: ScorerSnapshot) -> dict[str, Any]:
     """What a snapshot holds, with its arrays as such."""
     state = json.loads(snapshot.state_json)
-    model = state["model"]
-    return state | {"model": model | {"arrays": from_json(model["arrays"])}}
+    return state | {"arrays": from_json(state["arrays"])}
 
 
 def _saved(envelopes: Iterable[Envelope], producer: str) -> Iterator[ScorerSnapshot]:

@@ -51,7 +51,7 @@ class AlarmOnRequestScorer(Core):
     """The conditions of a tray whose fans have the alarms that a test says; answers requests as a scorer does."""
 
     def __init__(self) -> None:
-        self.conditions = AlarmsOfTray(FANS)
+        self.conditions = AlarmsOfTray.begin(FANS)
         self.has_alarm: set[int] = set()
         self._raised_t_ns = np.zeros(FANS, np.int64)
         self.deaf = False

@@ -19,7 +19,7 @@ from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Message, ScorerSnapshot
 from fantwin.schemas.topics import tray_key
 from fantwin.scoring.wear.recorded_wear import shown
-from fantwin.scoring.wear.trend import NS_PER_DAY, WearSeries
+from fantwin.scoring.wear.trend import NS_PER_DAY
 from tests.support.fantwin_command import error_of, fantwin
 from tests.support.running_chain import SITE, TRAY
 from tests.support.running_scorer import RunningScorer
@@ -84,7 +84,7 @@ def test_people_are_shown_a_table_that_says_when_its_values_hold(tmp_path, notes
 def without_points(note: ScorerSnapshot, *fans: int) -> ScorerSnapshot:
     state = json.loads(note.state_json)
     for fan in fans:
-        state["wear"]["fans"][fan] |= dict.fromkeys(shown(None)) | {"series": WearSeries().snapshot()}
+        state["wear"]["fans"][fan] |= dict.fromkeys(shown(None))
     return replace(note, state_json=json.dumps(state))
 
 

@@ -11,13 +11,10 @@ import pytest
 from fantwin.pipeline.replay.offline.comparison import Apart
 from fantwin.pipeline.replay.offline.verify import first_difference
 from fantwin.schemas.messages import ScorerSnapshot
-from fantwin.scoring.model.saved import as_json
+from fantwin.scoring.saved import as_json
 
 STATE: dict[str, Any] = {
-    "model": {
-        "t_ns": 107,
-        "arrays": {"speed_rad_s": [0.1, 0.2], "number": [107], "log_statistic": [-np.inf, 1.0], "reading": [np.nan]},
-    },
+    "arrays": {"speed_rad_s": [0.1, 0.2], "number": [107], "log_statistic": [-np.inf, 1.0], "reading": [np.nan]},
     "input_producer": "twin_integrator-1-00aa",
     "alarms": {
         "last_emitted": {"3": {"active": True, "message": "takes 0.046 more", "causes": [{"probability": 0.75}]}}
@@ -27,9 +24,8 @@ STATE: dict[str, Any] = {
 
 
 def snapshot(state: dict[str, Any], twin: str = "t") -> ScorerSnapshot:
-    arrays = {name: np.array(values) for name, values in state["model"]["arrays"].items()}
-    written = state | {"model": state["model"] | {"arrays": as_json(arrays)}}
-    return ScorerSnapshot(t_ns=1, twin_sha256=twin, state_json=json.dumps(written))
+    arrays = {name: np.array(values) for name, values in state["arrays"].items()}
+    return ScorerSnapshot(t_ns=1, twin_sha256=twin, state_json=json.dumps(state | {"arrays": as_json(arrays)}))
 
 
 def changed(where: str, value: object) -> dict[str, Any]:
@@ -49,11 +45,11 @@ def changed(where: str, value: object) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("where", "value", "found"),
     [
-        ("model.arrays.speed_rad_s.1", 0.2, ""),
-        ("model.arrays.speed_rad_s.1", 0.2 * (1 + 1e-9), ""),
-        ("model.arrays.speed_rad_s.1", 0.2 * (1 + 1e-4), "model.arrays.speed_rad_s"),
-        ("model.arrays.log_statistic.0", 0.5, "model.arrays.log_statistic"),
-        ("model.arrays.reading.0", 1.0, "model.arrays.reading"),
+        ("arrays.speed_rad_s.1", 0.2, ""),
+        ("arrays.speed_rad_s.1", 0.2 * (1 + 1e-9), ""),
+        ("arrays.speed_rad_s.1", 0.2 * (1 + 1e-4), "arrays.speed_rad_s"),
+        ("arrays.log_statistic.0", 0.5, "arrays.log_statistic"),
+        ("arrays.reading.0", 1.0, "arrays.reading"),
         ("input_producer", "twin_integrator-2-99aa", "input_producer"),
         ("alarms.last_emitted.3.active", False, "alarms.last_emitted.3.active"),
         ("alarms.last_emitted.3.message", "takes 0.047 more", ""),

@@ -13,7 +13,7 @@ def series(
 ) -> WearSeries:
     """Points with noise of standard deviation `error`, correlated from one to the next."""
     rng = np.random.default_rng(seed)
-    points = WearSeries()
+    points = WearSeries([], [], [])
     noise = rng.normal()
     for k in range(int(days * per_day)):
         noise = correlation * noise + np.sqrt(1.0 - correlation**2) * rng.normal()
@@ -64,7 +64,7 @@ def test_there_is_no_forecast_without_a_basis_for_one() -> None:
 
 def test_a_third_of_wild_points_does_not_carry_the_slope_away() -> None:
     rng = np.random.default_rng(4)
-    points = WearSeries()
+    points = WearSeries([], [], [])
     for k in range(200):
         wild = 0.5 if rng.random() < 0.25 else 0.0
         points.add(START_NS + k * NS_PER_DAY // 10, 0.002 * k / 10 + wild * rng.normal() + 0.01 * rng.normal(), 0.01)
@@ -77,13 +77,13 @@ def test_memory_is_bounded_and_merging_keeps_the_trend() -> None:
     trend = trend_of(points)
     assert trend.significant and trend.low <= 0.001 <= trend.high
     assert trend.slope_per_day == pytest.approx(0.001, rel=0.02)
-    assert points.snapshot()["std_error"][0] == 0.01, "the points of a filter err alike"
+    assert points.std_error[0] == 0.01, "the points of a filter err alike"
 
 
 def test_few_points_give_no_trend_and_those_that_are_no_numbers_or_come_again_are_left_out() -> None:
-    assert WearSeries().trend() is None
+    assert WearSeries([], [], []).trend() is None
     assert series(1, 5, 0.1, 6).trend() is None
-    points = WearSeries()
+    points = WearSeries([], [], [])
     refused = ((START_NS, 2.0, 0.1), (START_NS - 1, 2.0, 0.1), (START_NS + 1, np.nan, 0.1), (START_NS + 2, 1.0, 0.0))
     assert points.add(START_NS, 1.0, 0.1) and not any(points.add(*point) for point in refused)
-    assert points.snapshot()["value"] == [1.0]
+    assert points.value == [1.0]

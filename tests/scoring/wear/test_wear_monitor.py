@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import copy
-import json
-from typing import Any
 
 import numpy as np
 import pytest
@@ -31,7 +29,6 @@ from tests.support.wear_data import (
     loss_of,
     slow_states,
     times_ns,
-    worn_monitor,
 )
 
 FANS, WORN = 4, 2
@@ -51,9 +48,9 @@ def after(change: Array, monitor: WearMonitor | None = None, from_day: float = 0
     return monitor
 
 
-def restored(snapshot: Any, fans: int = FANS) -> WearMonitor:
-    successor = WearMonitor(fans, EVERY_S)
-    successor.restore(json.loads(json.dumps(snapshot, allow_nan=False)))
+def restored(monitor: WearMonitor, *, same_twin: bool = True) -> WearMonitor:
+    successor = WearMonitor(len(monitor.t_ns), EVERY_S)
+    successor.continue_from(copy.deepcopy(monitor.state), monitor.arrays(), same_twin=same_twin)
     return successor
 
 
@@ -130,7 +127,7 @@ def test_a_replaced_fan_starts_again_and_is_compared_with_the_others_from_then_o
     feed(monitor, t_ns[:cut], shares[:cut], std_error[:cut])
     monitor.forget(np.arange(FANS) == WORN, START_NS + 30 * NS_PER_DAY)
     assert monitor.of(WORN) is None and monitor.of(0) is not None
-    monitor = restored(monitor.snapshot())
+    monitor = restored(monitor)
     feed(monitor, t_ns[cut:], shares[cut:], std_error[cut:])
     assert change_of(monitor, 0)[0] == pytest.approx(-0.12, abs=0.02)
     found = monitor.of(WORN)
@@ -147,29 +144,9 @@ def test_a_limit_is_reached_only_surely_and_until_the_change_is_below_it_again()
     for day in range(6):
         rows = slice(day * PER_DAY, (day + 1) * PER_DAY)
         feed(monitor, t_ns[rows], steps[rows, np.newaxis] * [-1.0, 1.0], np.full(PER_DAY, error))
-        monitor = restored(monitor.snapshot(), 2)
+        monitor = restored(monitor)
         seen.append(monitor.is_over.tolist())
     assert seen == [[False] * 2] * 3 + [[True] * 2] * 2 + [[False] * 2]
-
-
-@pytest.mark.parametrize("earlier", [True, False])
-def test_a_damaged_snapshot_is_refused_and_changes_nothing(earlier: bool) -> None:
-    monitor = worn_monitor(FANS, WORN, days=2)
-    before, whole = monitor.snapshot(), worn_monitor(FANS, WORN, days=3).snapshot()
-    damaged: list[Any] = [{}, [], None, worn_monitor(FANS + 1, WORN, days=2).snapshot()]
-    for path in (("state",), ("fans",), ("state", "shift"), ("state", "t_ns"), ("fans", 1, "series")):
-        for other in (None, "x", [0] * FANS):
-            broken = copy.deepcopy(whole)
-            place: Any = broken
-            for key in path[:-1]:
-                place = place[key]
-            place[path[-1]] = other
-            damaged += [broken] if path != ("state", "shift") or other != [0] * FANS else []
-    restore = monitor.restore_of_earlier_twin if earlier else monitor.restore
-    for snapshot in damaged:
-        with pytest.raises((ValueError, LookupError, TypeError, AttributeError)):
-            restore(snapshot)
-        assert monitor.snapshot() == before
 
 
 def test_the_change_goes_on_with_another_twin() -> None:
@@ -177,19 +154,15 @@ def test_the_change_goes_on_with_another_twin() -> None:
     change = loss_of(WORN, FANS, 30)
     first, second = change[: 15 * PER_DAY], change[15 * PER_DAY :] - change[15 * PER_DAY] + 0.03
     before = after(first)
-    monitor = WearMonitor(FANS, EVERY_S)
-    monitor.restore_of_earlier_twin(json.loads(json.dumps(before.snapshot())))
+    monitor = restored(before, same_twin=False)
     assert [change_of(monitor, fan) for fan in range(FANS)] == [change_of(before, fan) for fan in range(FANS)]
     after(second, monitor, from_day=15.0, seed=2)
     found, std_error = change_of(monitor, WORN)
     assert found == pytest.approx(-LOSS, abs=2.0 * std_error)
     assert change_of(before, WORN)[1] < std_error < 0.02, "a takeover is no surer than the last point and the first"
     assert abs(change_of(monitor, 0)[0]) < 0.02
-    series = monitor.snapshot()["fans"][WORN]["series"]
-    assert np.abs(np.diff(series["value"])).max() < 0.015, "there is no step"
-    other = WearMonitor(FANS, EVERY_S)
-    other.restore(before.snapshot())
-    after(second, other, from_day=15.0, seed=2)
+    assert np.abs(np.diff(monitor.state.series[WORN].value)).max() < 0.015, "there is no step"
+    other = after(second, restored(before), from_day=15.0, seed=2)
     assert abs(change_of(other, WORN)[0] + LOSS) > 0.01, "without it there is one"
 
 

@@ -24,14 +24,15 @@ def snapshot() -> ScorerSnapshot:
 def test_the_points_of_every_fan_are_read_as_they_are_shown(snapshot: ScorerSnapshot) -> None:
     found = wear_points(snapshot)
     assert [each.fan for each in found] == [0, 1, 2]
-    worn, stored = found[WORN], json.loads(snapshot.state_json)["wear"]["fans"][WORN]
-    assert worn.t_ns.tolist() == stored["series"]["t_ns"]
+    wear = json.loads(snapshot.state_json)["wear"]
+    worn, series = found[WORN], wear["series"][WORN]
+    assert worn.t_ns.tolist() == series["t_ns"]
     assert worn.change[-1] == pytest.approx(-100.0 * LOSS, abs=1.5) and abs(worn.change[0]) < 1.0, "per cent"
-    assert worn.change[-1] == pytest.approx(100.0 * stored["change"], abs=1.0)
-    np.testing.assert_allclose(worn.std_error, 100.0 * np.array(stored["series"]["std_error"]))
+    assert worn.change[-1] == pytest.approx(100.0 * wear["fans"][WORN]["change"], abs=1.0)
+    np.testing.assert_allclose(worn.std_error, 100.0 * np.array(series["std_error"]))
     assert len(worn.after(int(worn.t_ns[-3])).t_ns) == 2
 
 
 def test_a_snapshot_without_wear_or_of_an_unknown_version_has_no_points(snapshot: ScorerSnapshot) -> None:
-    for text in ("{}", '{"wear": {"fans": [{}], "state": {"value": [0]}}}', '{"wear": {"fans": 3}}', "not JSON"):
+    for text in ("{}", '{"wear": {"fans": [{}], "series": [{}]}}', '{"wear": {"fans": 3}}', "not JSON"):
         assert wear_points(replace(snapshot, state_json=text)) == []
