@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict
 from pathlib import Path
 
@@ -12,6 +11,7 @@ import pytest
 from fantwin.pipeline.replay.offline.replay_input import open_replay_input
 from fantwin.pipeline.replay.offline.rescoring import rescore
 from fantwin.pipeline.tray_scoring import tray_scorer
+from fantwin.pipeline.tray_scoring.scorer_state import ScorerState
 from fantwin.schemas.enums import Action, FanState, Transition
 from tests.support.killed_site import CALIBRATION, FANS, Site, balanced_hybrid
 from tests.support.offline_replay import made_equal, recorded, verified
@@ -135,10 +135,8 @@ def test_wear_goes_on_in_a_replay_as_it_did_when_a_twin_took_over(
     with open_replay_input([recording], None, (), None) as replay_input:
         (tray,) = rescore(replay_input, replayed, verify=True)
     assert made_equal(tray) > 2200
-    of_recorded, of_replayed = (
-        json.loads(recorded(path, "snapshot")[-1].state_json)["wear"] for path in (recording, replayed)
-    )
-    assert of_replayed == of_recorded
-    state, fan = of_recorded["state"], of_recorded["fans"][1]
-    assert state["has_shift"][1] and state["joined_variance"][1] > 0.0, "there are points by both twins"
+    of_recorded, of_replayed = (ScorerState.of(recorded(path, "snapshot")[-1]) for path in (recording, replayed))
+    assert of_replayed.wear == of_recorded.wear
+    arrays, fan = of_recorded.arrays, of_recorded.wear.fans[1]
+    assert arrays["wear.has_shift"][1] and arrays["wear.joined_variance"][1] > 0.0, "there are points by both twins"
     assert abs(fan["change"]) < 0.03, "and no step between them"
