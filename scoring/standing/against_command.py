@@ -53,6 +53,11 @@ class AgainstCommand(Saved):
         n = len(block.t_ns)
         self.active, self.score = np.zeros(speed.shape, np.bool_), np.zeros(speed.shape)
         self.kind = np.zeros(speed.shape, np.int64)
+        is_ahead = self._arrived_t_ns > block.t_ns[0]  # of a clock that was set back since: how long ago is not known
+        if is_ahead.any():
+            self._arrived_t_ns[is_ahead] = NEVER_NS
+            self._stands.forget(is_ahead)
+            self._runs.forget(is_ahead)
         missed_ns = self._missed_ns(block.t_ns, block.period_ns, is_here)
         ends = [*np.flatnonzero((missed_ns > 0).any(axis=1)).tolist(), n]
         begin = 0
