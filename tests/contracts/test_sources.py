@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import re
 import threading
 from collections.abc import Callable, Iterator
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -15,7 +13,6 @@ from fantwin.pipeline.sources import polling
 from fantwin.pipeline.sources.http import source as http_source
 from fantwin.pipeline.sources.kinds import SOURCE_KINDS, build_source, parse_source
 from fantwin.pipeline.sources.mqtt import client as broker_client
-from fantwin.pipeline.sources.redfish import source as redfish_source
 from fantwin.pipeline.sources.serial import port as serial_port
 from fantwin.pipeline.sources.source import (
     LinkDown,
@@ -67,7 +64,6 @@ def made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[
         (polling, ("RECONNECT_DELAY_S", "RECONNECT_DELAY_MAX_S")),
         (serial_port, ("REOPEN_DELAY_S", "REOPEN_DELAY_MAX_S")),
         (http_source, ("RETRY_S",)),
-        (redfish_source, ("PERIOD_S",)),
     ):
         for name in names:
             monkeypatch.setattr(module, name, 0.02)
@@ -182,38 +178,3 @@ def test_settings_are_frozen_and_an_unknown_one_is_refused_by_name(kind: str, ma
         parse_source({**settings, "no_such_key": 1})
     with pytest.raises(ValueError, match="frozen"):
         config.kind = "other"  # pyright: ignore[reportAttributeAccessIssue]
-
-
-FAN = {"speed": {"address": 1}, "command": {"address": 2}}
-NO_SUCH_REGISTER = {"speed": {"address": 1, "scale": 0}, "command": {"address": 2}}
-BROKER = {"url": "mqtt://broker"}
-IMPOSSIBLE: list[tuple[str, dict[str, Any], str]] = [
-    ("serial", {"baud": 0}, "baud"),
-    ("modbus", {"line": "drive", "fan": [NO_SUCH_REGISTER]}, "scale is 0"),
-    ("modbus", {"line": "", "fan": [FAN]}, "give plc1, plc1:1502"),
-    ("modbus", {"line": "drive:port", "fan": [FAN]}, "give plc1, plc1:1502"),
-    ("modbus", {"line": "fe80::1", "fan": [FAN]}, "or [fe80::1]"),
-    ("modbus", {"line": "/dev/ttyUSB0", "serial": "9600 7E1", "fan": [FAN]}, "serial"),
-    ("redfish", {"url": "https://a:b@bmc1"}, "a configuration is recorded"),
-    ("redfish", {"url": "bmc1"}, "write the address"),
-    ("redfish", {"url": "https://a@bmc1"}, "needs password_file"),
-    ("http", {"host": "0.0.0.0"}, "can be reached from other hosts: give token_file"),
-    ("http", {"host": "board.plant"}, "can be reached from other hosts: give token_file"),
-    ("http", {"key": "x"}, "give certificate and key"),
-    ("mqtt", {**BROKER}, "topic"),
-    ("mqtt", {**BROKER, "topic": "a", "command_topic": "b/{0}"}, "topic needs the number of the first fan"),
-    ("mqtt", {**BROKER, "topic": "b/{1}"}, "give command_topic"),
-    ("mqtt", {**BROKER, "topic": "b/{1}/+", "command_topic": "c/{1}"}, "no + or #"),
-    ("mqtt", {**BROKER, "topic": "b/{1}", "command_topic": "b/rpm"}, "command_topic needs the number of the first fan"),
-    ("mqtt", {**BROKER, "topic": "b/{1}", "command_topic": "b/{1}"}, "are the same"),
-    ("mqtt", {**BROKER, "topic": "a", "send_topic": "b/#"}, "without + and #"),
-    ("mqtt", {**BROKER, "topic": "a", "password_file": "x"}, "needs a user in url"),
-    ("mqtt", {**BROKER, "topic": "a", "ca": "x"}, "need mqtts://"),
-    ("mqtt", {"url": "mqtts://broker", "topic": "a", "key": "x"}, "give certificate and key"),
-]
-
-
-@pytest.mark.parametrize(("kind", "settings", "words"), IMPOSSIBLE)
-def test_settings_that_cannot_be_are_refused_with_what_to_do(kind: str, settings: dict[str, Any], words: str) -> None:
-    with pytest.raises(ValueError, match=re.escape(words)):
-        parse_source({"kind": kind, **settings})

@@ -5,15 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
 from bench.detection.tray_run import samples_of
 from fantwin.schemas.device_sample import DeviceSample
-from fantwin.simulation.errors import SimulationError
 from fantwin.simulation.faults import Fault
 from fantwin.simulation.plant import Surroundings
 from fantwin.simulation.tacho import NoisyTacho, TachoSettings
-from fantwin.simulation.tray import SimulatedTray, TraySettings
+from fantwin.simulation.tray import TraySettings
 
 DUTY = 0.7
 ALL = ("supply_voltage_v", "current_a", "temperature_c")
@@ -56,8 +54,3 @@ def test_4_pin_fans_follow_a_supply_that_wanders_only_where_they_do_not_hold_the
     assert np.all(np.abs(share - 1.0) > 0.02)
     np.testing.assert_allclose(held.speed_rad_s / steady, 1.0, atol=0.005)
     np.testing.assert_allclose(follows.speed_rad_s / steady, share, atol=0.01)
-
-
-def test_the_current_of_4_pin_fans_is_not_simulated() -> None:
-    with pytest.raises(SimulationError, match="choose dc fans"):
-        SimulatedTray(TraySettings(fan="4-pin", surroundings=Surroundings(measured=ALL)))

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from fantwin.schemas.tacho import Tacho
-from fantwin.simulation.errors import SimulationError
 from fantwin.simulation.tacho import (
     AveragingTacho,
     CountingTacho,
@@ -99,11 +98,6 @@ def test_a_delay_shows_what_was_measured_before() -> None:
     late = simulated_tacho(TachoSettings((Tacho(kind="period", delay_s=0.295),)), 2, np.random.default_rng(5))
     assert isinstance(late, DelayedTacho)
     assert np.array_equal(readings(late, speed)[30:], now[:-30])
-
-
-def test_a_window_of_a_broken_number_of_updates_is_refused() -> None:
-    with pytest.raises(SimulationError, match=r"not a whole number of updates of 0\.3 s; give 0\.333"):
-        counts_of(Tacho(kind="count", window_s=1.0, update_s=0.3))
 
 
 def test_an_average_is_the_mean_speed_of_its_window_in_whole_steps_and_is_held() -> None:

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fantwin.pipeline.config.loading import parse_config
-from fantwin.pipeline.config.settings import ConfigError, TrayConfig
+from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.recordings import disk, disk_room
 from fantwin.pipeline.recordings.contents import contents_of
 from fantwin.pipeline.recordings.reading import read_metadata, read_recording
@@ -319,20 +319,6 @@ def test_of_healths_those_that_report_something_new_are_recorded_and_no_other_is
     assert streams[health_key("plant", "scorer", "all"), "acquisition-1"].missing == 0
     assert streams[RAW_KEY, "acquisition-1"].missing == 3, "the last one says what was published"
     assert scan(path).counts.ledger.counts[health_key("plant", "scorer", "all"), "acquisition-1"].missing == 0
-
-
-@pytest.mark.parametrize(
-    ("topic", "words"),
-    [
-        ("scor", "recorder.topics = ['scor']: unknown topic 'scor'; did you mean 'score'?"),
-        ("clock", "unknown topic 'clock'; known: raw, grid, prediction, score"),
-        ("alarm", "alarm is always recorded: name only topics of samples, raw, grid, prediction, score"),
-    ],
-)
-def test_a_topic_that_cannot_be_chosen_is_refused_in_one_line(topic, words):
-    with pytest.raises(ConfigError) as refused:
-        chosen(2, f"topics = ['{topic}']")
-    assert words in str(refused.value) and "\n" not in str(refused.value)
 
 
 def test_a_recording_says_which_topics_were_left_out_on_purpose(tmp_path):

@@ -13,7 +13,9 @@ from fantwin.pipeline.runtime.stage import load_stage
 from fantwin.schemas.codec import encode, type_name
 from fantwin.schemas.health import Health, Input, Output
 from fantwin.schemas.topics import BY_NAME, alive_key, health_key, tray_key
+from tests.support.fantwin_command import error_of
 from tests.support.made_messages import health
+from tests.support.replay_data import write_raw
 from tests.support.running_chain import eventually
 
 ALL = ("raw", "grid", "prediction", "score", "alarm", "command", "twin")
@@ -83,6 +85,15 @@ class FakeStage:
             lost=lost,
         )
         self.publisher.put(encode(said))
+
+
+def test_beside_another_replay_none_starts(tmp_path, endpoint, monkeypatch):
+    monkeypatch.setattr(Listeners, "wait_for_discovery", lambda _listeners, _stop, _report: None)
+    monkeypatch.setattr(Listeners, "is_replaying", lambda _listeners: True)
+    recording, config = write_raw(tmp_path / "r.mcap", 20), tmp_path / "c.toml"
+    config.write_text(f'site = "hall"\nbus = {{ endpoint = "{endpoint}" }}\n[[tray]]\nname = "tray1"\nfans = 8\n')
+    expected = f"a replay is running on site 'hall' at {endpoint}: stop that first"
+    assert error_of("replay", recording, "-c", config) == expected
 
 
 def seen_stages(bus: Bus, listeners: Listeners, *names: str) -> list[FakeStage]:

@@ -27,7 +27,7 @@ from fantwin.twin.report.steady_states import static_curve
 from fantwin.twin.report.timeline import broken_at, kept_samples, timeline
 from fantwin.twin.runs import Run
 from tests.support.fan_data import PUBLISHED_PARAMETERS, published_run, rough_run
-from tests.support.fantwin_command import error_of, fantwin
+from tests.support.fantwin_command import fantwin
 from tests.support.page_browser import measured
 from tests.support.written_recordings import write_run as record
 
@@ -102,7 +102,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         recordings = (path / name / "healthy.mcap", "--validate", path / name / "held-out.mcap")
         made = fantwin("train", *recordings, *common, "-o", path / name / "twin.onnx")
         assert made.exit_code == 0, made.output
-    record(path / "three.mcap", published_run(4, 5.0, fans=3))
     return path
 
 
@@ -310,16 +309,6 @@ def test_recordings_summed_one_by_one_give_the_figures_of_all_their_samples(twin
     np.testing.assert_allclose(fan.residual.cross_correlation, of_samples.residual.cross_correlation, atol=1e-9)
     assert [part.middle_rad_s for part in fan.by_speed] == [part.middle_rad_s for part in of_samples.by_speed]
     assert assess(summary) == assess(content)
-
-
-def test_invalid_input_is_a_one_line_error(folder, tmp_path):
-    twin, held_out = folder / "two" / "twin.onnx", folder / "two" / "held-out.mcap"
-    assert "has fans 0, 1, the runs have 0, 1, 2" in error_of("report", twin, folder / "three.mcap")
-    assert "no such file" in error_of("report", tmp_path / "nowhere.onnx", held_out)
-    (tmp_path / "text.onnx").write_text("text")
-    assert "not an ONNX file" in error_of("report", tmp_path / "text.onnx", held_out)
-    assert "cannot read the recording" in error_of("report", twin, tmp_path / "nowhere.mcap")
-    assert "name a file that ends in .html" in error_of("report", twin, held_out, "-o", tmp_path)
 
 
 def test_in_a_browser_nothing_overflows_is_fetched_or_too_small_to_read(page_of_hybrid):

@@ -112,29 +112,6 @@ def test_dates_and_periods_need_no_unit_and_a_name_with_blanks_is_quoted(tmp_pat
 
 
 @pytest.mark.parametrize(
-    ("arguments", "expected"),
-    [
-        ({"time": "T1me"}, "no column 'T1me'"),
-        ({"speed": ("speeed",)}, r"no column 'speeed'; it has t, u, y"),
-        ({"time": "tt"}, "did you mean 't'"),
-        ({"speed": ("y:rmp",)}, "unknown unit 'rmp'; known: rad/s, rpm, hz, deg/s"),
-        ({"time": "t:min"}, "unknown unit 'min'; known: s, ms, us, ns, iso"),
-        ({"command": ("u:V",)}, "no column 'u:V'; did you mean 'u'?"),
-        ({"time": None}, "needs --time COLUMN"),
-        ({"time": None, "period": "10"}, "with its unit"),
-        ({"time": None, "period": "0ms"}, "with its unit"),
-        ({"period": "10ms"}, "leave out --time or --period"),
-        ({"command": ("u", "u"), "speed": ("y", "y", "y")}, "2 command and 3 speed columns"),
-        ({"speed": ("y:rpm", "y:hz")}, "speeds in rpm, hz: give all in one unit"),
-    ],
-)
-def test_a_wrong_description_of_the_table_is_a_one_line_error(tmp_path, arguments, expected):
-    with pytest.raises(UserError, match=expected) as raised:
-        table(tmp_path, "t,u,y\n0,1,10\n1,2,20\n", **arguments)
-    assert "\n" not in str(raised.value)
-
-
-@pytest.mark.parametrize(
     ("content", "expected"),
     [
         ("", "must name the columns"),
