@@ -14,12 +14,18 @@ from fantwin.twin.export.onnx_export import export_onnx
 from fantwin.twin.export.onnx_twin import OnnxTwin
 from fantwin.twin.finishing import TrainedTwin
 from fantwin.twin.kinds import KINDS
+from fantwin.twin.models.physics import LAG
 from fantwin.twin.runs import Array
 from tests.support import fan_data
 from tests.support.made_once import TrainedOnce
 
 MOST_ITERATIONS = 2
 RUN = fan_data.rough_run(1, 6.0, fans=2)
+COMMAND = np.repeat(RUN.command, 2, axis=1)
+STEP_S = np.random.default_rng(9).uniform(0.008, 0.012, RUN.samples)
+STEP_S[100:110], STEP_S[300] = 1e-7, 0.0
+LAGS_S = (0.05, 0.0, 1.0, 5e-5)
+"""what four fans are given, at uneven steps, some of them tiny or zero; each has another lag, or none"""
 every_kind = pytest.mark.parametrize("kind", [row.name for row in KINDS])
 Advance = Callable[[Array, Array, Array, Array], tuple[Array, Array]]
 
@@ -34,7 +40,7 @@ def in_pieces(advance: Advance, ends: list[int], state: Array, parameters: Array
     """The speeds and the last state of a run that was cut."""
     parts = []
     for first, end in zip([0, *ends], [*ends, RUN.samples], strict=True):
-        speed, state = advance(state, RUN.command[first:end], RUN.step_s[first:end], parameters)
+        speed, state = advance(state, COMMAND[first:end], STEP_S[first:end], parameters)
         parts.append(speed)
     return np.concatenate(parts), state
 
@@ -44,17 +50,21 @@ def test_a_run_that_is_cut_anywhere_goes_on_as_if_it_were_not_in_memory_and_in_t
     kind: str, trained: Callable[..., TrainedTwin], tmp_path: Path
 ) -> None:
     twin = trained(kind)
-    state = twin.model.state_layout.initial_state(np.array([5.0, 50.0]), RUN.command[0])
-    whole, last = twin.model.advance(state, RUN.command, RUN.step_s, twin.parameters)
+    parameters = np.repeat(twin.parameters, 2, axis=0)
+    parameters[:, LAG] = LAGS_S
+    turning_rad_s = np.array([20.0, 90.0, 0.0, -40.0])
+    state = twin.model.state_layout.initial_state(turning_rad_s, COMMAND[0] + 30.0)
+    whole, last = twin.model.advance(state, COMMAND, STEP_S, parameters)
+    assert np.ptp(whole, axis=0).min() > 20.0
     file = OnnxTwin(twin.save(tmp_path / "x.onnx"))
-    of_file, last_of_file = file.advance(state, RUN.command, RUN.step_s, twin.parameters)
+    of_file, last_of_file = file.advance(state, COMMAND, STEP_S, parameters)
     np.testing.assert_allclose(of_file, whole, rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(last_of_file, last, rtol=1e-9, atol=1e-9)
     for ends in ([1, 2, 3], sorted(np.random.default_rng(1).choice(RUN.samples, 5, replace=False).tolist())):
-        speed, after = in_pieces(twin.model.advance, ends, state, twin.parameters)
+        speed, after = in_pieces(twin.model.advance, ends, state, parameters)
         np.testing.assert_allclose(speed, whole, rtol=1e-12, atol=1e-12)
         np.testing.assert_allclose(after, last, rtol=1e-12, atol=1e-12)
-        speed, after = in_pieces(file.advance, ends, state, twin.parameters)
+        speed, after = in_pieces(file.advance, ends, state, parameters)
         np.testing.assert_array_equal(speed, of_file)
         np.testing.assert_array_equal(after, last_of_file)
 

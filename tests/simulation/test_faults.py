@@ -53,16 +53,6 @@ def test_a_stuck_tacho_repeats_its_last_reading_until_the_fault_ends() -> None:
     assert run[300, 0] == run[300, 1]
 
 
-def test_a_dropping_tacho_gives_no_reading_for_its_share_of_samples() -> None:
-    run = speeds("tacho-dropout:fan=0,start=2,stop=12,size=0.3")
-    missing = np.isnan(run)
-    assert missing[200:, 0].mean() == pytest.approx(0.3, abs=0.05)
-    assert not missing[:200].any()
-    assert not missing[:, 1].any()
-    there = ~missing[:, 0]
-    assert np.array_equal(run[there, 0], run[there, 1])  # the fan itself is well
-
-
 def test_the_tray_reports_when_a_fault_really_began_and_ended() -> None:
     fault = parse_fault("inlet:fan=0,start=1.003,stop=2.001")
     tray = SimulatedTray(replace(QUIET, faults=(fault, parse_fault("rotor:fan=1,start=5"))))

@@ -107,23 +107,3 @@ def test_sampling_times_scatter_by_the_jitter_around_a_schedule_that_does_not_dr
     assert error_s.std() == pytest.approx(500e-6, rel=0.1)
     assert abs(error_s.mean()) < 50e-6
     assert np.all(np.diff([s.t_s for s in samples]) > 0.0)
-
-
-def test_a_command_over_the_line_overrides_the_profile_of_its_fan_alone() -> None:
-    tray = SimulatedTray(TraySettings(fans=2, duration_s=60.0))
-    before = tray.take().command
-    tray.command(np.array([np.nan, 0.33]))
-    after = tray.take().command
-    assert after[1] == 0.33
-    assert after[0] == pytest.approx(before[0], abs=0.05)
-    tray.command(np.array([np.nan, 7.0]))
-    assert tray.take().command[1] == 1.0
-
-
-def test_a_fan_with_a_set_point_reaches_it_and_a_command_ends_it() -> None:
-    tray = SimulatedTray(TraySettings(fans=2, duration_s=60.0))
-    tray.set_point(np.array([400.0, np.nan]))
-    samples = [tray.take() for _ in range(2000)]
-    assert np.mean([s.speed_rad_s[0] for s in samples[1000:]]) == pytest.approx(400.0, abs=2.0)
-    tray.command(np.array([0.5, np.nan]))
-    assert tray.take().command[0] == 0.5

@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from fantwin.twin.models.hybrid import Hybrid
 from fantwin.twin.models.narx import PARAMETER_COUNT, Narx
 from fantwin.twin.models.network import Scaling, TanhNetwork
-from fantwin.twin.models.neural_ode import NeuralOde
-from fantwin.twin.models.physical import PhysicalModel
 
 SCALING = Scaling(80.0, 90.0, 50.0, 50.0, 300.0)
 
@@ -20,6 +17,3 @@ def random_network(units: int, inputs: tuple[str, ...] = ("speed", "command")) -
 
 def random_narx() -> Narx:
     return Narx(np.random.default_rng(1).normal(scale=0.1, size=PARAMETER_COUNT), SCALING)
-
-
-ALL_MODELS = [PhysicalModel(), NeuralOde(random_network(20)), Hybrid(random_network(10)), random_narx()]

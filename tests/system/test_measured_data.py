@@ -81,6 +81,8 @@ def test_a_twin_of_the_first_part_predicts_the_rest_and_is_believed_only_where_i
     ):
         done = fantwin(*words)
         assert done.exit_code == 0, done.exception
+        has_loop = "closed loop" in done.output
+        assert has_loop == (words[0] == "train" and file.startswith("rosa")), "a motor in open loop has none"
     found: dict[str, list[Any]] = {}
     for entry in read_recording(judged):
         found.setdefault(entry.topic, []).append(entry.message)

@@ -11,11 +11,10 @@ from fantwin.pipeline.prediction.twin_file import TwinFile
 from fantwin.schemas.blocks import cut
 from fantwin.schemas.messages import Grid, Message, ModelCard, NewTwin, Prediction
 from fantwin.stages.twin_integrator import TwinIntegratorConfig, TwinIntegratorCore
+from tests.support.integrated_twins import EPOCH_NS, STEP_NS, grid_of
 from tests.support.twin_files import small_hybrid, write_twin
 
 FANS = 2
-STEP_NS = 10_000_000
-EPOCH_NS = 1_800_000_000_000_000_000
 TRAY = TrayConfig.model_validate({"name": "tray1", "fans": FANS})
 
 
@@ -41,17 +40,8 @@ def time_of(sample: int) -> int:
 
 
 def grid(first: int, end: int) -> Grid:
-    t_ns = EPOCH_NS + np.arange(first, end, dtype=np.int64) * STEP_NS
-    columns = np.full((len(t_ns), FANS), 50.0)
-    return Grid(
-        fans=FANS,
-        period_ns=STEP_NS,
-        t_ns=t_ns,
-        command=columns,
-        speed_rad_s=columns,
-        valid=np.ones_like(columns, np.bool_),
-        invalid_reason=np.zeros_like(columns, np.uint8),
-    )
+    columns = np.full((end - first, FANS), 50.0)
+    return grid_of(columns, columns, first=first)
 
 
 def new_twin(content: bytes, number: int, first_sample: int | None = None) -> NewTwin:

@@ -15,14 +15,14 @@ from mcap.records import ChunkIndex
 from fantwin.pipeline.recordings.reading import RecordingError
 from fantwin.pipeline.recordings.writing import RecordingWriter
 from fantwin.pipeline.replay.live.recording_playback import RecordingPlayback, TimeExtent, shifted
-from fantwin.schemas.enums import InvalidReason
 from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.fields import columns
 from fantwin.schemas.header import Header
-from fantwin.schemas.messages import Alarm, Grid, ModelCard
+from fantwin.schemas.messages import Alarm, ModelCard
 from fantwin.schemas.topics import tray_key
 from fantwin.scoring.alarms.alarm_state import UNTIL_IT_CLEARS_T_NS
 from tests.support import made_messages
+from tests.support.integrated_twins import grid_of
 from tests.support.replay_data import START_NS, STEP_NS, raw_of, write_raw
 
 RAW = tray_key("demo", "tray1", "raw")
@@ -105,13 +105,9 @@ def test_a_recording_without_messages_to_replay_ends_even_in_a_loop(tmp_path):
 
 @pytest.mark.parametrize("span_ns", [10 * 33_333_333, 10 * 33_333_333 + 5])
 def test_a_round_is_a_whole_number_of_grid_steps_and_longer_than_all_that_is_in_it(span_ns):
-    extent = TimeExtent()
+    extent, grid = TimeExtent(), grid_of(np.zeros(1), period_ns=33_333_333)
     for t_ns in (START_NS, START_NS + span_ns):
-        zeros = np.zeros((1, 1))
-        why = np.full((1, 1), InvalidReason.NONE, np.uint8)
-        states = {"valid": zeros == 0, "invalid_reason": why, "command": zeros, "speed_rad_s": zeros}
-        grid = Grid(fans=1, period_ns=33_333_333, t_ns=np.array([t_ns]), **states)
-        extent.add(Envelope.of("fantwin/demo/tray1/grid", grid, START_NS + 7))
+        extent.add(Envelope.of("fantwin/demo/tray1/grid", replace(grid, t_ns=np.array([t_ns])), START_NS + 7))
     assert extent.length_ns() % 33_333_333 == 0
     assert span_ns < extent.length_ns() <= span_ns + 33_333_333
 

@@ -75,26 +75,15 @@ def test_row_13_the_time_never_goes_back() -> None:
     assert all(later > earlier for earlier, later in pairwise(times))
 
 
-def test_row_13_a_stage_that_is_started_after_the_wall_clock_was_set_back_goes_on_with_the_time_of_its_launcher() -> (
-    None
-):
+@pytest.mark.parametrize("set_by_s", [-3600, -20, -10, -3, -2, 3])
+def test_row_13_a_stage_goes_on_with_the_time_of_its_launcher_and_notices_a_step_while_it_starts(set_by_s: int) -> None:
     host = Host()
-    host.passes(1.0)
-    host.passes(1.0, set_by_ns=-HOUR_NS)
-    handed = handed_on({VARIABLE: str(host.clock.offset_ns)})
-    of_stage = HostClock(lambda: host.wall_ns, lambda: host.monotonic_ns, handed)
-    assert of_stage.now_ns() == host.passes(0.0) == host.wall_ns + HOUR_NS
-    assert of_stage.last_step and of_stage.last_step.step_ns == -HOUR_NS, "it reports the step, too"
-
-
-@pytest.mark.parametrize("set_by_s", [-20, -10, -3, -2, 3])
-def test_row_13_a_clock_set_while_a_stage_starts_is_noticed_by_it(set_by_s: int) -> None:
-    host = Host()
-    before, offset_ns = host.passes(1.0), host.clock.offset_ns
+    before, handed = host.passes(1.0), handed_on({VARIABLE: str(host.clock.offset_ns)})
     host.monotonic_ns += NS_PER_S
     host.wall_ns += NS_PER_S + set_by_s * NS_PER_S
-    of_stage = HostClock(lambda: host.wall_ns, lambda: host.monotonic_ns, offset_ns)
+    of_stage = HostClock(lambda: host.wall_ns, lambda: host.monotonic_ns, handed)
     assert of_stage.now_ns() == host.clock.now_ns() == before + NS_PER_S + max(set_by_s, 0) * NS_PER_S
+    assert of_stage.last_step == host.clock.last_step, "it reports the step, too"
 
 
 @pytest.mark.parametrize("environment", [{}, {VARIABLE: "soon"}])

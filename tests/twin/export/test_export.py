@@ -1,4 +1,4 @@
-"""The exported file against the model in numpy and in torch, and files that are not one."""
+"""The card in the exported file, and files that are not one. The graph itself: contracts/test_model_kinds.py."""
 
 import json
 from dataclasses import replace
@@ -13,16 +13,11 @@ from onnx import helper
 
 from fantwin.schemas.twin_card import CARD_PROPERTY, DataCard, TwinCard
 from fantwin.twin.errors import TwinError
-from fantwin.twin.export.onnx_export import export_onnx
 from fantwin.twin.export.onnx_twin import OnnxTwin
 from fantwin.twin.finishing import TrainedTwin
-from fantwin.twin.models.hybrid import Hybrid
-from fantwin.twin.models.model import Model
 from tests.support import fan_data
 from tests.support.made_once import TrainedOnce
-from tests.support.random_models import ALL_MODELS, random_network
 
-SAMPLES = 2000
 CREATED = datetime(2026, 1, 1, tzinfo=UTC)
 
 
@@ -31,54 +26,6 @@ def trained(trained_once: TrainedOnce) -> TrainedTwin:
     run = fan_data.published_run(1, 20.0, fans=2)
     data = [DataCard("bench.csv", "ab" * 32, run.fans, run.samples)]
     return trained_once([run], [], "physical", name="bench", command_unit="%", data=data, created=CREATED)
-
-
-def saved(model: Model, card: TwinCard, folder: Path) -> OnnxTwin:
-    fields = json.loads(card.to_json())
-    fields |= {"kind": model.kind, "n_state": model.state_layout.size}
-    fields["state_layout"] = {"speed": model.state_layout.speed, "command": model.state_layout.command}
-    path = folder / f"{model.kind}.onnx"
-    path.write_bytes(export_onnx(model, TwinCard.from_json(json.dumps(fields))))
-    return OnnxTwin(path)
-
-
-EVERY_MODEL = [*ALL_MODELS, Hybrid(random_network(10, ("speed",)))]
-every_model = pytest.mark.parametrize("model", EVERY_MODEL, ids=["physical", "neural-ode", "hybrid", "narx", "speed"])
-FANS = 4
-
-
-def fleet() -> np.ndarray:
-    """(4, 4) parameters of fans that differ in every parameter; the second has no lag, the last a small one."""
-    scale = np.linspace(0.8, 1.3, FANS)[:, np.newaxis] ** np.array([1.0, -1.0, 2.0])
-    return np.column_stack((scale * fan_data.PUBLISHED_PARAMETERS, (0.05, 0.0, 1.0, 5e-5)))
-
-
-def uneven_commands() -> tuple[np.ndarray, np.ndarray]:
-    """Twenty seconds for four fans at uneven steps, some of them tiny or zero."""
-    rng = np.random.default_rng(9)
-    step_s = rng.uniform(0.008, 0.012, SAMPLES)
-    step_s[100:110], step_s[1500] = 1e-7, 0.0
-    return fan_data.stairs(rng, SAMPLES, FANS), step_s
-
-
-def state_of(model: Model, command: np.ndarray) -> np.ndarray:
-    """Fans that turn, one of them backwards, after a command that differs from the first one here."""
-    return model.state_layout.initial_state(np.array([20.0, 90.0, 0.0, -40.0]), command[0] + 30.0)
-
-
-@every_model
-def test_the_file_runs_uneven_steps_in_two_blocks_as_numpy_does_in_one(
-    model: Model, trained: TrainedTwin, tmp_path: Path
-) -> None:
-    command, step_s = uneven_commands()
-    twin = saved(model, trained.card, tmp_path)
-    state, parameters = state_of(model, command), fleet()
-    expected, expected_state = model.advance(state, command, step_s, parameters)
-    first, middle = twin.advance(state, command[:777], step_s[:777], parameters)
-    second, last = twin.advance(middle, command[777:], step_s[777:], parameters)
-    assert np.ptp(expected, axis=0).min() > 50.0
-    np.testing.assert_allclose(np.concatenate((first, second)), expected, rtol=1e-9, atol=1e-9)
-    np.testing.assert_allclose(last, expected_state, rtol=1e-9, atol=1e-9)
 
 
 def test_the_card_travels_in_the_file(trained: TrainedTwin, tmp_path: Path) -> None:

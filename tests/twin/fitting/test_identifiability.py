@@ -1,13 +1,10 @@
 """Warnings: none for recordings that determine every parameter, and the right one for each that does not."""
 
 import re
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 import pytest
-from numpy.typing import ArrayLike
 
 from fantwin.schemas.tacho import Tacho
 from fantwin.twin.fitting.identifiability import feedback_share, identifiability_warnings
@@ -19,7 +16,6 @@ from tests.support.fan_data import published_run, rough_run
 
 INERTIA, VISCOUS, DRAG = fan_data.PUBLISHED_PARAMETERS[:3]
 STEP_S = 1.0 / fan_data.RATE_HZ
-RPM = np.pi / 30.0
 
 
 def warnings_of(*runs: Run) -> tuple[str, ...]:
@@ -178,51 +174,11 @@ def test_each_parameter_is_judged_by_its_own_interval(
     assert not words or has_line_with(lines, *words)
 
 
-def merged(name: str, t_s: ArrayLike, command: ArrayLike, speed_rad_s: ArrayLike) -> Run:
-    """A run of samples whose time may repeat: those of one time become one, mean speed and last command."""
-    table = pd.DataFrame({"t_s": t_s, "command": command, "speed_rad_s": speed_rad_s})
-    one = table.groupby("t_s", sort=False).agg({"command": "last", "speed_rad_s": "mean"})
-    return Run(name, one.index.to_numpy(float), one["command"].to_numpy(float), one["speed_rad_s"].to_numpy(float))
-
-
 def test_a_command_that_hardly_moves_is_little_excitation() -> None:
     levels = np.random.default_rng(4).choice([50.0, 51.0], 14).repeat(100)[:, None]
     lines = warnings_of(commanded(levels, seed=4, warm_up_s=4.0))
     for reason in ("moves by 2.0%", "2 level(s) only", "hardly more than its noise"):
         assert has_line_with(lines, "little excitation", reason, "three or more levels")
-
-
-def rosa(folder: Path, number: int) -> Run:
-    table = pd.read_csv(folder / "rosa" / f"healthy_{number}.csv", encoding="utf-8-sig", low_memory=False)
-    table.columns = table.columns.str.strip()
-    t_s = table["Time"].to_numpy(dtype=float) / 1000.0
-    return merged("rosa", t_s, table["Shaft Control Effort"], table["Actual Speed"] * RPM)
-
-
-@pytest.mark.data
-def test_the_rotor_under_speed_control_is_noticed_in_every_healthy_run(measured_data) -> None:
-    for number in (44, 120):
-        assert feedback_share(rosa(measured_data, number).split_at_gaps(), 0) > 0.2, number
-    assert has_line_with(warnings_of(rosa(measured_data, 103)), "closed loop")
-
-
-@pytest.mark.data
-def test_motors_in_open_loop_are_not_reported_as_controlled(measured_data) -> None:
-    esc = pd.read_csv(measured_data / "esc_test" / "f40_steps_5-2.csv")
-    stamps = pd.to_datetime(esc["Timestamp"], format="%Y-%m-%d %H:%M:%S:%f")
-    seconds = (stamps - stamps.iloc[0]).dt.total_seconds()
-    crazyflie = pd.read_csv(measured_data / "imrclab" / "cf21_stock2.csv")
-    rpm = crazyflie[[f"rpm{k}" for k in (1, 2, 3, 4)]].to_numpy(dtype=float)
-    pwm = np.tile(crazyflie["pwm"].to_numpy(dtype=float)[:, None], (1, 4))
-    motor = pd.read_csv(measured_data / "undcmotor" / "DCmotor_prbs_open_exp.csv")
-    for run in (
-        merged("esc", seconds, esc["Duty"], esc["RPM"] * RPM),
-        Run("crazyflie", 0.01 * np.arange(float(len(rpm))), pwm, rpm * RPM),
-        merged("motor", motor["t"], motor["u"], np.deg2rad(motor["y"])),
-    ):
-        lines = warnings_of(run)
-        assert not has_line_with(lines, "closed loop"), run.name
-        assert not has_line_with(lines, "cannot be distinguished"), run.name
 
 
 def counted(gain_per_rad_s: float) -> Run:

@@ -13,7 +13,7 @@ from onnx import helper
 
 from fantwin.pipeline.prediction.twin_file import TwinFile
 from fantwin.schemas.enums import InvalidReason
-from fantwin.schemas.messages import Grid, Prediction
+from fantwin.schemas.messages import Prediction
 from fantwin.schemas.twin_card import NetworkCard, StateLayout
 from fantwin.stages.twin_integrator import TwinIntegratorConfig, TwinIntegratorCore
 from fantwin.twin import kinds
@@ -26,6 +26,7 @@ from fantwin.twin.report.content import SpeedUnit, report_content
 from fantwin.twin.report.page import report_page
 from fantwin.twin.runs import Array, Run
 from tests.support import fan_data
+from tests.support.integrated_twins import grid_of
 
 
 @dataclass(frozen=True)
@@ -109,17 +110,9 @@ def test_the_runtime_loads_and_runs_it_by_its_card_alone(trained: TrainedTwin, t
     twin = TwinFile.load(path, 2)
     run = linear_run(4)
     core = TwinIntegratorCore(twin, TwinIntegratorConfig(warm_up_s=0.5), 0)
-    valid = np.ones(run.command.shape, np.bool_)
-    grid = Grid(
-        fans=2,
-        period_ns=10_000_000,
-        t_ns=np.arange(run.samples) * 10_000_000,
-        command=run.command,
-        speed_rad_s=run.speed_rad_s,
-        valid=valid,
-        invalid_reason=np.zeros(run.command.shape, np.uint8),
+    (prediction,) = (
+        message for message in core.step(grid_of(run.command, run.speed_rad_s)) if isinstance(message, Prediction)
     )
-    (prediction,) = (message for message in core.step(grid) if isinstance(message, Prediction))
     assert (prediction.invalid_reason[100:] == InvalidReason.NONE).all()
     error = prediction.measured_speed_rad_s - prediction.predicted_speed_rad_s
     assert np.sqrt(np.mean(error[100:] ** 2)) < 0.3

@@ -42,17 +42,6 @@ TITLES = [
     "Error over speed",
 ]
 TITLES_OF_HYBRID = [*TITLES, "What the twin knows"]
-FIGURES = (
-    "over_time",
-    "around_the_largest_error",
-    "histogram",
-    "autocorrelation",
-    "cross_correlation",
-    "static_curve",
-    "error_over_speed",
-    "what_is_known",
-)
-"""the functions that draw them"""
 RAD_S = SpeedUnit("rad/s", 1.0)
 SMALLEST_TEXT_UNITS = 8.5 * 0.88
 """Height of the smallest text of a figure in the units of its viewBox (points)."""
@@ -151,13 +140,6 @@ def page_of_hybrid(content_of_hybrid: Content) -> str:
     return report_page(content_of_hybrid)
 
 
-@pytest.fixture
-def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Pages without drawings, for what is asserted about their words."""
-    for name in FIGURES:
-        monkeypatch.setattr(figures, name, lambda *_, **__: "")
-
-
 def content_of(twin: OnnxTwin, *runs: Run, unit: SpeedUnit = RAD_S) -> Content:
     return report_content(twin, runs, [DataCard("runs.mcap", "0" * 64, runs[0].fans, runs[0].samples)], unit)
 
@@ -196,7 +178,8 @@ def test_a_healthy_fan_is_followed_as_declared_and_without_a_warning(twin):
     assert judged.headline == "The twin follows this fan as closely as its card says."
 
 
-def test_a_fan_that_runs_slow_is_not_followed_and_the_page_says_by_how_much(twin, undrawn):
+def test_a_fan_that_runs_slow_is_not_followed_and_the_page_says_by_how_much(twin, monkeypatch):
+    monkeypatch.setattr("fantwin.twin.report.page.fan_figures", lambda *_: [])  # it is about the words
     healthy = published_run(5, 30.0)
     content = content_of(twin, with_speed(healthy, 0.9 * healthy.speed_rad_s))
     judged = assess(content)
