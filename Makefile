@@ -71,7 +71,7 @@ lock: $(VENV)/.development
 		--output-file requirements-bench.lock
 
 # what depends on a release of Rerun: its calls, its files, and the viewer itself, which must report nothing
-RERUN_TESTS := tests/pipeline/outputs/rerun tests/stages/test_viewer.py tests/stages/test_viewer_fleet.py \
+RERUN_TESTS := tests/pipeline/outputs/rerun tests/stages/test_viewer.py \
 	tests/pipeline/recordings/test_other_readers.py
 
 rerun-bump:

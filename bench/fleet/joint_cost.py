@@ -2,7 +2,7 @@
 
 Rough fans at 100 Hz under random stairs, watched by a calibrated twin of one such fan. The messages of all trays are
 made outside of the measured time, and the cores run in this process. Both ways make the same messages, but for rounding
-(tests/stages/test_joint_steps.py). The scorer takes each tray alone.
+(tests/stages/test_large_tray.py). The scorer takes each tray alone.
 
     python -m bench.fleet.joint_cost
 """

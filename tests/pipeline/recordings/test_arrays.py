@@ -2,7 +2,6 @@
 
 import tracemalloc
 from collections.abc import Iterable
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,13 +9,12 @@ import pytest
 from fantwin.pipeline.recordings import read_arrays
 from fantwin.pipeline.recordings.arrays import Arrays, Block, block_columns
 from fantwin.pipeline.recordings.reading import RecordingError
-from fantwin.schemas.enums import InvalidReason, Statistic, Transition
-from fantwin.schemas.header import Header
+from fantwin.schemas.enums import InvalidReason, Statistic
 from fantwin.schemas.health import Counter
-from fantwin.schemas.messages import Array, Command, ModelCard
+from fantwin.schemas.messages import Array
 from tests.support.made_messages import health
 from tests.support.score_data import made_up_tray
-from tests.support.small_recordings import alarm, raw, write
+from tests.support.small_recordings import raw, write
 
 
 def together(blocks: Iterable[Block], name: str) -> Array:
@@ -80,35 +78,6 @@ def test_a_block_ends_where_the_form_of_the_messages_changes(tmp_path):
     messages = [raw(0), raw(1, clock=False), raw(2, clock=False), raw(3, clock=False, fans=4)]
     blocks = list(read_arrays(write(tmp_path / "r.mcap", messages), "raw"))
     assert [(len(b), b.fans, len(b["device_clock_us"])) for b in blocks] == [(10, 2, 10), (20, 2, 0), (10, 4, 0)]
-
-
-def test_an_event_is_a_row(tmp_path):
-    nan = np.nan
-    path = write(
-        tmp_path / "r.mcap",
-        [
-            alarm(0),
-            Command(header=Header("c", 0, "tray1"), fans=2, t_ns=5, command=np.array([1, nan])),
-            ModelCard(
-                t_ns=6, twin="t", kind="hybrid", sha256="00", sigma_rad_s=np.ones(2), header=Header("t", 0, "tray1")
-            ),
-            replace(alarm(1), transition=Transition(88)),
-        ],
-    )
-    (alarms,) = read_arrays(path, "alarm")
-    assert (len(alarms), alarms.fans) == (2, 0)
-    assert alarms.t_ns.tolist() == [70, 71]
-    assert alarms["fan"].tolist() == [0, 1]
-    assert alarms["active"].tolist() == [True, False]
-    assert alarms["message"].tolist() == ["alarm 0", "alarm 1"]
-    assert alarms.names("severity").tolist() == ["ALARM", "ALARM"]
-    assert alarms.names("transition").tolist() == ["RAISED", "88"]
-    assert alarms.names("statistic").tolist() == ["DEVIATION", "DEVIATION"]
-    (commands,) = read_arrays(path, "command")
-    np.testing.assert_array_equal(commands["command"], [[1, nan]])
-    assert commands["set_point_rad_s"].size == 0
-    (twins,) = read_arrays(path, "twin")
-    assert (twins.fans, twins["kind"].tolist(), twins["sigma_rad_s"].tolist()) == (2, ["hybrid"], [[1, 1]])
 
 
 def test_health_belongs_to_no_tray_and_keeps_its_order(tmp_path):

@@ -1,20 +1,29 @@
-"""Recordings: written messages are read back, by fantwin and by others, after damage too."""
+"""Recordings: written messages are read back, by fantwin and by others, whole or the few of a topic."""
+
+from __future__ import annotations
 
 from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.opcode import Opcode
+from mcap.records import ChunkIndex
 from mcap.writer import Writer
 
+from fantwin.pipeline.recordings import indexed
 from fantwin.pipeline.recordings.contents import contents_of
 from fantwin.pipeline.recordings.indexed import last_message_ns, last_messages, rare_messages
 from fantwin.pipeline.recordings.reading import RecordingError, read_metadata, read_recording
+from fantwin.pipeline.recordings.records import RecordReader
 from fantwin.pipeline.recordings.scan import scan
 from fantwin.pipeline.recordings.writing import RecordingWriter
+from fantwin.schemas.codec import decode
 from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.header import Header
-from fantwin.schemas.messages import Raw
+from fantwin.schemas.messages import ModelCard, Raw
+from fantwin.schemas.topics import tray_key
+from tests.support.replay_data import START_NS, STEP_NS, raw_of
 from tests.support.written_recordings import ALARM_KEY, RAW_KEY, raw, sequences, write
 
 
@@ -122,3 +131,85 @@ def test_a_file_that_is_no_recording_or_is_not_there_is_reported_in_one_line(tmp
             read(path)
     with pytest.raises(RecordingError, match=r"r\.mcap: cannot read the recording: No such file"):
         read_recording(tmp_path / "r.mcap")
+
+
+GOLDEN = Path(__file__).parents[2] / "support" / "data" / "golden.mcap"
+
+
+def test_a_file_that_is_still_being_written_is_no_crash(tmp_path):
+    with RecordingWriter(tmp_path / "r.mcap", {}) as writer:
+        for envelope in read_recording(GOLDEN, ("raw",)).undecoded():
+            writer.add_message(envelope.key, envelope.message, envelope.received_t_ns)
+        writer.flush()
+        reading = read_recording(tmp_path / "r.mcap.active")
+        assert list(reading.undecoded())
+        assert reading.damage == f"{tmp_path}/r.mcap.active: it is still being written; read up to its last flush"
+    whole = read_recording(tmp_path / "r.mcap")
+    assert list(whole.undecoded())
+    assert not whole.damage
+
+
+def test_a_recording_that_is_renamed_while_it_is_read_is_one_line(tmp_path, monkeypatch):
+    """The recorder that finishes it renames it."""
+    path, read = tmp_path / "one.mcap", RecordReader.__iter__
+    path.write_bytes(GOLDEN.read_bytes())
+
+    def then_renamed(reader):
+        yield from read(reader)
+        path.rename(tmp_path / "other.mcap")
+
+    monkeypatch.setattr(RecordReader, "__iter__", then_renamed)
+    with pytest.raises(RecordingError, match="one.mcap: cannot read the recording: No such file"):
+        scan(path)
+
+
+AT = (0, 1500, 2999)
+"""raw messages before which there is a card"""
+
+
+@pytest.fixture(params=["finished", "killed"])
+def recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> Path:
+    """A recording of many chunks, with an index and without one."""
+    monkeypatch.setattr("fantwin.pipeline.recordings.writing.CHUNK_BYTES", 4096)
+    with RecordingWriter(tmp_path / "r.mcap", {"trays": "tray1"}) as writer:
+        for sample in range(3000):
+            if sample in AT:
+                card = ModelCard(header=Header("t", sample, "tray1"), t_ns=1, twin="a", kind="hybrid", sha256="")
+                writer.add_message(tray_key("demo", "tray1", "twin"), card, START_NS + sample * STEP_NS)
+            writer.add_message(tray_key("demo", "tray1", "raw"), raw_of(sample, 1), START_NS + sample * STEP_NS)
+    path = tmp_path / "r.mcap"
+    if request.param == "killed":
+        (*_, ledger) = [record for record in RecordReader(path) if record.opcode == Opcode.METADATA]
+        path.write_bytes(path.read_bytes()[: ledger.offset - 10])
+    return path
+
+
+def found(path: Path) -> list[tuple[str, int, int]]:
+    return [(e.key, e.message.header.sequence, e.received_t_ns) for e in rare_messages(path, "twin")]
+
+
+CARDS = [(tray_key("demo", "tray1", "twin"), sample, START_NS + sample * STEP_NS) for sample in AT]
+
+
+def test_they_are_found_by_the_index_without_reading_the_rest(recording, monkeypatch):
+    def read(*_: object) -> None:
+        raise AssertionError("the whole file is read")
+
+    monkeypatch.setattr("fantwin.pipeline.recordings.indexed.read_recording", read)
+    assert found(recording) == CARDS
+    assert rare_messages(recording, "grid") == []
+
+
+def test_the_last_one_of_each_key_is_found_from_the_end(recording, monkeypatch):
+    read: list[int] = []
+
+    def chunk_at(file, chunk: ChunkIndex) -> bytes:
+        read.append(chunk.chunk_start_offset)
+        return whole(file, chunk)
+
+    whole = indexed.chunk_at
+    monkeypatch.setattr(indexed, "chunk_at", chunk_at)
+    (payload,) = last_messages(recording, "twin").values()
+    assert decode(ModelCard, payload).header.sequence == AT[-1]
+    assert len(set(read)) <= 3, "with those that describe a channel"
+    assert last_messages(recording, "grid") == {}

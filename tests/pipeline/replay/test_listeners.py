@@ -120,28 +120,6 @@ def settled(listeners: Listeners, stop: threading.Event, say) -> list[str]:
     return listeners.wait_until_drained("replay-1", {GRID: 100}, stop, say)
 
 
-def test_discovery_waits_for_the_health_of_every_present_stage(sites):
-    bus, listeners = sites
-    stages = seen_stages(bus, listeners, "twin_integrator", "viewer")
-    done = threading.Event()
-
-    def say_on() -> None:
-        while not done.wait(0.05):
-            for stage in stages:
-                stage.say(lost=7)
-
-    speaker = threading.Thread(target=say_on)
-    speaker.start()
-    listeners.wait_for_discovery(threading.Event(), pytest.fail)
-    done.set()
-    speaker.join()
-    assert listeners.readers(("grid",)) == ["twin_integrator"]
-    assert listeners.readers(("grid", "score")) == ["twin_integrator", "viewer"]
-    assert listeners.lost("replay-1", {}) == {}, "what was lost before is not this replay's"
-    stages[0].say(lost=9)
-    eventually(lambda: listeners.lost("replay-1", {}) == {"twin_integrator": 2}, "what is lost since is")
-
-
 def test_the_replay_is_drained_when_the_whole_chain_has_consumed_everything(sites):
     bus, listeners = sites
     twin, scorer = seen_stages(bus, listeners, "twin_integrator", "scorer")
@@ -175,13 +153,14 @@ def test_whoever_stops_changing_and_is_behind_is_named(sites, monkeypatch):
     assert settled(listeners, threading.Event(), lambda: twin.say(line(GRID, "replay-1", 99))) == ["twin_integrator"]
 
 
-def test_messages_before_the_first_received_one_count_as_lost_for_listeners_present_from_the_start(sites):
+def test_what_stages_that_are_there_from_the_start_have_lost_since_then_counts_also_before_their_first_message(sites):
     bus, listeners = sites
-    twin, recorder = seen_stages(bus, listeners, "twin_integrator", "recorder")
-    twin.say()
-    eventually(listeners._views, "it is known")
-    listeners._present_at_start = {twin.producer}
-    twin.say(line(GRID, "replay-1", 90, first=7, missing=3), lost=3)
-    recorder.say(line(GRID, "replay-1", 50, first=50))
-    eventually(lambda: len(listeners._views()) == 2, "both are known")
+    (twin,) = seen_stages(bus, listeners, "twin_integrator")
+    twin.say(lost=7)
+    listeners.wait_for_discovery(threading.Event(), pytest.fail)
+    assert listeners.readers(("grid",)) == listeners.readers(("grid", "score")) == ["twin_integrator"]
+    assert listeners.lost("replay-1", {}) == {}, "what was lost before is not this replay's"
+    twin.say(line(GRID, "replay-1", 90, first=7, missing=3), lost=10)
+    recorder, late = FakeStage(bus, "recorder"), line(GRID, "replay-1", 50, first=50)
+    eventually(lambda: recorder.say(late) or len(listeners._views()) == 2, "both are known")
     eventually(lambda: listeners.lost("replay-1", {GRID: 100}) == {"twin_integrator": 10}, "7 early, 3 missing")

@@ -1,14 +1,15 @@
-"""A replay without a bus or a real clock: which messages are sent when, and the effect of the keys."""
+"""A replay without a bus or a real clock: which messages are sent when, and the keys and their effect."""
 
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Callable, Sequence
 from typing import Any, cast
 
 import pytest
 
-from fantwin.pipeline.replay.live.keyboard import Key
+from fantwin.pipeline.replay.live.keyboard import Key, Keys, keys_in
 from fantwin.pipeline.replay.live.player import (
     BEAT_S,
     FASTEST,
@@ -177,3 +178,28 @@ def test_progress_is_reported_and_an_error_of_its_callback_ends_the_replay():
         play(raws(1000), look=look)
     assert seen[-1].t_ns == pytest.approx(START_NS + 1_000_000_000, abs=1e8)
     assert (seen[-1].rate, seen[-1].paused, seen[-1].round) == (1.0, False, 0)
+
+
+@pytest.mark.parametrize(
+    ("typed", "keys"),
+    [
+        (b" ", [Key.PAUSE]),
+        (b"s\x1b[C\x1bOC", [Key.STEP] * 3),
+        (b"\x1b[A\x1bOA", [Key.FASTER] * 2),
+        (b"\x1b[B\x1bOB", [Key.SLOWER] * 2),
+        (b"xyz\tq", [Key.QUIT]),
+        (b"\x1b[Dq", [Key.QUIT]),
+        (b"\x1b\x1b[A", [Key.FASTER]),
+    ],
+)
+def test_keys_and_both_manners_of_arrows_are_known_and_all_else_is_passed_over(typed, keys):
+    assert keys_in(typed) == keys
+
+
+def test_without_a_terminal_there_are_no_keys(monkeypatch, tmp_path):
+    with (tmp_path / "input").open("w+") as no_terminal:
+        monkeypatch.setattr(sys, "stdin", no_terminal)
+        keys = Keys()
+        assert not keys.is_available
+        with keys:
+            assert keys.pressed() == []

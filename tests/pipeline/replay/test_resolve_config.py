@@ -1,18 +1,23 @@
-"""The site on which a recording is replayed: from the options, the recorded configuration, or the keys."""
+"""The site on which a recording is replayed, and the chain of stages, derived from what they read and write."""
 
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from fantwin.pipeline.config.registry import STAGES
 from fantwin.pipeline.config.settings import Config, ConfigError
 from fantwin.pipeline.recordings.reading import read_metadata
 from fantwin.pipeline.recordings.writing import RecordingWriter
 from fantwin.pipeline.replay.live.recording_playback import RecordingPlayback
 from fantwin.pipeline.replay.resolve_config import attached_config, resolve_config, trays_of
-from fantwin.schemas.topics import tray_key
+from fantwin.pipeline.replay.stage_chain import derive_chain, derive_starts, replay_starts
+from fantwin.pipeline.runtime.stage import Stage, load_stage
+from fantwin.schemas.topics import BY_NAME, tray_key
 from fantwin.stages.resampler import ResamplerConfig
 from tests.support.replay_data import START_NS, raw_of
 
@@ -79,3 +84,42 @@ def test_recorded_overrides_apply_where_a_recording_is_scored_again(tmp_path):
     section = found.sections["resampler"]
     assert isinstance(section, ResamplerConfig)
     assert (section.rate_hz, section.watermark_s, section.gap_limit_s) == (10.0, 0.7, 0.2)
+
+
+REGISTERED = [load_stage(name) for name in STAGES]
+
+
+def with_row(of: str, **changed: Any) -> Stage:
+    stage = load_stage(of)
+    return replace(stage, row=replace(stage.row, **changed))
+
+
+@pytest.fixture
+def smoother(monkeypatch):
+    """A toy stage with two toy topics."""
+    for name in ("smooth_grid", "smoothing"):
+        monkeypatch.setitem(BY_NAME, name, replace(BY_NAME["grid"], name=name))
+    topics = {"reads": ("grid",), "writes": ("smooth_grid", "smoothing")}
+    return with_row("resampler", name="smoother", **topics)
+
+
+def test_a_new_stage_is_placed_by_what_it_reads_and_writes(smoother):
+    integrator = with_row("twin_integrator", reads=("smooth_grid",))
+    stages = [smoother, integrator, *(stage for stage in REGISTERED if stage.name != "twin_integrator")]
+    chain = derive_chain(stages)
+    assert [stage.name for stage in chain.stages] == ["resampler", "smoother", "twin_integrator", "scorer"]
+    assert chain.outputs == ("grid", "smooth_grid", "prediction", "score")
+    assert derive_starts(stages)["smooth_grid"] == ("smooth_grid", "smoothing")
+
+
+def test_a_replay_starts_with_all_topics_of_the_stage_that_it_replaces_and_the_twins_of_those_that_follow():
+    expected = {"raw": ("raw", "new_twin"), "grid": ("grid", "new_twin"), "prediction": ("prediction", "twin")}
+    assert replay_starts() == expected
+
+
+def test_stages_that_do_not_lead_from_raw_samples_to_scores_are_refused():
+    without_integrator = [stage for stage in REGISTERED if stage.name != "twin_integrator"]
+    circle = with_row("resampler", reads=("prediction",))
+    for stages in (without_integrator, [*REGISTERED, circle]):
+        with pytest.raises(ValueError, match="look at what writes 'prediction'"):
+            derive_chain(stages)

@@ -1,4 +1,4 @@
-"""Many fans are trained on windows of their runs and on all of their readings in the end; few fans as ever."""
+"""What of the readings a network is trained on: windows of many fans, and none that are dropouts or glitches."""
 
 from dataclasses import replace
 
@@ -8,6 +8,7 @@ import pytest
 from fantwin.twin.build import evaluate, train_twin
 from fantwin.twin.evaluation.resampling import thinned
 from fantwin.twin.fitting import trajectories
+from fantwin.twin.fitting.outliers import without_outliers
 from fantwin.twin.fitting.trajectories import coarser, thinning_factor, windows_of
 from fantwin.twin.models.recursion import linear_recursion
 from fantwin.twin.runs import Run
@@ -84,3 +85,35 @@ def test_a_recursion_of_many_signals_is_that_of_each() -> None:
     together = linear_recursion(factor, forcing)
     alone = np.stack([linear_recursion(factor, forcing[..., each]) for each in range(50)], axis=-1)
     np.testing.assert_allclose(together, alone, rtol=1e-12, atol=1e-12)
+
+
+def with_speed(run: Run, speed_rad_s: np.ndarray) -> Run:
+    return Run(run.name, run.t_s, run.command, speed_rad_s)
+
+
+def test_dropouts_and_double_counts_are_left_out_and_counted() -> None:
+    run = fan_data.rough_run(1, 40.0, fans=2)
+    rng = np.random.default_rng(2)
+    speed = run.speed_rad_s.copy()
+    bad = (rng.random(speed.shape) < 0.02) & (speed > 60.0)
+    bad[:, 1] = False
+    speed[bad] *= rng.choice([0.0, 2.0], bad.sum())
+    speed[::7, 1] = np.nan
+    cleaned, share = without_outliers(with_speed(run, speed))
+    found = np.isnan(cleaned.speed_rad_s)
+    assert (found & bad).sum() > 0.97 * bad.sum()
+    assert (found & ~bad)[:, 0].sum() <= 2, "missing speeds are not counted"
+    assert share[0] == pytest.approx(bad[:, 0].mean(), rel=0.05)
+    assert share[1] == 0.0
+
+
+@pytest.mark.parametrize(
+    ("every", "step_rad_s", "most"),
+    [(1, 0.0, 2e-4), (10, 0.0, 2e-4), (1, 20.0, 2e-3)],
+    ids=["slow fan", "fan of 23 ms", "coarse tacho"],
+)
+def test_a_healthy_fan_keeps_all_its_samples(every: int, step_rad_s: float, most: float) -> None:
+    run = fan_data.published_run(3, 60.0) if step_rad_s else fan_data.rough_run(3, 60.0)
+    speed = np.round(run.speed_rad_s / step_rad_s) * step_rad_s if step_rad_s else run.speed_rad_s[::every]
+    coarse = Run("coarse", run.t_s[: len(speed)], run.command[::every], speed)
+    assert np.all(without_outliers(coarse)[1] < most)

@@ -1,4 +1,4 @@
-"""Training reaches the noise, repeats itself, and withstands bad samples."""
+"""Training reaches the noise and withstands bad samples; networks are chosen by cross-validation, and averaged."""
 
 import numpy as np
 import pytest
@@ -8,12 +8,17 @@ from fantwin.twin.errors import TwinError
 from fantwin.twin.evaluation.resampling import thinned
 from fantwin.twin.finishing import TrainedTwin
 from fantwin.twin.fitting import training
+from fantwin.twin.fitting.cross_validation import choose_prior_std, simplest_of_the_best
 from fantwin.twin.fitting.identification import identify
+from fantwin.twin.fitting.mean_of_networks import mean_model
 from fantwin.twin.fitting.outliers import without_outliers
-from fantwin.twin.fitting.training import data_scaling
+from fantwin.twin.fitting.training import GRID_PRIOR_STD, data_scaling
+from fantwin.twin.models.fan_ode import NetworkOde
 from fantwin.twin.models.hybrid import Hybrid
-from fantwin.twin.models.network import TanhNetwork
-from fantwin.twin.runs import Run
+from fantwin.twin.models.network import Scaling, TanhNetwork
+from fantwin.twin.models.neural_ode import NeuralOde
+from fantwin.twin.models.physics import LAG
+from fantwin.twin.runs import Array, Run
 from tests.support import fan_data
 from tests.support.made_once import TrainedOnce
 
@@ -135,3 +140,56 @@ def test_a_kind_and_a_trainer_that_are_unknown_are_refused_in_one_line(rough) ->
         train_twin([rough[1]], [], "oracle", name="x")
     with pytest.raises(TwinError, match="trainer 'luck' is unknown"):
         train_twin([rough[1]], [], "hybrid", name="x", trainer="luck")
+
+
+def untrained(runs: list[Run]) -> Hybrid:
+    return Hybrid(TanhNetwork.zero(10, ("speed", "command"), data_scaling(runs, identify(runs))))
+
+
+@pytest.mark.slow
+def test_a_fan_that_the_physics_describe_gets_no_network_and_a_rough_one_does() -> None:
+    plain = [fan_data.published_run(seed, 5.0) for seed in (1, 2)]
+    rough = [fan_data.rough_run(seed, 8.0) for seed in (1, 2)]
+    assert choose_prior_std(untrained(plain), plain, seed=0) == 0.0
+    assert choose_prior_std(untrained(rough), rough, seed=0) > 0.0
+    blind = Run("blind", rough[1].t_s, rough[1].command, np.full_like(rough[1].speed_rad_s, np.nan))
+    assert choose_prior_std(untrained(rough), [rough[0], blind], seed=0) == GRID_PRIOR_STD, "it does not count"
+
+
+@pytest.mark.parametrize(
+    ("losses", "chosen"),
+    [
+        ([[5.0, 5.0, 5.0], [4.0, 4.1, 3.9]], 1),
+        ([[5.0, 5.0, 5.0], [4.0, 6.0, 4.9]], 0),
+        ([[5.0, 5.0, 5.0], [4.0, np.inf, 4.0]], 0),
+        ([[np.inf, 9.0, 9.0], [4.0, 4.0, 4.0]], 1),
+    ],
+)
+def test_the_simplest_within_one_standard_error_of_the_best_is_chosen(losses: list, chosen: int) -> None:
+    assert simplest_of_the_best(np.array(losses)) == chosen
+
+
+SCALING = Scaling(60.0, 70.0, 0.4, 0.5, 200.0)
+FANS = 3
+BOTH = ("speed", "command")
+Trained = tuple[NetworkOde, Array]
+
+
+def trained(seed: int, kind: type[Hybrid | NeuralOde] = Hybrid, inputs: tuple[str, ...] = BOTH) -> Trained:
+    rng = np.random.default_rng(seed)
+    network = TanhNetwork.zero(10, inputs, SCALING)
+    parameters = np.array([0.15, 0.012, 0.0025, 0.02]) * rng.uniform(0.5, 2.0, (FANS, 4))
+    return kind(network.with_theta(rng.normal(size=network.parameter_count))), parameters
+
+
+@pytest.mark.parametrize(("kind", "inputs"), [(Hybrid, ("speed",)), (NeuralOde, BOTH)])
+def test_its_acceleration_is_the_mean_of_theirs_and_its_lag_too(kind, inputs: tuple[str, ...]) -> None:
+    members = [trained(seed, kind, inputs) for seed in range(4)]
+    model, parameters = mean_model(members)
+    rng = np.random.default_rng(9)
+    speed_rad_s, command = rng.uniform(-20.0, 200.0, (50, FANS)), rng.uniform(-0.2, 1.2, (50, FANS))
+    theirs = [one.equation(own).acceleration(speed_rad_s, command) for one, own in members]
+    np.testing.assert_allclose(
+        model.equation(parameters).acceleration(speed_rad_s, command), np.mean(theirs, axis=0), rtol=1e-9, atol=1e-9
+    )
+    np.testing.assert_allclose(parameters[:, LAG], np.mean([own[:, LAG] for _, own in members], axis=0))
