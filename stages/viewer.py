@@ -17,7 +17,7 @@ from collections.abc import Iterable, Sequence
 from functools import partial
 from pathlib import Path
 
-from pydantic import Field, field_validator
+from pydantic import Field
 
 from fantwin.pipeline.config.registry import STAGES
 from fantwin.pipeline.config.settings import TrayConfig, nearest
@@ -45,7 +45,7 @@ class ViewerConfig(StageConfig):
     grpc_port: int = Field(
         default=9876,
         ge=0,
-        le=65435,
+        le=65535 - PAGE_ABOVE_DATA,
         description="port on this host (127.0.0.1) for the data of live viewers, native and in a browser; the page of "
         "the latter has the port 100 above it, 9976; shard K uses the K-th ports from there on; 0: no live viewers",
     )
@@ -57,13 +57,6 @@ class ViewerConfig(StageConfig):
     def web_port(self) -> int:
         """The port of the browser viewer's page; 0: no page."""
         return self.grpc_port + PAGE_ABOVE_DATA if self.grpc_port else 0
-
-    @field_validator("grpc_port")
-    @classmethod
-    def _leaves_one_for_the_page(cls, value: int) -> int:
-        if 0 < value <= PAGE_BELOW_DATA:
-            raise ValueError(f"0, or above {PAGE_BELOW_DATA}: the page has the port {PAGE_BELOW_DATA} below it")
-        return value
 
 
 def shown_fans(names: Iterable[str], trays: Sequence[TrayConfig]) -> list[Fan]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any, ClassVar, Literal, Self
 from urllib.parse import urlsplit
 
@@ -64,7 +65,6 @@ class ModbusConfig(PolledConfig, frozen=True):
     )
     serial: str = Field(
         default="19200 8E1",
-        pattern=r"^[1-9][0-9]{1,6} 8[NEO][12]$",
         description="of a serial port: bits a second, data bits (8), parity (N, E or O) and stop bits (1 or 2)",
     )
     fan: tuple[ModbusFan, ...] = Field(min_length=1, description="one [[tray.source.fan]] for each fan, in their order")
@@ -83,6 +83,13 @@ class ModbusConfig(PolledConfig, frozen=True):
             raise ValueError(
                 "give plc1, plc1:1502 or [fe80::1] for Modbus TCP, or a path, /dev/ttyUSB0, for Modbus RTU"
             )
+        return value
+
+    @field_validator("serial")
+    @classmethod
+    def _is_of_a_serial_port(cls, value: str) -> str:
+        if not re.fullmatch("[1-9][0-9]{1,6} 8[NEO][12]", value):
+            raise ValueError("give bits a second, 8 data bits, parity N, E or O, and 1 or 2 stop bits: 19200 8E1")
         return value
 
     @property
