@@ -15,21 +15,14 @@ from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Message, Raw, Request
 from fantwin.schemas.topics import tray_key
+from tests.support.made_messages import filled
 
 TRAYS = ("a", "b")
 
 
 def raw(tray: str, sequence: int, samples: int = 1, fans: int = 2, producer: str = "acquisition-1") -> Envelope:
-    message = Raw(
-        header=Header(producer, sequence, tray),
-        fans=fans,
-        host_receive_t_ns=np.arange(samples, dtype=np.int64) + sequence,
-        device_clock_us=np.zeros(samples, np.uint32),
-        device_sequence=np.zeros(samples, np.uint32),
-        command=np.full((samples, fans), 0.5),
-        speed_rad_s=np.full((samples, fans), 100.0),
-    )
-    return envelope("raw", message)
+    times = {"host_receive_t_ns": np.arange(samples) + sequence}
+    return envelope("raw", filled(Raw, samples, fans, header=Header(producer, sequence, tray), **times))
 
 
 def request(tray: str, sequence: int) -> Envelope:

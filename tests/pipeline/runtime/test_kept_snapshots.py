@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterator, Mapping
+from typing import Any
 
 import pytest
 
@@ -38,22 +39,10 @@ def buses(endpoint: str) -> Iterator[tuple[Bus, Bus]]:
 
 
 def asking(
-    bus: Bus,
-    *,
-    is_one_expected: bool = True,
-    keeper_limit_s: float = LONG_S,
-    answer_limit_s: float = LONG_S,
-    wait_for_predecessor: Callable[[], None] = lambda: None,
+    bus: Bus, wait_for_predecessor: Callable[[], None] = lambda: None, answer_limit_s: float = LONG_S, **more: Any
 ) -> KeptSnapshots:
-    return KeptSnapshots(
-        lambda: bus,
-        "s",
-        threading.Event(),
-        wait_for_predecessor,
-        answer_limit_s,
-        is_one_expected=is_one_expected,
-        keeper_limit_s=keeper_limit_s,
-    )
+    limits = {"is_one_expected": True, "keeper_limit_s": LONG_S, **more}
+    return KeptSnapshots(lambda: bus, "s", threading.Event(), wait_for_predecessor, answer_limit_s, **limits)
 
 
 def keeping(bus: Bus, before: Mapping[str, bytes]) -> KeptForOthers:

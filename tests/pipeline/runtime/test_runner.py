@@ -12,16 +12,15 @@ import pytest
 from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.runtime.runner import TICK_S
-from fantwin.pipeline.runtime.sessions import Session
 from fantwin.pipeline.runtime.stage import BuiltStage, Context, Core
 from fantwin.pipeline.site.loss_accounting import losses
 from fantwin.schemas.codec import encode, type_name
-from fantwin.schemas.enums import StageStatus
 from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.header import Header, InputPosition
 from fantwin.schemas.health import Health, Note, Output
 from fantwin.schemas.messages import Command, Grid, Message, Raw
-from fantwin.schemas.topics import BY_NAME, health_key, tray_key
+from fantwin.schemas.topics import BY_NAME, tray_key
+from tests.support import made_messages
 from tests.support.running_chain import eventually
 from tests.support.toy_stage import TRAY_A, TRAY_B, Bench, Passer, Silent, raw, toy
 
@@ -100,43 +99,17 @@ def send_once(bus: Bus, producer: str, t_ns: int) -> None:
 def test_a_side_input_does_not_advance_the_input_position(config):
     bench = Bench(toy(lambda _context: BuiltStage(Answers()), reads=("raw", "command")), config)
     send_once(bench.bus, "operator", 5)
-    grids = [bench.next(Grid)]
-    bench.feed(TRAY_A, 10)
-    grids.append(bench.next(Grid))
-    send_once(bench.bus, "another", 6)
-    grids.append(bench.next(Grid))
-    bench.feed(TRAY_A, 11)
-    grids.append(bench.next(Grid))
+    found = [bench.next(Grid)]
+    for send in (lambda: bench.feed(TRAY_A, 10), lambda: send_once(bench.bus, "another", 6)):
+        send()
+        found.append(bench.next(Grid))
     bench.end()
     first = InputPosition("raw", "feeder", 0, 1, 0)
-    assert [grid.t_ns.tolist() for grid in grids] == [[5], [10], [6], [11]]
-    assert [grid.header.input_position for grid in grids] == [
-        None,
-        first,
-        first,
-        InputPosition("raw", "feeder", 1, 2, 0),
+    assert [(grid.t_ns.tolist(), grid.header.input_position) for grid in found] == [
+        ([5], None),
+        ([10], first),
+        ([6], first),
     ]
-
-
-def test_a_producer_that_publishes_one_message_and_leaves_causes_no_loss(config):
-    class Careful(Answers):
-        def counters(self):
-            return {}
-
-    bench = Bench(toy(lambda _context: BuiltStage(Careful()), reads=("raw", "command")), config)
-    for number in range(3):  # sessions that nobody has a word of health from
-        with Bus(config.bus) as visitor:
-            met = threading.Event()
-            visitor.subscribe(health_key("s", "*", "*"), lambda _key, _payload, met=met: met.set())
-            assert met.wait(20)
-            send_once(visitor, f"visitor-{number}", number)
-            assert bench.next(Grid).t_ns.tolist() == [number]
-    health = bench.health_with(lambda health: len(health.inputs) == 3)
-    last = bench.end()
-    for reported, status in ((health, StageStatus.OK), (last, StageStatus.STOPPED)):
-        assert (reported.status, reported.problem, reported.lost) == (status, "", 0)
-        assert [(line.received, line.missing, line.duplicated) for line in reported.inputs] == [(1, 0, 0)] * 3
-    assert losses([health, last]) == {"resampler": 0}
 
 
 def waits(health: Health, tray: str) -> bool:
@@ -215,16 +188,8 @@ def test_row_18_what_a_killed_stage_had_received_and_not_saved_is_lost_if_nobody
     killed = bench.health_with(lambda health: any(line.received == 5 for line in health.inputs))
     last = bench.end()
     assert [line.unsaved for line in (*killed.inputs, *last.inputs)] == [5, 0]
-    sent = Health(
-        header=Header("feeder", 0, ""),
-        stage="acquisition",
-        instance=TRAY_A,
-        status=StageStatus.OK,
-        t_ns=1,
-        uptime_s=0,
-        outputs=(Output(key=tray_key("s", TRAY_A, "raw"), published=5),),
-        process_id=1,
-    )
+    outputs = (Output(key=tray_key("s", TRAY_A, "raw"), published=5),)
+    sent = made_messages.health("acquisition", TRAY_A, "feeder", outputs=outputs, process_id=1)
     follower = replace(last, header=Header("follower", 0, ""), inputs=(), counters=(), lost=0, process_id=2)
     killed = replace(killed, counters=(), lost=0)
     launched = {(f"acquisition/{TRAY_A}", 1), ("resampler", 2), ("resampler", killed.process_id)}
@@ -323,61 +288,7 @@ def test_a_stage_that_may_drop_discards_its_oldest_items_and_counts_them(config,
     assert last.lost == 4  # the counters of the two cores: what it may drop is no loss
 
 
-def test_a_stage_stops_while_its_producer_continues(config):
-    bench = Bench(toy(), config)
-    enough = threading.Event()
-
-    def feed_on() -> None:
-        t_ns = 0
-        while not enough.wait(0.002):
-            bench.feed(TRAY_A, t_ns)
-            t_ns += 1
-
-    feeder = threading.Thread(target=feed_on)
-    feeder.start()
-    bench.next(Grid)
-    bench.stop.set()
-    bench.thread.join(20)
-    stopped = not bench.thread.is_alive()
-    enough.set()
-    feeder.join()
-    bench.end()
-    assert stopped
-
-
 @pytest.mark.parametrize("declared", [{"reads": ("rwa",)}, {"writes": ("gird",)}])
 def test_a_stage_with_an_unknown_topic_is_refused_when_it_is_declared(declared):
     with pytest.raises(ValueError, match="stage 'resampler': no such topic: (rwa|gird); known: raw, "):
         toy(**declared)
-
-
-def test_a_stage_whose_launcher_has_gone_runs_until_its_producers_have_ended(config):
-    bench = Bench(toy(), config)
-    with Bus(config.bus) as feeder:
-        key, stage = health_key("s", "acquisition", TRAY_A), ("acquisition", TRAY_A)
-        producer = f"acquisition-{TRAY_A}-{feeder.id}"
-        health = Health(
-            header=Header(producer, 0, ""),
-            stage=stage[0],
-            instance=stage[1],
-            status=StageStatus.OK,
-            t_ns=0,
-            uptime_s=0.0,
-            outputs=(Output(key=tray_key("s", TRAY_A, "raw"), published=0),),
-        )
-        feeder.declare_alive(Session(*stage, 1, producer, "elsewhere", 1, (TRAY_A,)).key("s"))
-        publisher = feeder.publisher(key, BY_NAME["health"], type_name(Health), producer)
-        while not bench.runner._sessions.has_producer():  # until they have discovered each other
-            publisher.put(encode(health))
-            bench.next(Health)
-        bench.runner.launcher_gone.set()
-        last = None
-        for _ in range(3):  # seconds in which it could have ended
-            last = bench.health_with(lambda h: h.stage == "resampler")
-            if last.status == StageStatus.STOPPED:
-                break
-    bench.thread.join(20)
-    ended_by_itself = not bench.thread.is_alive()
-    bench.end()
-    assert last and last.status == StageStatus.OK, "it ended while there was still somebody to read from"
-    assert ended_by_itself

@@ -15,6 +15,7 @@ from fantwin.schemas.header import Header
 from fantwin.schemas.health import Health
 from fantwin.schemas.messages import Clock, Command, Grid, Message
 from fantwin.schemas.topics import BY_NAME, alive_key, health_key, tray_key
+from tests.support import made_messages
 from tests.support.running_chain import eventually
 from tests.support.toy_stage import TRAY_A, TRAY_B, Bench, Burst, Passer, toy
 
@@ -51,9 +52,8 @@ class Replay:
         self._publish_health(StageStatus.STOPPED, is_last=True)
 
     def _publish_health(self, status: StageStatus, *, is_last: bool = False) -> None:
-        header = Header("replay-1", self.health.published, "")
-        about = {"stage": "replay", "instance": "all", "status": status, "is_last": is_last}
-        self.health.put(encode(Health(header=header, t_ns=0, uptime_s=0.0, **about)))
+        about = {"sequence": self.health.published, "status": status, "is_last": is_last}
+        self.health.put(encode(made_messages.health("replay", producer="replay-1", **about)))
 
 
 @pytest.fixture

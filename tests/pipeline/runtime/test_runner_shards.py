@@ -12,11 +12,11 @@ import pytest
 from fantwin.pipeline.runtime.runner import Runner
 from fantwin.pipeline.runtime.stage import BuiltStage, Context, StageError
 from fantwin.schemas.codec import decode, encode, type_name
-from fantwin.schemas.enums import StageStatus
 from fantwin.schemas.header import Header
 from fantwin.schemas.health import Health
 from fantwin.schemas.messages import Grid, Message, ScorerSnapshot
 from fantwin.schemas.topics import BY_NAME, health_key, tray_key
+from tests.support import made_messages
 from tests.support.running_chain import eventually
 from tests.support.toy_stage import TRAY_A, TRAY_B, Bench, Passer, Silent, ToyConfig, toy
 
@@ -45,20 +45,9 @@ def test_a_shard_receives_the_health_of_every_process_that_has_one_of_its_trays_
         toy(lambda _context: BuiltStage(Listens()), core_per_tray=False, reads=("raw", "health")), config, "b"
     )
     for instance, trays in (("1-of-2", "a"), ("2-of-2", "b"), ("a+b", "a,b"), ("all", "")):
-        producer = f"scorer-{instance}-1"
-        publisher = bench.bus.publisher(
-            health_key("s", "scorer", instance), BY_NAME["health"], type_name(Health), producer
-        )
-        health = Health(
-            header=Header(producer, 0, ""),
-            stage="scorer",
-            instance=instance,
-            status=StageStatus.OK,
-            t_ns=1,
-            uptime_s=0.0,
-            trays=trays,
-        )
-        publisher.put(encode(health))
+        key, producer = health_key("s", "scorer", instance), f"scorer-{instance}-1"
+        publisher = bench.bus.publisher(key, BY_NAME["health"], type_name(Health), producer)
+        publisher.put(encode(made_messages.health("scorer", instance, producer, trays=trays)))
     eventually(lambda: ("scorer", "all") in heard, "the last one has come")
     bench.end()
     assert [instance for stage, instance in heard if stage == "scorer"] == ["2-of-2", "a+b", "all"]
@@ -75,21 +64,14 @@ def test_a_recorder_that_is_behind_gives_the_last_snapshot_that_had_arrived(conf
             return []
 
     config = replace(config, sections={"recorder": ToyConfig()})
-    stage = toy(
-        lambda _context: BuiltStage(Behind()),
-        name="recorder",
-        reads=("raw", "snapshot"),
-        writes=(),
-        core_per_tray=False,
-    )
+    declared = {"name": "recorder", "reads": ("raw", "snapshot"), "writes": ()}
+    stage = toy(lambda _context: BuiltStage(Behind()), core_per_tray=False, **declared)
     bench = Bench(stage, config)
     key = tray_key("s", TRAY_A, "snapshot")
     scorer = bench.bus.publisher(key, BY_NAME["snapshot"], type_name(ScorerSnapshot), "scorer-all-1")
     for number in (0, 1):
-        message = ScorerSnapshot(
-            header=Header("scorer-all-1", number, TRAY_A), t_ns=number, twin_sha256="", state_json=""
-        )
-        scorer.put(encode(message))
+        header = Header("scorer-all-1", number, TRAY_A)
+        scorer.put(encode(ScorerSnapshot(header=header, t_ns=number, twin_sha256="", state_json="")))
         assert is_behind.wait(20)
     found: list[tuple[list[bytes], bool]] = []
     thread = threading.Thread(target=lambda: found.append(bench.bus.ask_for_kept(key, 20.0)))

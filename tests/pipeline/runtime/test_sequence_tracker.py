@@ -9,10 +9,18 @@ from hypothesis import strategies as st
 from fantwin.pipeline.runtime.sequence_tracker import Found, Request, SequenceTracker
 from fantwin.pipeline.runtime.sessions import Session, Sessions
 from fantwin.schemas.enums import StageStatus
-from fantwin.schemas.header import Header
-from fantwin.schemas.health import Health
 from fantwin.schemas.topics import CATCH_UP_MESSAGES
+from tests.support import made_messages
 from tests.support.numbered_packets import KEY, PRODUCER, health, packet, sequences
+
+TOKEN = Session("scorer", "all", 1, PRODUCER, "host", 1).key("site")
+
+
+def with_its_session() -> Sessions:
+    """Sessions among which is that of the producer."""
+    sessions = Sessions()
+    sessions.update(TOKEN, alive=True)
+    return sessions
 
 
 class Producer:
@@ -69,9 +77,7 @@ def test_a_consumer_restarted_late_gets_what_is_kept_also_when_a_live_message_co
 
 @pytest.mark.parametrize(("found", "missing"), [(Found(), 8), (Found(published=9), 0), (Found(was_asked=False), 0)])
 def test_first_messages_of_a_stage_that_does_not_answer_are_missing_and_not_history(found, missing):
-    sessions = Sessions()
-    sessions.update(Session("scorer", "all", 1, PRODUCER, "host", 1).key("site"), alive=True)
-    tracker = SequenceTracker(lambda _request: found, sessions=sessions)
+    tracker = SequenceTracker(lambda _request: found, sessions=with_its_session())
     assert sequences(tracker.accept(packet(8))) == [8]
     (line,) = tracker.inputs()
     assert (line.missing, line.missing_at_start) == (missing, missing)
@@ -136,14 +142,12 @@ class SlowProducer:
 
 
 def tracker_of_session(slow: SlowProducer, *, alive: bool, replaced: bool = False) -> SequenceTracker:
-    sessions = Sessions()
-    token = Session("scorer", "all", 1, PRODUCER, "host", 1).key("site")
+    sessions = with_its_session()
     if replaced:
         sessions.update(Session("scorer", "all", 2, "scorer-all-new", "host", 2).key("site"), alive=True)
-    sessions.update(token, alive=True)
     tracker = SequenceTracker(slow.ask, lambda: slow.now_s, sessions)
     assert sequences(tracker.accept(packet(0))) == [0]
-    sessions.update(token, alive=alive)
+    sessions.update(TOKEN, alive=alive)
     return tracker
 
 
@@ -170,13 +174,11 @@ def test_row_16_a_stage_that_does_not_answer_is_asked_again_for_a_while(
 
 def test_row_16_a_stage_that_is_left_alone_because_it_did_not_answer_is_asked_later():
     slow = SlowProducer()
-    sessions = Sessions()
-    sessions.update(Session("scorer", "all", 1, PRODUCER, "host", 1).key("site"), alive=True)
 
     def ask(request: Request) -> Found | None:
         return slow.ask(request) if request.not_before_s else Found()
 
-    tracker = SequenceTracker(ask, lambda: slow.now_s, sessions)
+    tracker = SequenceTracker(ask, lambda: slow.now_s, with_its_session())
     assert sequences(tracker.accept(packet(0))) == [0]
     assert tracker.accept(packet(4)) == []
     (later,) = slow.asked
@@ -185,22 +187,12 @@ def test_row_16_a_stage_that_is_left_alone_because_it_did_not_answer_is_asked_la
 
 
 def test_row_16_a_stage_that_has_said_that_it_ends_does_not_return():
-    slow, sessions = SlowProducer(), Sessions()
-    token = Session("scorer", "all", 1, PRODUCER, "host", 1).key("site")
-    sessions.update(token, alive=True)
+    slow, sessions = SlowProducer(), with_its_session()
     tracker = SequenceTracker(slow.ask, lambda: slow.now_s, sessions)
     assert sequences(tracker.accept(packet(0))) == [0]
-    last = Health(
-        header=Header(PRODUCER, 1, ""),
-        stage="scorer",
-        instance="all",
-        status=StageStatus.STOPPED,
-        t_ns=0,
-        uptime_s=1.0,
-        is_last=True,
-    )
+    last = made_messages.health("scorer", producer=PRODUCER, status=StageStatus.STOPPED, is_last=True)
     sessions.add_health(last, {KEY})
-    sessions.update(token, alive=False)
+    sessions.update(TOKEN, alive=False)
     assert tracker.accept(packet(4)) == []
     slow.now_s = 5.0
     assert sequences(tracker.answer(slow.asked[-1], Found())) == [4]

@@ -110,11 +110,22 @@ def test_row_07_only_sessions_with_a_common_tray_have_successors():
     assert [sessions.owner("scorer", tray) for tray in "acx"] == [whole] * 3
 
 
-def test_row_07_a_shard_with_a_tray_that_another_one_has_is_refused_in_one_line(config, monkeypatch):
+@pytest.fixture
+def _found_before(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first of two is found before the time for that is over, and is not waited for until it leaves."""
     monkeypatch.setattr("fantwin.pipeline.runtime.second_owner.LEAVING_LIMIT_S", 0.0)
-    monkeypatch.setattr("fantwin.pipeline.runtime.second_owner.GOSSIP_S", 60.0)  # the first one is found before
+    monkeypatch.setattr("fantwin.pipeline.runtime.second_owner.GOSSIP_S", 60.0)
+
+
+@pytest.fixture
+def stopped() -> threading.Event:
     stop = threading.Event()
     stop.set()
+    return stop
+
+
+@pytest.mark.usefixtures("_found_before")
+def test_row_07_a_shard_with_a_tray_that_another_one_has_is_refused_in_one_line(config, stopped):
     with Bus(config.bus) as bus:
         bus.declare_alive(replace(shard("a+x", 1, "a", "x"), stage="resampler", producer="resampler-a+x-1").key("s"))
         with pytest.raises(StageError) as refused:
@@ -123,11 +134,11 @@ def test_row_07_a_shard_with_a_tray_that_another_one_has_is_refused_in_one_line(
             "resampler of site 's' cannot start: resampler/a+x already has trays a, x: process 1 on board; stop that, "
             "or give this one other trays"
         )
-        Runner(toy(), config, Shard(TRAY_B, (TRAY_B,), ("--trays", TRAY_B)), stop).run()
+        Runner(toy(), config, Shard(TRAY_B, (TRAY_B,), ("--trays", TRAY_B)), stopped).run()
 
 
+@pytest.mark.usefixtures("_found_before")
 def test_row_07_a_second_process_of_a_stage_is_refused_in_one_line_that_names_the_first(config, monkeypatch):
-    monkeypatch.setattr("fantwin.pipeline.runtime.second_owner.LEAVING_LIMIT_S", 0.0)
     aborted: list[bool] = []
 
     class Aborts(Passer):
@@ -135,7 +146,6 @@ def test_row_07_a_second_process_of_a_stage_is_refused_in_one_line_that_names_th
             aborted.append(True)
 
     bench = Bench(toy(), config)
-    monkeypatch.setattr("fantwin.pipeline.runtime.second_owner.GOSSIP_S", 60.0)  # the first one is found before
     first = os.getpid()
     monkeypatch.setattr("fantwin.pipeline.runtime.sessions.os.getpid", lambda: first + 1)
     with pytest.raises(
@@ -148,11 +158,8 @@ def test_row_07_a_second_process_of_a_stage_is_refused_in_one_line_that_names_th
     assert aborted == [True]
 
 
-def test_row_07_a_stage_with_a_device_is_refused_where_a_replay_presents_the_site_and_others_are_not(
-    config, monkeypatch
-):
-    monkeypatch.setattr("fantwin.pipeline.runtime.second_owner.LEAVING_LIMIT_S", 0.0)
-    monkeypatch.setattr("fantwin.pipeline.runtime.second_owner.GOSSIP_S", 60.0)  # the first one is found before
+@pytest.mark.usefixtures("_found_before")
+def test_row_07_a_stage_with_a_device_is_refused_where_a_replay_presents_the_site_and_others_are_not(config, stopped):
     with Bus(config.bus) as replay:
         replay.declare_alive(alive_key("s", "replay", "all"))
         with pytest.raises(StageError) as refused:
@@ -160,20 +167,18 @@ def test_row_07_a_stage_with_a_device_is_refused_where_a_replay_presents_the_sit
         assert str(refused.value) == (
             "a replay presents site 's': stop it, or give acquisition/a another site or bus.endpoint"
         )
-        stop = threading.Event()
-        stop.set()
-        Runner(toy(), config, None, stop).run()
+        Runner(toy(), config, None, stopped).run()
 
 
 @pytest.mark.parametrize("process_id", [2**22 + 1, os.getpid()], ids=["ended", "our number, as in a container"])
-def test_row_07_the_token_of_a_process_of_this_host_that_has_ended_refuses_nobody(config, monkeypatch, process_id):
+def test_row_07_the_token_of_a_process_of_this_host_that_has_ended_refuses_nobody(
+    config, monkeypatch, stopped, process_id
+):
     monkeypatch.setattr("fantwin.pipeline.runtime.second_owner.LEAVING_LIMIT_S", 0.0)
     ours = Session.of_this_process("resampler", Shard("all", (TRAY_A, TRAY_B)), 1, "resampler-all-1")
     with Bus(config.bus) as bus:
         bus.declare_alive(replace(ours, process_id=process_id).key("s"))
-        stop = threading.Event()
-        stop.set()
-        Runner(toy(), config, None, stop).run()
+        Runner(toy(), config, None, stopped).run()
 
 
 def test_row_07_where_two_were_started_at_once_the_earlier_ends_and_names_the_other(config):

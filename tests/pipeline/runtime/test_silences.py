@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from dataclasses import replace
 
 import pytest
 
 from fantwin.pipeline.runtime.sessions import Session, Sessions, this_host
 from fantwin.pipeline.runtime.silences import BEGINS_NS, MOST_DELAY_S, RESTART_S, Silences
 from fantwin.schemas.enums import StageStatus
-from fantwin.schemas.header import Header
-from fantwin.schemas.health import Health, Output
+from fantwin.schemas.health import Output
 from fantwin.schemas.topics import tray_key
 from fantwin.schemas.units import NS_PER_S
+from tests.support import made_messages
 
 KEY = tray_key("s", "a", "raw")
 STARTING, OK, DEGRADED, STOPPED = StageStatus.STARTING, StageStatus.OK, StageStatus.DEGRADED, StageStatus.STOPPED
@@ -38,19 +37,17 @@ class Consumer:
         has_more: bool = False,
         **fields: object,
     ) -> None:
-        health = Health(
-            header=Header(producer, 0, ""),
-            stage="acquisition",
-            instance="a",
-            status=status,
-            t_ns=round(self.now_s * NS_PER_S),
-            uptime_s=0.0,
-            outputs=(
-                Output(key=KEY, published=published, has_more=has_more),
-                Output(key="another", published=9, has_more=True),
-            ),
+        own, another = (
+            Output(key=KEY, published=published, has_more=has_more),
+            Output(key="x", published=9, has_more=True),
         )
-        health = replace(health, **fields)  # type: ignore[arg-type]
+        about = {
+            "status": status,
+            "t_ns": round(self.now_s * NS_PER_S),
+            "outputs": (own, another),
+            "stage": "acquisition",
+        }
+        health = made_messages.health(instance="a", producer=producer, **(about | fields))
         self.sessions.add_health(health, {KEY})
         self.silences.add_health(health, self._has_all_of)
 
