@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import subprocess
 import sys
-import threading
 
 import zenoh
 
-from fantwin.pipeline.bus.publisher import KEPT_BYTES
 from fantwin.pipeline.bus.recovery import recovery_key
 from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.config.settings import BusConfig
@@ -45,24 +43,6 @@ def test_peers_meet_after_the_process_at_the_endpoint_was_killed_and_the_last_on
     assert sorted(int(payload) for _, payload in found) == list(range(COUNT))
 
 
-def test_a_token_shows_when_a_process_appears_and_when_it_has_gone(endpoint):
-    seen: list[bool] = []
-    changed = threading.Event()
-
-    def on_change(_key: str, alive: bool) -> None:
-        seen.append(alive)
-        changed.set()
-
-    with Bus(BusConfig(endpoint=endpoint)) as watcher:
-        watcher.watch_alive(alive_key("site", "*", "*"), on_change)
-        with Bus(BusConfig(endpoint=endpoint)) as other:
-            other.declare_alive(alive_key("site", "scorer", "all"))
-            assert changed.wait(20)
-            changed.clear()
-        assert changed.wait(20)
-    assert seen == [True, False]
-
-
 def test_a_session_that_does_not_listen_leaves_the_endpoint_to_others(endpoint):
     config = BusConfig(endpoint=endpoint)
     with Bus(config, listens=False) as first, Bus(config) as staying:
@@ -71,28 +51,6 @@ def test_a_session_that_does_not_listen_leaves_the_endpoint_to_others(endpoint):
         eventually(lambda: first.alive(alive_key("site", "*", "*")), "they meet all the same")
         with Bus(config, listens=False) as late:
             assert late.came_second
-
-
-def test_a_publisher_keeps_the_newest_messages_that_fit_its_memory(endpoint, monkeypatch):
-    key, size, count = tray_key("site", "tray", "score"), KEPT_BYTES // 4, 6
-    monkeypatch.setattr(Bus, "answer_timeout_s", 30.0)
-    patient = BusConfig(endpoint=endpoint)
-    met = threading.Event()
-    with Bus(patient) as bus, Bus(patient) as asker:
-        bus.declare_alive(alive_key("site", "big", "all"))
-        asker.watch_alive(alive_key("site", "*", "*"), lambda _key, _alive: met.set())
-        assert met.wait(20)
-        publisher = bus.publisher(key, BY_NAME["score"], "", "big")
-        for number in range(count):
-            publisher.put(bytes([number]) * size)
-        # the asker must have discovered the publisher
-        eventually(lambda: asker.recover(key, "big"), "somebody answers")
-        kept = [payload[0] for _, payload in asker.recover(key, "big")]
-        assert kept == [2, 3, 4, 5]
-        history = BY_NAME["score"].history
-        for _ in range(history + 1):
-            publisher.put(b"small")
-        assert len(asker.recover(key, "big")) == history
 
 
 def test_row_11_a_request_that_makes_no_sense_is_answered_as_if_it_had_not_asked_that(endpoint, capfd):

@@ -17,8 +17,6 @@ from fantwin.pipeline.config.settings import BusConfig
 from tests.support.secured_site import SecuredSite, free_endpoint
 from tests.support.tcp_relay import TcpRelay
 
-NOBODY = "no-such-host.invalid"
-
 
 @pytest.fixture
 def foreign() -> Iterator[str]:
@@ -27,21 +25,10 @@ def foreign() -> Iterator[str]:
         yield f"tcp/127.0.0.1:{listening.getsockname()[1]}"
 
 
-@pytest.mark.parametrize(
-    ("endpoint", "line"),
-    [
-        ("tcp/127.0.0.1:99999", "port 99999 is out of range, 1 to 65535"),
-        ("tcp/127.0.0.1:0", "port 0 is out of range"),
-        ("tls/[::1]:7447777777777", "port 7447777777777 is out of range"),
-        (f"tcp/{NOBODY}:7447", f"the host '{NOBODY}' cannot be found"),
-        (f"tcp/{'x' * 70}.invalid:7447", "cannot be found"),
-    ],
-)
-def test_row_15_an_endpoint_that_cannot_be_is_one_line(endpoint, line):
-    with pytest.raises(BusError) as refused:
-        Bus(BusConfig(endpoint=endpoint))
-    assert str(refused.value).startswith(f"bus.endpoint = {endpoint!r}: ")
-    assert line in str(refused.value)
+@pytest.mark.parametrize("host", ["no-such-host.invalid", f"{'x' * 70}.invalid"])
+def test_row_15_a_host_that_cannot_be_found_is_one_line(host):
+    with pytest.raises(BusError, match=f"^bus.endpoint = 'tcp/{host}:7447': the host '{host}' cannot be found"):
+        Bus(BusConfig(endpoint=f"tcp/{host}:7447"))
 
 
 @pytest.mark.parametrize("endpoint", ["tcp/127.0.0.1:7447", "tcp/[::1]:7447", "udp/localhost:1", "unixsock-stream/x"])

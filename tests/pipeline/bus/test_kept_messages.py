@@ -79,9 +79,13 @@ def test_row_16_publishers_of_a_process_keep_a_bounded_number_of_bytes_together(
         assert len(rare._kept) == 100, "what is published only on change is kept all the same"
 
 
-def test_the_newest_message_is_kept_however_large_it_is(endpoint):
+def test_the_newest_message_is_kept_however_large_it_is_and_of_small_ones_as_many_as_its_topic_says(endpoint):
+    topic = BY_NAME["snapshot"]
     with Bus(BusConfig(endpoint=endpoint)) as bus:
-        publisher = bus.publisher(tray_key("s", "a", "snapshot"), BY_NAME["snapshot"], "", "p")
+        publisher = bus.publisher(tray_key("s", "a", "snapshot"), topic, "", "p")
         for number in range(3):
             publisher.put(bytes([number]) * (publisher_module.KEPT_BYTES + 1))
         assert [(sequence, payload[0]) for sequence, payload in publisher._kept] == [(2, 2)]
+        for _ in range(topic.history + 1):
+            publisher.put(b"small")
+        assert len(publisher._kept) == topic.history

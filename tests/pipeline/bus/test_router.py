@@ -52,16 +52,6 @@ def exchange(listener: Bus, speaker: Bus) -> bytes:
     raise AssertionError("nothing was heard in a minute")
 
 
-def test_two_clients_hear_each_other_through_the_router(endpoint, started):
-    router = RunningCommand(["router", "--listen", endpoint, "--json"])
-    started.append(router)
-    with client(endpoint, threading.Event()) as one, client(endpoint) as other:
-        assert exchange(one, other) == b"hello"
-        assert exchange(other, one) == b"hello"
-    assert router.end() == 0
-    assert router.output() == {"listening": endpoint}
-
-
 def test_a_client_that_waits_for_its_router_says_so(endpoint, monkeypatch):
     monkeypatch.setattr("fantwin.pipeline.bus.session.SAID_AFTER_S", 0.0)
     said: queue.Queue[str] = queue.Queue()
@@ -129,7 +119,8 @@ sys.stdin.read()
 
 def test_a_client_that_takes_nothing_any_more_does_not_cut_the_others_off(endpoint, started):
     """The router waits for it at most a second, well below the lease of the client that sends."""
-    started.append(RunningCommand(["router", "--listen", endpoint]))
+    router = RunningCommand(["router", "--listen", endpoint, "--json"])
+    started.append(router)
     heard: queue.Queue[bytes] = queue.Queue()
     with client(endpoint, threading.Event()) as one, client(endpoint) as other:
         exchange(one, other)
@@ -153,6 +144,8 @@ def test_a_client_that_takes_nothing_any_more_does_not_cut_the_others_off(endpoi
             taken = [heard.get(timeout=20) for _ in numbers]
             silent.kill()
     assert taken == numbers
+    assert router.end() == 0
+    assert router.output() == {"listening": endpoint}
 
 
 def test_a_second_router_at_the_same_place_is_refused_in_one_line(endpoint):

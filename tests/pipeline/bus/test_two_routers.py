@@ -8,7 +8,6 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import pytest
-from pydantic import ValidationError
 
 from fantwin.pipeline.bus.errors import BusError
 from fantwin.pipeline.bus.rights import SiteRoles
@@ -146,8 +145,3 @@ def test_a_client_asks_its_own_router_for_its_rights_and_no_other(secured):
                 refused.require_rights()
         assert good.has_all_rights_of_its_role(first.site)
         assert not refused.has_all_rights_of_its_role(first.site)
-
-
-def test_peers_have_one_endpoint():
-    with pytest.raises(ValidationError, match="peers meet at one endpoint"):
-        BusConfig.model_validate({"endpoint": ["tcp/127.0.0.1:1", "tcp/127.0.0.1:2"]})

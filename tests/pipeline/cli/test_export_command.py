@@ -165,8 +165,6 @@ def test_an_existing_table_is_replaced_only_with_force_and_only_by_a_complete_on
     out = tmp_path / "out"
     out.mkdir()
     (out / "r.tray1.score.csv").write_text("mine")
-    error = error_of("export", path, "--to", "csv", "-o", out)
-    assert error == f"{out}/r.tray1.score.csv: exists; name another folder or file with -o, or replace it with --force"
     with disk_of(20_000):
         error = error_of("export", path, "--to", "csv", "-o", out, "--force")
     assert "r.tray1.score.csv: cannot be written: File too large" in error
@@ -176,16 +174,7 @@ def test_an_existing_table_is_replaced_only_with_force_and_only_by_a_complete_on
     assert names(out) == ["r.tray1.score.csv"]
 
 
-def test_one_file_holds_one_table_of_one_tray_of_one_site(tmp_path):
-    path = recording(tmp_path, trays=("left", "right"))
-    one = tmp_path / "one.csv"
-    assert error_of("export", path, "--to", "csv", "-o", one) == (
-        f"{one}: would hold both score of left and score of right: name a folder with -o, or choose with --topic and "
-        "--tray"
-    )
-    assert names(tmp_path) == ["r.mcap"]
-    assert fantwin("export", path, "--to", "csv", "--tray", "right", "-o", one).exit_code == 0
-    assert len(table(one)) == 600
+def test_one_file_holds_one_table_of_one_site(tmp_path):
     with RecordingWriter(tmp_path / "sites.mcap", {}) as writer:
         for site in ("here", "there"):
             writer.add_message(f"fantwin/{site}/tray1/raw", raw(0), 1)

@@ -15,7 +15,10 @@ from fantwin.twin.models.physical import PhysicalModel
 from fantwin.twin.runs import Run
 from tests.support.fan_data import published_run
 from tests.support.running_chain import DEMO
+from tests.support.score_data import made_up_tray
+from tests.support.small_recordings import write
 from tests.support.twin_files import write_twin
+from tests.support.written_logs import write_ulog
 from tests.support.written_recordings import write_run
 
 LINES = Path(__file__).with_name("refusals.txt").read_text(encoding="utf-8").splitlines()
@@ -24,6 +27,10 @@ REFUSALS = [
     (words.removeprefix("$ fantwin "), *refusal.split(maxsplit=1))
     for words, refusal in zip(ROWS[::2], ROWS[1::2], strict=True)
 ]
+
+GOLDEN = Path(__file__).parents[2] / "support" / "data" / "golden.mcap"
+TRAYS = ("tray1", "tray2")
+ESCS = ("uint64_t timestamp;esc_report[2] esc;", [(1000 * k, 3000, 12.0, 3000, 12.0) for k in range(3)])
 
 
 @pytest.fixture(scope="module")
@@ -49,8 +56,19 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name, content in (("bad.mcap", b"t,u,y\n"), ("magic.mcap", b"\x89MCAP0\r\n"), ("bad.onnx", b"nothing")):
         (folder / name).write_bytes(content)
     (folder / "kept.toml").write_text(tray.format("a") + tray.format("kept"), encoding="utf-8")
-    (folder / "kept.onnx").write_bytes(b"kept")
-    (folder / "folder").mkdir()
+    for name in ("kept.onnx", "kept.rrd", "kept.csv"):
+        (folder / name).write_bytes(b"kept")
+    for name in ("folder", "bag"):
+        (folder / name).mkdir()
+    (folder / "bag" / "metadata.yaml").write_text("none", encoding="utf-8")
+    shutil.copy(GOLDEN, folder)
+    write(folder / "scores.mcap", [score for tray in TRAYS for score in made_up_tray(seconds=1, tray=tray)[0]])
+    outputs = ("uint64_t timestamp;float[4] output;", [(1000 * k, *[0.5] * 4) for k in range(3)])
+    write_ulog(folder / "flight.ulg", {"actuator_outputs": outputs, "esc_status": ESCS})
+    (folder / "cut.ulg").write_bytes((folder / "flight.ulg").read_bytes()[:20])
+    nested = {f"f{depth}": (f"f{depth + 1}[10] a;", ()) for depth in range(12)}
+    write_ulog(folder / "nested.ulg", {**nested, "f12": ("float a;", ())})
+    write_ulog(folder / "endless.ulg", {"a": ("b[2] x;", ()), "b": ("a y;", ())})
     return folder
 
 

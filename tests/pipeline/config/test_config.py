@@ -38,16 +38,7 @@ def test_a_good_file_gives_every_enabled_stage_its_section():
     ("text", "words"),
     [
         (GOOD + "alarm_shrae = 1\n", ["scorer.alarm_shrae", "did you mean 'alarm_share'"]),
-        (GOOD.replace("fans = 8", "fnas = 8"), ["tray.0.fnas", "did you mean 'fans'"]),
-        (GOOD.replace("[scorer]", "[scorrer]"), ["unknown key 'scorrer'", "did you mean 'scorer'"]),
-        (GOOD.replace("fans = 8", "fans = 99"), ["fans = 99: a serial source carries at most 64 fans"]),
-        (GOOD.replace("fans = 8", "fans = 1025"), ["tray.0.fans = 1025", "1024"]),
         (GOOD.replace("fans = 8\n", ""), ["'tray.0.fans' is missing"]),
-        (GOOD.replace('name = "a"', 'name = "health"'), ["reserved name"]),
-        *(
-            (f'{GOOD}[bus.security]\ncontrollers = ["dcim", "{role}"]\n', [f"'{role}' is a role of its own"])
-            for role in ("scorer", "operator", "viewer", "source", "replay", "router")
-        ),
         ("site = 'x'\n", ["'tray' is missing"]),
         (
             "format = 2\nnew_key = 1\n" + GOOD,
@@ -55,16 +46,6 @@ def test_a_good_file_gives_every_enabled_stage_its_section():
         ),
         ("format = '1'\n" + GOOD, ["a configuration of format '1'; ", "write format = 1, or leave it out"]),
         ("site = \n", ["not valid TOML"]),
-        (GOOD.replace("0.25", "inf"), ["scorer.alarm_share = inf", "finite"]),
-        (GOOD.replace("fans = 8", "fans = 8\nspeed_max = nan"), ["tray.0.speed_max = nan", "finite"]),
-        (GOOD.replace("fans = 8", 'fans = 8\ntacho = { kind = "count" }'), ["tray.0.tacho", "needs window_s"]),
-        (
-            GOOD.replace("fans = 8", 'fans = 8\ntacho = { kind = "count", window = 1 }'),
-            ["tray.0.tacho.0.window", "did you mean 'window_s'"],
-        ),
-        (GOOD.replace("fans = 8", "fans = 8\ntacho = [{}, {}]"), ["tray.0", "2 tachos for 8 fans"]),
-        (GOOD + '[launcher]\nstages = ["scorr"]\n', ["unknown stage 'scorr'", "did you mean 'scorer'"]),
-        ("scorer = 3\n" + GOOD.replace("[scorer]\nalarm_share = 0.25", ""), ["'scorer' must be a section"]),
     ],
 )
 def test_a_mistake_is_one_line_with_file_key_and_remedy(text, words):
@@ -129,41 +110,22 @@ def test_overrides_set_nested_keys_and_keep_their_types():
 
 
 @pytest.mark.parametrize(
-    ("override", "words"),
+    ("content", "words"),
     [
-        ("on_delay", "KEY=VALUE"),
-        ("tray.4.port=x", "no such key"),
-        ("tray.².port=x", "no such key"),
-        ("run_folder='/tmp/it's here'", "not a TOML string"),
+        ('site = "Prüfstand"'.encode("latin-1"), r"the configuration is not UTF-8 \(byte 10\)"),
+        (b"#" * 2_000_000, "larger than 1,048,576 bytes, so no configuration"),
     ],
 )
-def test_an_override_without_a_matching_key_is_refused(override, words):
-    with pytest.raises(ConfigError, match=words):
-        parse(GOOD, override)
-
-
-def test_a_missing_file_is_one_line(tmp_path):
-    with pytest.raises(ConfigError, match="cannot read the configuration: No such file"):
-        load_config(tmp_path / "none.toml")
-
-
-def test_a_file_that_is_not_utf_8_is_one_line(tmp_path):
+def test_row_15_a_file_that_cannot_be_a_configuration_is_one_line(tmp_path, content, words):
     path = tmp_path / "fantwin.toml"
-    path.write_bytes('site = "Prüfstand"'.encode("latin-1"))
-    with pytest.raises(ConfigError, match=r"fantwin.toml: the configuration is not UTF-8 \(byte 10\)"):
+    path.write_bytes(content)
+    with pytest.raises(ConfigError, match=rf"fantwin\.toml: {words}"):
         load_config(path)
 
 
 @pytest.mark.parametrize(
     ("text", "overrides", "words"),
     [
-        (GOOD, ["resampler.watermark_s=1e300"], "resampler.watermark_s = 1e+300: too large: at most 31,622,400 s"),
-        (GOOD, ["resampler.rate_hz=1e-300"], "resampler.rate_hz = 1e-300: too small: 0, or at least 1e-09"),
-        (
-            GOOD,
-            ["scorer.alarm_share=1" + 30 * "0"],
-            "scorer.alarm_share = 1000000000000000000000000000000: too large",
-        ),
         (GOOD, ["scorer.alarm_share=" + 5000 * "9"], "longer than 1,000 characters"),
         (GOOD + "false_alarms_per_day = " + 5000 * "9", [], "not valid TOML: Exceeds the limit"),
         (GOOD + "false_alarms_per_day = " + 4000 * "9", [], "scorer.false_alarms_per_day = 9999"),
@@ -171,7 +133,6 @@ def test_a_file_that_is_not_utf_8_is_one_line(tmp_path):
         (GOOD, ["scorer.false_alarms_per_day=" + 400 * "[" + 400 * "]"], "scorer.false_alarms_per_day = [[[["),
         (GOOD, [".".join(["scorer", *400 * ["a"]]) + "=1"], "unknown key 'scorer.a'"),
         (GOOD, [400 * "9" + "=1"], "unknown key '9999"),
-        (GOOD, ["tray.0.command_min=1.5"], "tray.0: command_min = 1.5 is greater than command_max = 1"),
     ],
 )
 def test_row_15_values_without_measure_are_one_line(text, overrides, words):
@@ -182,13 +143,6 @@ def test_row_15_values_without_measure_are_one_line(text, overrides, words):
     assert "more)" not in line, "what follows from the first problem is none of its own"
     assert "\n" not in line
     assert len(line) < 400
-
-
-def test_row_15_a_file_that_is_too_large_is_not_read(tmp_path):
-    path = tmp_path / "fan.toml"
-    path.write_bytes(b"#" * 2_000_000)
-    with pytest.raises(ConfigError, match=r"fan\.toml: larger than 1,048,576 bytes, so no configuration"):
-        load_config(path)
 
 
 def test_a_password_that_somebody_wrote_into_an_address_is_not_repeated_in_the_error() -> None:

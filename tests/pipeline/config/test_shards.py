@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from fantwin.pipeline.config.loading import parse_config
-from fantwin.pipeline.config.settings import Config, ConfigError
+from fantwin.pipeline.config.settings import Config
 from fantwin.pipeline.config.shards import (
     MOST_NAME_CHARACTERS,
     Shard,
@@ -85,44 +85,11 @@ def test_hosts_that_share_the_trays_start_every_process_once():
     ]
 
 
-@pytest.mark.parametrize(
-    ("trays", "shard", "line"),
-    [
-        (None, "2", "--shard 2: give K/N with K from 1 to N, for example --shard 2/8"),
-        (None, "0/3", "--shard 0/3: give K/N with K from 1 to N, for example --shard 2/8"),
-        (None, "4/3", "--shard 4/3: give K/N with K from 1 to N, for example --shard 2/8"),
-        (None, "1/8", "--shard 1/8: site.toml has 5 trays, and a shard needs one at least"),
-        ("x", None, "site.toml: no tray called 'x'; known: a, b, c, d, e"),
-        ("a", "1/2", "give --trays or --shard, not both"),
-    ],
-)
-def test_a_shard_that_cannot_be_is_refused_in_one_line(trays, shard, line):
-    with pytest.raises(UserError) as refused:
-        chosen_shard("scorer", site(), trays, shard)
-    assert str(refused.value) == line
-
-
 def test_a_shard_whose_names_do_not_fit_a_token_is_refused():
     names = tuple(f"{'x' * 100}{number:04}" for number in range(MOST_NAME_CHARACTERS // 100 + 2))
     with pytest.raises(UserError, match="and 32,768 are possible: make more shards"):
         chosen_shard("scorer", site(names=names), ",".join(names[1:]))
     assert chosen_shard("scorer", site(names=names)).is_whole, "all trays need no names"
-
-
-@pytest.mark.parametrize(
-    ("value", "line"),
-    [
-        ("0", "launcher.shards = 0: give a number from 1, or a table of stages with such numbers"),
-        ("true", "launcher.shards = True: give a number from 1, or a table of stages with such numbers"),
-        ("6", "launcher.shards = 6: more shards than trays, of which there are 5"),
-        ("{scorer=7}", "launcher.shards.scorer = 7: more shards than trays, of which there are 5"),
-        ("{scorr=2}", "launcher.shards: unknown stage 'scorr'; did you mean 'scorer'?"),
-    ],
-)
-def test_shards_that_cannot_be_are_refused_in_one_line(value, line):
-    with pytest.raises(ConfigError) as refused:
-        site(f"launcher.shards={value}")
-    assert str(refused.value) == f"site.toml: {line}"
 
 
 def test_a_tray_that_is_added_at_the_end_moves_no_other_one():

@@ -8,13 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fantwin.pipeline.cli.recordings.view import view
-from fantwin.pipeline.errors import UserError
-from fantwin.pipeline.recordings.writing import RecordingWriter
-from fantwin.schemas.topics import tray_key
 from tests.support.drawn_views import chunks_of, rows_of
-from tests.support.recorded_views import live_view, recorded_view, recording
-from tests.support.score_data import START_NS, made_up_tray
+from tests.support.recorded_views import live_view, recorded_view
 
 pytest.importorskip("rerun")
 
@@ -53,16 +48,3 @@ def samples(path: Path, entity: str) -> np.ndarray:
     count = 2 if entity.endswith("/speed") else None
     of_entity = np.array([[t_ns, *row[component][:count]] for t_ns, row in rows], float)
     return of_entity[np.isfinite(of_entity[:, 1:]).any(axis=1)]
-
-
-def test_an_existing_view_is_kept_and_a_recording_without_scores_is_one_line(tmp_path: Path) -> None:
-    path = recording(tmp_path)
-    (tmp_path / "kept.rrd").write_bytes(b"kept")
-    with pytest.raises(UserError, match="exists; name another file with -o, or use --force"):
-        view([path], tmp_path / "kept.rrd")
-    assert (tmp_path / "kept.rrd").read_bytes() == b"kept"
-    with RecordingWriter(tmp_path / "none.mcap", {"site": "site"}, {}) as writer:
-        writer.add_message(tray_key("site", "tray1", "alarm"), made_up_tray(seconds=10)[1][0], START_NS)
-    with pytest.raises(UserError, match="holds no scores to show"):
-        view([writer.path], tmp_path / "new.rrd")
-    assert not (tmp_path / "new.rrd").exists()
