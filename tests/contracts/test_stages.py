@@ -44,19 +44,19 @@ from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.header import Header
 from fantwin.schemas.health import Health
 from fantwin.schemas.messages import Alarm, Message, Prediction, Score, ScorerSnapshot
-from fantwin.schemas.topics import BY_NAME, TOPICS
+from fantwin.schemas.topics import BY_NAME
 from fantwin.stages.mqtt import MqttCore
 from fantwin.stages.notifier import NotifierCore
 from fantwin.stages.resampler import ResamplerConfig, ResamplerCore
 from fantwin.stages.twin_integrator import TwinIntegratorConfig, TwinIntegratorCore
 from tests.support.drawn_views import FakeSink
+from tests.support.made_messages import TOPIC_OF
 from tests.support.message_strategies import any_message
 from tests.support.scored_blocks import core_of, prediction_of
 from tests.support.twin_files import write_twin
 
 FANS = 2
 TRAYS = (TrayConfig(name="tray1", fans=FANS),)
-TOPIC_OF = {topic.message: topic.name for topic in TOPICS}
 NO_SLOW_CHECK = settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 
 

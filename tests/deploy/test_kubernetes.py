@@ -28,9 +28,9 @@ OPEN = {"certificates": {"secret": ""}, "insecure": True}
 MANY = {stage: {"shards": 3, "storage": "1Gi" if stage in ("recorder", "learner") else ""} for stage in STAGES}
 
 
-def rendered(**values: Any) -> list[dict[str, Any]]:
+def rendered(name: str = "plant", **values: Any) -> list[dict[str, Any]]:
     with helm.Chart.load(str(CHART)) as chart:
-        files = chart.render({**SECURED, **values}, name="plant", namespace="fans")
+        files = chart.render({**SECURED, **values}, name=name, namespace="fans")
     return [document for text in files.values() for document in yaml.safe_load_all(text) if document]
 
 
@@ -95,9 +95,7 @@ def test_another_number_of_shards_is_another_set_with_pods_and_a_service_of_its_
         )
         assert of_scorer["metadata"]["name"] == of_scorer["spec"]["serviceName"] == f"plant-scorer-of-{shards}"
     long = "a-release-whose-name-is-as-long-as-helm-allows-53-cha"
-    with helm.Chart.load(str(CHART)) as chart:
-        files = chart.render({**SECURED, "stages": {"scorer": {"shards": 4096}}}, name=long, namespace="f")
-    names = of_kind("StatefulSet", [each for text in files.values() for each in yaml.safe_load_all(text) if each])
+    names = of_kind("StatefulSet", rendered(long, stages={"scorer": {"shards": 4096}}))
     assert all(re.fullmatch(r"[a-z0-9]([a-z0-9-]*[a-z0-9])?", name) for name in names)
     assert max(map(len, names)) <= 52, "the hash of the revision is appended to it in a label of 63 characters"
 

@@ -15,6 +15,7 @@ from fantwin.schemas.blocks import can_join, cut, join
 from fantwin.schemas.fields import columns
 from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Command, Grid, Message, Prediction, Raw, Score
+from tests.support.made_messages import filled
 from tests.support.message_strategies import any_message, same
 
 OF_SAMPLES = (Raw, Grid, Prediction, Score)
@@ -31,23 +32,12 @@ def times(message: Any) -> Any:
 
 def grid(samples: int, fans: int = 2, period_ns: int = 10) -> Grid:
     values = np.arange(float(samples * fans)).reshape(samples, fans)
-    return Grid(
-        fans=fans,
-        period_ns=period_ns,
-        t_ns=np.arange(samples) * period_ns,
-        command=values,
-        speed_rad_s=-values,
-        valid=values > 1,
-        invalid_reason=np.zeros(values.shape, np.uint8),
-    )
+    columns = {"command": values, "speed_rad_s": -values, "valid": values > 1}
+    return filled(Grid, samples, fans, period_ns=period_ns, t_ns=np.arange(samples) * period_ns, **columns)
 
 
 def raw(**present: Any) -> Raw:
-    one = np.zeros((1, 1))
-    return Raw(fans=1, host_receive_t_ns=np.zeros(1, np.int64), command=one, speed_rad_s=one, **present)
-
-
-COUNT = np.zeros(1, np.uint32)
+    return filled(Raw, 1, 1, **present)
 
 
 @given(MESSAGES, st.lists(st.integers(0, 5), max_size=3))
@@ -73,8 +63,8 @@ def test_samples_are_joined_in_the_order_given_under_the_first_header() -> None:
         (grid(1), raw()),
         (grid(1, fans=2), grid(1, fans=3)),
         (grid(1, period_ns=10), grid(1, period_ns=11)),
-        (raw(device_clock_us=COUNT), raw()),
-        (raw(), raw(device_sequence=COUNT)),
+        (raw(device_clock_us=0), raw()),
+        (raw(), raw(device_sequence=0)),
         (Prediction(fans=1, period_ns=1, twin="a"), Prediction(fans=1, period_ns=1, twin="b")),
         (Prediction(fans=1, period_ns=1, sigma_rad_s=np.ones(1)), Prediction(fans=1, period_ns=1)),
         (Command(fans=1, t_ns=0), Command(fans=1, t_ns=0)),

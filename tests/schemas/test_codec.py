@@ -23,7 +23,7 @@ from fantwin.schemas.fields import OpenEnum, columns, other_fields, time_column
 from fantwin.schemas.header import Header, InputPosition
 from fantwin.schemas.health import Counter, Input, Output
 from fantwin.schemas.messages import Command, Diagnosis, Grid, Message, Prediction, Raw, Score
-from tests.support.made_messages import MESSAGE_TYPES
+from tests.support.made_messages import MESSAGE_TYPES, filled
 from tests.support.message_strategies import any_message, same
 
 ENUMS: list[type[OpenEnum]] = OpenEnum.__subclasses__()
@@ -145,17 +145,9 @@ def grid_of(samples: int) -> Grid:
     speed = rng.normal(size=(samples, 2))
     speed[rng.random(speed.shape) < 0.1] = np.nan
     invalid_reason = rng.integers(0, 8, speed.shape).astype(np.uint8)
-    t_ns = np.arange(samples) + 10**18
-    return Grid(
-        fans=2,
-        period_ns=1,
-        t_ns=t_ns,
-        command=-speed,
-        speed_rad_s=speed,
-        valid=invalid_reason == 0,
-        invalid_reason=invalid_reason,
-        reading_missing=np.isnan(speed),
-    )
+    columns = {"t_ns": np.arange(samples) + 10**18, "command": -speed, "speed_rad_s": speed}
+    columns |= {"valid": invalid_reason == 0, "invalid_reason": invalid_reason, "reading_missing": np.isnan(speed)}
+    return filled(Grid, samples, 2, period_ns=1, **columns)
 
 
 @pytest.mark.parametrize("kind", [*fan_pb2.DESCRIPTOR.message_types_by_name.values()], ids=lambda kind: kind.name)

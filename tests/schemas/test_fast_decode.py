@@ -12,18 +12,15 @@ from fantwin.schemas.enums import TachoKind
 from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.header import Header, InputPosition
 from fantwin.schemas.messages import Raw, StatedTacho
+from tests.support.made_messages import filled
 
 KEY = "fantwin/plant/tray1/raw"
 
 
 def raw(sequence: int, fans: int = 2, position: InputPosition | None = None) -> Raw:
-    return Raw(
-        header=Header("acquisition-1", sequence, "tray1", position),
-        fans=fans,
-        host_receive_t_ns=np.array([sequence + 5], np.int64),
-        command=np.full((1, fans), sequence / 7),
-        speed_rad_s=np.full((1, fans), np.nan),
-    )
+    header = Header("acquisition-1", sequence, "tray1", position)
+    columns = {"host_receive_t_ns": sequence + 5, "command": sequence / 7, "speed_rad_s": np.nan}
+    return filled(Raw, 1, fans, header=header, **columns)
 
 
 @pytest.mark.parametrize("length", [1, 100, 130])

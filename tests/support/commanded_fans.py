@@ -48,12 +48,7 @@ def add_history(
     t_ns = round((START_S + first_s) * NS_PER_S) + (np.arange(len(command)) / rate_hz * NS_PER_S).astype(np.int64)
     for number, first in enumerate(range(0, len(command), SAMPLES_PER_MESSAGE)):
         rows = slice(first, first + SAMPLES_PER_MESSAGE)
-        raw = Raw(
-            header=Header("acquisition", number, "tray1"),
-            fans=command.shape[1],
-            host_receive_t_ns=t_ns[rows],
-            command=command[rows],
-            speed_rad_s=speed_rad_s[rows],
-        )
+        columns = {"host_receive_t_ns": t_ns[rows], "command": command[rows], "speed_rad_s": speed_rad_s[rows]}
+        raw = Raw(header=Header("acquisition", number, "tray1"), fans=command.shape[1], **columns)
         history.add(raw, has_alarm=has_alarm, is_watched=False)
     history.close()

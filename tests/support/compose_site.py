@@ -7,7 +7,7 @@ import os
 import signal
 import subprocess
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -81,9 +81,9 @@ def cut_off(service: str, seconds: float) -> None:
     succeed("podman", "network", "connect", NETWORK, container(service))
 
 
-def fantwin(*words: str, service: str = "viewer", timeout_s: float = 60.0) -> subprocess.CompletedProcess[str]:
-    """A command in the container of a service, which has the certificate of that service only."""
-    return run("podman", "exec", container(service), "fantwin", *words, timeout_s=timeout_s)
+def fantwin(*words: str) -> subprocess.CompletedProcess[str]:
+    """A command in the container of the viewer, which has the certificate of the viewer only."""
+    return run("podman", "exec", container("viewer"), "fantwin", *words)
 
 
 def status() -> Status:
@@ -92,11 +92,10 @@ def status() -> Status:
     return json.loads(answer.stdout) if answer.stdout.startswith("{") else {"error": answer.stderr}
 
 
-def in_new_container(script: str, volumes: Sequence[str] = ()) -> subprocess.CompletedProcess[str]:
-    """A script in a container of its own, on the network of the site, with some of its volumes."""
-    mounts = (word for volume in volumes for word in ("-v", f"{PROJECT}_{volume}"))
+def in_new_container(script: str) -> subprocess.CompletedProcess[str]:
+    """A script in a container of its own, on the network of the site, without its volumes."""
     shell = ("--entrypoint", '["sh", "-euc"]', "fantwin", script)
-    return run("podman", "run", "--rm", "--network", NETWORK, *mounts, *shell)
+    return run("podman", "run", "--rm", "--network", NETWORK, *shell)
 
 
 def is_well(seen: Status) -> bool:

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
 from fantwin.pipeline.prediction.tray_twin import load_tray_twin
-from fantwin.pipeline.recordings.writing import RecordingWriter
 from fantwin.pipeline.replay.offline.calibration_of_twin import calibration_in
 from fantwin.schemas.enums import Action, Severity, Transition
 from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Alarm
-from fantwin.schemas.topics import tray_key
 from fantwin.schemas.units import NS_PER_S
 from fantwin.scoring.alarms.alarm_state import GIVES_FEEDBACK
 from fantwin.scoring.calibration.calibration import Calibration
@@ -20,6 +19,7 @@ from fantwin.twin.evaluation.resampling import thinned
 from fantwin.twin.export.onnx_export import with_card_entries
 from fantwin.twin.runs import Run
 from tests.support.fan_data import published_run
+from tests.support.small_recordings import write
 from tests.support.written_recordings import write_run
 
 EPOCH_NS = 1_790_000_000 * NS_PER_S
@@ -69,12 +69,8 @@ def with_alarm(path: Path, action: Action | None) -> Path:
     if action is not None:
         said = {"transition": GIVES_FEEDBACK[action][0], "marked_onset_t_ns": onset_t_ns, "operator_name": "ann"}
         alarms.append(Alarm(**state, **said, active=False, t_ns=cleared_t_ns + 60 * NS_PER_S, comment="door"))
-    path.unlink(missing_ok=True)
-    with RecordingWriter(path, {"site": "plant", "trays": "tray1"}) as writer:
-        for number, alarm in enumerate(alarms):
-            message = replace(alarm, header=Header("scorer-1", number, "tray1"))
-            writer.add_message(tray_key("plant", "tray1", "alarm"), message, message.t_ns)
-    return path
+    messages = [replace(each, header=Header("scorer-1", number, "tray1")) for number, each in enumerate(alarms)]
+    return write(path, messages, {"site": "plant", "trays": "tray1"}, at=attrgetter("t_ns"))
 
 
 def calibration_of(twin: Path) -> Calibration:

@@ -20,6 +20,7 @@ from fantwin.twin.models.integration import step_through
 from fantwin.twin.models.lag import effective_command
 from fantwin.twin.models.physical import PhysicalModel
 from fantwin.twin.models.physics import LAG
+from tests.support.made_messages import filled
 from tests.support.twin_files import PARAMETERS, made_up_card, still_balance
 
 EPOCH_NS = 1_700_000_000_000_000_000
@@ -86,15 +87,10 @@ def grid_of(command: Floats, speed: Floats | None = None, *, first: int = 0, per
     command = command.reshape(len(command), -1)
     speed = np.zeros_like(command) if speed is None else speed.reshape(len(command), -1)
     valid = np.isfinite(speed)
-    return Grid(
-        fans=command.shape[1],
-        period_ns=period_ns,
-        t_ns=EPOCH_NS + (first + np.arange(len(command))) * period_ns,
-        command=command,
-        speed_rad_s=speed,
-        valid=valid,
-        invalid_reason=np.where(valid, InvalidReason.NONE, InvalidReason.NO_SPEED).astype(np.uint8),
-    )
+    t_ns = EPOCH_NS + (first + np.arange(len(command))) * period_ns
+    columns = {"command": command, "speed_rad_s": speed, "valid": valid}
+    columns["invalid_reason"] = np.where(valid, InvalidReason.NONE, InvalidReason.NO_SPEED)
+    return filled(Grid, *command.shape, period_ns=period_ns, t_ns=t_ns, **columns)
 
 
 def silent(samples: int, first: int, command: float, why: InvalidReason = InvalidReason.GAP) -> Grid:

@@ -25,9 +25,10 @@ from fantwin.schemas.blocks import join
 from fantwin.schemas.enums import Action
 from fantwin.schemas.header import Header, InputPosition
 from fantwin.schemas.messages import Array, Consumed, Message, NewTwin, Raw, Request
-from fantwin.schemas.topics import BY_NAME, TOPICS, tray_key
+from fantwin.schemas.topics import BY_NAME, tray_key
 from fantwin.schemas.units import NS_PER_S
 from fantwin.twin.models.hybrid import Hybrid
+from tests.support.made_messages import TOPIC_OF
 from tests.support.twin_files import small_hybrid, write_twin
 
 SITE, TRAY, FANS = "plant", "tray1", 3
@@ -44,7 +45,6 @@ TICK_NS = 50_000_000
 AHEAD = 50
 """samples whose healthy speeds are computed at once"""
 declaration_of = cache(load_stage)
-TOPIC_OF = {topic.message: topic.name for topic in TOPICS}
 
 CONFIGURATION = f"""
 site = "{SITE}"

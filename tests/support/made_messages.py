@@ -11,9 +11,11 @@ from fantwin.schemas.fields import columns
 from fantwin.schemas.header import Header
 from fantwin.schemas.health import Health
 from fantwin.schemas.messages import Alarm, Message
+from fantwin.schemas.topics import TOPICS
 
 MESSAGE_TYPES: tuple[type[Message], ...] = get_args(Message)
 """every type of message"""
+TOPIC_OF = {topic.message: topic.name for topic in TOPICS}
 MessageType = TypeVar("MessageType", bound=Message)
 
 

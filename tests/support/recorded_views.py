@@ -11,13 +11,12 @@ from fantwin.pipeline.cli.options import ViewLayout
 from fantwin.pipeline.cli.recordings.view import view
 from fantwin.pipeline.recordings.writing import RecordingWriter
 from fantwin.schemas.messages import Alarm, Message, Score
-from fantwin.schemas.topics import tray_key
 from fantwin.stages.viewer import build
 from tests.support.drawn_views import context, sent
 from tests.support.score_data import START_NS, made_up_tray
+from tests.support.small_recordings import key_of
 from tests.support.wear_data import worn_snapshot
 
-TOPICS = {"Score": "score", "Alarm": "alarm", "ScorerSnapshot": "snapshot"}
 HOLE_S = (4.0, 6.0)
 
 
@@ -48,8 +47,7 @@ def recording(folder: Path) -> Path:
     metadata = {"site": "site", "trays": "tray1", "fans.tray1": "3", "speed_unit.tray1": "rad/s"}
     with RecordingWriter(folder / "rec.mcap", metadata, {}) as writer:
         for number, message in enumerate(messages()):
-            topic = TOPICS[type(message).__name__]
-            writer.add_message(tray_key("site", "tray1", topic), message, START_NS + number * 100_000_000)
+            writer.add_message(key_of(message, "site"), message, START_NS + number * 100_000_000)
     return writer.path
 
 

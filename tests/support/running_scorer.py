@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 from fantwin.pipeline.config.loading import load_config
 from fantwin.pipeline.config.registry import STAGES
@@ -27,8 +26,3 @@ class RunningScorer(RunningStage):
             build=lambda _context: BuiltStage(core),
         )
         super().__init__(stage, self.config)
-
-    @property
-    def last(self) -> Any:
-        """Its last health."""
-        return self.newest

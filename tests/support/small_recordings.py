@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,24 +12,30 @@ from fantwin.pipeline.recordings.writing import RecordingWriter
 from fantwin.schemas.enums import Statistic, Transition
 from fantwin.schemas.header import Header
 from fantwin.schemas.health import Health
-from fantwin.schemas.messages import Alarm, Command, Grid, Message, ModelCard, Raw
+from fantwin.schemas.messages import Alarm, Message, Raw
 from fantwin.schemas.topics import health_key, tray_key
 from tests.support import made_messages
+from tests.support.made_messages import TOPIC_OF
 
 
 def key_of(message: Message, site: str = "plant") -> str:
     if isinstance(message, Health):
         return health_key(site, message.stage, message.instance)
-    topic = {Raw: "raw", Grid: "grid", Alarm: "alarm", Command: "command", ModelCard: "twin"}.get(
-        type(message), "score"
-    )
-    return tray_key(site, message.header.tray, topic)
+    return tray_key(site, message.header.tray, TOPIC_OF[type(message)])
 
 
-def write(path: Path, messages: Iterable[Message], metadata: dict[str, str] | None = None, start: int = 1) -> Path:
-    with RecordingWriter(path, metadata or {"site": "plant"}, overwrite=True) as writer:
+def write(
+    path: Path,
+    messages: Iterable[Message],
+    metadata: Mapping[str, str] | None = None,
+    start: int = 1,
+    at: Callable[[Any], int] | None = None,
+) -> Path:
+    """A recording of a site that its metadata name. at: when a message was received; otherwise they are numbered."""
+    about = metadata or {"site": "plant"}
+    with RecordingWriter(path, about, overwrite=True) as writer:
         for number, message in enumerate(messages, start):
-            writer.add_message(key_of(message), message, number)
+            writer.add_message(key_of(message, about.get("site", "plant")), message, at(message) if at else number)
     return path
 
 

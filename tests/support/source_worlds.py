@@ -29,6 +29,7 @@ from fantwin.schemas.messages import PushedSamples
 from fantwin.schemas.units import RAD_S_PER_UNIT
 from fantwin.schemas.wire import Sample, encode
 from tests.support.hwmon_trees import add_chip
+from tests.support.made_messages import filled
 from tests.support.modbus_server import modbus_server
 from tests.support.mqtt_broker import MqttBroker
 from tests.support.ports import free_port
@@ -173,15 +174,10 @@ class PushWorld(World):
     def _push(self, numbers: list[int], source: SampleSource, deliver: Callable[[SourceEvent], None]) -> None:
         assert isinstance(source, PushSource)
         t_ns = np.array(numbers, np.int64) * 1_000_000_000
-        message = PushedSamples(
-            header=Header("client-1", numbers[0], "tray1"),
-            fans=2,
-            t_ns=t_ns,
-            first_number=numbers[0],
-            newest_t_ns=int(t_ns[-1]),
-            command=np.full((len(numbers), 2), COMMAND),
-            speed_rad_s=np.array([speeds_of(number) for number in numbers]) * RAD_S_PER_UNIT["rpm"],
-        )
+        about = {"header": Header("client-1", numbers[0], "tray1"), "first_number": numbers[0]}
+        about |= {"t_ns": t_ns, "newest_t_ns": int(t_ns[-1]), "command": COMMAND}
+        speed_rad_s = np.array([speeds_of(number) for number in numbers]) * RAD_S_PER_UNIT["rpm"]
+        message = filled(PushedSamples, len(numbers), 2, speed_rad_s=speed_rad_s, **about)
         for event in source.events(message, int(t_ns[-1])):
             deliver(event)
 

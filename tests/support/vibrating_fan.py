@@ -20,7 +20,6 @@ from prometheus_client.parser import text_string_to_metric_families
 from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.prediction.twin_file import TwinFile
 from fantwin.pipeline.recordings import read_arrays
-from fantwin.pipeline.recordings.writing import RecordingWriter
 from fantwin.pipeline.runtime.stage import Core
 from fantwin.pipeline.sources.json_samples import batches_of, parse_samples
 from fantwin.pipeline.timebase.receipt_times import ReceiptTimes
@@ -29,22 +28,22 @@ from fantwin.schemas.channels import CHANNELS
 from fantwin.schemas.codec import decode, encode
 from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Grid, Message, Prediction, Raw, Score
-from fantwin.schemas.topics import TOPICS, tray_key
 from fantwin.stages.acquisition import AcquisitionConfig
 from fantwin.stages.resampler import ResamplerConfig, ResamplerCore
 from fantwin.stages.twin_integrator import TwinIntegratorConfig, TwinIntegratorCore
 from fantwin.stages.viewer import build
 from tests.support.drawn_views import context, rows_of, sent
 from tests.support.fantwin_command import fantwin
+from tests.support.made_messages import TOPIC_OF
 from tests.support.running_core import FANS, SITE, TRAY
 from tests.support.running_gateway import Client, RunningGateway
 from tests.support.scored_blocks import core_of
 from tests.support.serial_core import FakeLink, SerialCore
+from tests.support.small_recordings import write
 from tests.support.twin_files import write_twin
 
 START_S, SECONDS, RATE_HZ = 1_790_000_000, 4, 50
 KINDS = (Raw, Grid, Prediction, Score)
-TOPIC_OF = {topic.message: topic.name for topic in TOPICS}
 
 
 def payloads(channel: str) -> Iterable[bytes]:
@@ -94,10 +93,7 @@ def main(folder: Path, channel: str) -> None:
     messages = all_messages(folder, channel)
     scores = [message for message in messages if isinstance(message, Score)]
     metadata = {"site": SITE, "trays": TRAY, f"fans.{TRAY}": str(FANS), f"speed_unit.{TRAY}": "rpm"}
-    path = folder / "r.mcap"
-    with RecordingWriter(path, metadata) as writer:
-        for number, message in enumerate(messages):
-            writer.add_message(tray_key(SITE, TRAY, TOPIC_OF[type(message)]), message, START_S * 10**9 + number)
+    path = write(folder / "r.mcap", messages, metadata, start=START_S * 10**9)
     every = tuple(float(np.float32(-1.1754944e-38)) * (1 + fan % 2) for fan in range(wire.MAX_FANS))
     longest = wire.Sample(2**32 - 1, 2**32 - 1, every, every, {each.name: every for each in CHANNELS})
     found: dict[str, Any] = {

@@ -74,6 +74,14 @@ def write_run(path: Path, run: Run, unit: str = "rad/s") -> Path:
     return path
 
 
+def raw_columns(path: Path) -> tuple[Array, Array, Array]:
+    """Times of receipt, commands and speeds, rad/s, of all raw samples."""
+    raws = [envelope.message for envelope in read_recording(path, ("raw",))]
+    names = ("host_receive_t_ns", "command", "speed_rad_s")
+    t_ns, command, speed_rad_s = (np.concatenate([getattr(raw, name) for raw in raws]) for name in names)
+    return t_ns, command, speed_rad_s
+
+
 def sequences(path: Path) -> list[int]:
     return [envelope.message.header.sequence for envelope in read_recording(path, topics=("raw",))]
 

@@ -86,6 +86,6 @@ def test_the_newest_message_is_kept_however_large_it_is_and_of_small_ones_as_man
         for number in range(3):
             publisher.put(bytes([number]) * (publisher_module.KEPT_BYTES + 1))
         assert [(sequence, payload[0]) for sequence, payload in publisher._kept] == [(2, 2)]
-        for _ in range(topic.history + 1):
+        for _ in range(topic.kept + 1):
             publisher.put(b"small")
-        assert len(publisher._kept) == topic.history
+        assert len(publisher._kept) == topic.kept

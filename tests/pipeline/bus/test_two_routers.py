@@ -34,9 +34,6 @@ class Routers:
         listen, connect = self.endpoints[number], self.endpoints[1 - number]
         self.running[number] = RunningCommand(["router", "--listen", listen, "--connect", connect])
 
-    def kill(self, number: int) -> None:
-        self.running[number].kill()
-
     def client(self, *numbers: int) -> Bus:
         endpoints = [self.endpoints[number] for number in numbers]
         return Bus(BusConfig.model_validate({"mode": "client", "endpoint": endpoints}), threading.Event())
@@ -76,7 +73,7 @@ def test_row_16_clients_of_two_routers_hear_one_another_whichever_of_them_is_the
 
         are_together(b"by two routers")
         for number in (0, 1):
-            routers.kill(number)
+            routers.running[number].kill()
             are_together(b"without router %d" % number)
             routers.start(number)
             are_together(b"with router %d again" % number)

@@ -10,6 +10,7 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import fields, replace
 from datetime import datetime
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,6 @@ from fantwin.pipeline.cli.watch.scorers import wait_for_stages
 from fantwin.pipeline.recordings.clips.clip import CLIP_KEY
 from fantwin.pipeline.recordings.indexed import rare_messages
 from fantwin.pipeline.recordings.reading import read_recording
-from fantwin.pipeline.recordings.writing import RecordingWriter
 from fantwin.pipeline.runtime.stage import Core
 from fantwin.pipeline.site.alarm_history import AlarmHistory
 from fantwin.pipeline.site.alarm_rates import AlarmRates, JudgedStretch
@@ -39,6 +39,7 @@ from tests.support.made_messages import alarm
 from tests.support.running_chain import DEMO, FANTWIN, SITE, TRAY, eventually
 from tests.support.running_scorer import RunningScorer
 from tests.support.score_data import one_sample
+from tests.support.small_recordings import write
 
 FANS = 8
 CAUSES = (
@@ -184,8 +185,9 @@ def test_a_request_for_all_fans_succeeds_if_it_is_granted_for_at_least_one_and_a
     for action in ("out-of-service", "in-service"):
         site.ask(action, TRAY, 1)
     site.end()
-    assert (site.last.status, site.last.problem, site.last.lost) == (StageStatus.STOPPED, "", 0)
-    assert [line.received for line in site.last.inputs] == [1] * 5, "commands that come and go"
+    last = site.newest
+    assert (last.status, last.problem, last.lost) == (StageStatus.STOPPED, "", 0)
+    assert [line.received for line in last.inputs] == [1] * 5, "commands that come and go"
 
 
 def test_watching_prints_what_happens_as_it_happens(site):
@@ -268,35 +270,29 @@ GOLDEN = Path(__file__).parents[2] / "support" / "data" / "golden.mcap"
 """fan 1 has an alarm; its twin declares 24 false alarms per fan and day"""
 
 
+OF_GOLDEN = {"site": "golden", "trays": "tray1"}
+
+
 def golden_alarms() -> list[Alarm]:
     return [alarm for each in rare_messages(GOLDEN, "alarm") if isinstance(alarm := each.message, Alarm)]
 
 
 def marked(alarm: Alarm, feedback: Feedback, sequence: int, reason: str) -> Alarm:
     transition = Transition.MARKED_TRUE if feedback == Feedback.TRUE_ALARM else Transition.MARKED_FALSE
-    given = {"feedback": feedback, "feedback_by": "ann", "feedback_reason": reason}
-    return replace(
-        alarm,
-        header=Header("scorer-later", sequence, alarm.header.tray),
-        transition=transition,
-        active=False,
-        operator_name="ann",
-        comment=reason,
-        marked_onset_t_ns=alarm.onset_t_ns,
-        **given,
-    )
+    given = {"feedback": feedback, "feedback_by": "ann", "feedback_reason": reason, "transition": transition}
+    given |= {"active": False, "operator_name": "ann", "comment": reason, "marked_onset_t_ns": alarm.onset_t_ns}
+    return replace(alarm, header=Header("scorer-later", sequence, alarm.header.tray), **given)
 
 
 @pytest.fixture
 def later(tmp_path: Path) -> Path:
     """A recording of the next day, in which an operator changes his mind."""
     (*_, last) = (alarm for alarm in golden_alarms() if alarm.fan == 1)
-    path = tmp_path / "later.mcap"
-    with RecordingWriter(path, {"site": "golden", "trays": "tray1"}) as writer:
-        for number, feedback in enumerate((Feedback.TRUE_ALARM, Feedback.FALSE_ALARM)):
-            message = replace(marked(last, feedback, number, "the door was open"), t_ns=last.t_ns + 10**9 * number)
-            writer.add_message(tray_key("golden", "tray1", "alarm"), message, message.t_ns)
-    return path
+    said = [
+        replace(marked(last, feedback, number, "the door was open"), t_ns=last.t_ns + 10**9 * number)
+        for number, feedback in enumerate((Feedback.TRUE_ALARM, Feedback.FALSE_ALARM))
+    ]
+    return write(tmp_path / "later.mcap", said, OF_GOLDEN, at=attrgetter("t_ns"))
 
 
 def history(*words: object) -> dict[str, Any]:
@@ -316,11 +312,8 @@ def test_the_alarms_of_recordings_have_the_feedback_of_later_ones_and_the_rate_t
     assert (alarm["fan"], alarm["feedback"], before["rate"]["unmarked"]) == (1, "none", 1)
     found = history("--recordings", GOLDEN, later)
     (alarm,) = found["alarms"]
-    assert (alarm["feedback"], alarm["feedback_by"], alarm["feedback_reason"]) == (
-        "false_alarm",
-        "ann",
-        "the door was open",
-    )
+    said = [alarm[name] for name in ("feedback", "feedback_by", "feedback_reason")]
+    assert said == ["false_alarm", "ann", "the door was open"]
     rate = found["rates"]["tray1"]
     days = judged_fan_s() / 86400
     assert rate["fan_hours"] == pytest.approx(24 * days)
@@ -349,10 +342,7 @@ def test_a_gateway_on_this_host_has_kept_the_history(tmp_path: Path) -> None:
 
 
 def test_the_clip_of_an_alarm_gives_no_rate_and_is_no_healthy_running(tmp_path):
-    path = tmp_path / "tray1-1-20270115T080000Z.mcap"
-    with RecordingWriter(path, {"site": "golden", "trays": "tray1", CLIP_KEY: "{}"}) as writer:
-        for alarm in golden_alarms():
-            writer.add_message(tray_key("golden", "tray1", "alarm"), alarm, alarm.t_ns)
+    path = write(tmp_path / "tray1-1.mcap", golden_alarms(), OF_GOLDEN | {CLIP_KEY: "{}"}, at=attrgetter("t_ns"))
     for command in (
         ("alarms", "--history", "--recordings", path),
         ("calibrate", DEMO / "twin.onnx", path, "--false-alarms-per-day", "24", "-o", tmp_path / "limited.onnx"),

@@ -35,6 +35,7 @@ from fantwin.schemas.messages import Raw
 from fantwin.schemas.topics import tray_key
 from fantwin.schemas.units import NS_PER_S
 from tests.support.fantwin_command import as_typed, fantwin
+from tests.support.made_messages import filled
 from tests.support.replay_data import START_NS, raw_of
 from tests.support.running_chain import DEMO
 
@@ -80,14 +81,8 @@ class PlayedSite:
     def sample(self, tray: str) -> Raw:
         level = 0.5 if tray in self.still else LEVELS[int(self.now_s // HELD_S) % len(LEVELS)]
         t_ns = np.array([self.now_s - 0.5, self.now_s]) * NS_PER_S
-        command = np.full((2, 1), level)
-        return Raw(
-            header=Header("acquisition", 0, tray),
-            fans=1,
-            host_receive_t_ns=t_ns.astype(np.int64),
-            command=command,
-            speed_rad_s=900 * command,
-        )
+        columns = {"host_receive_t_ns": t_ns, "command": level, "speed_rad_s": 900 * level}
+        return filled(Raw, 2, 1, header=Header("acquisition", 0, tray), **columns)
 
 
 class Played:

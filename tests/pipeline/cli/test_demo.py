@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -93,15 +94,23 @@ else:
 """
 
 
-def test_a_pipeline_that_does_not_stop_is_one_line_and_is_killed(tmp_path, endpoint, monkeypatch):
-    monkeypatch.setattr(
-        "fantwin.pipeline.selftest.scratch_site.FANTWIN", (sys.executable, "-c", STUBBORN, str(tmp_path))
-    )
+@pytest.fixture
+def run_demo(tmp_path: Path, endpoint: str, monkeypatch: pytest.MonkeyPatch) -> Callable[[str, str], None]:
+    """Runs the demo, whose commands are those of a program instead of fantwin's. argument: of the program."""
+
+    def run(program: str, argument: str) -> None:
+        words = (sys.executable, "-c", program, argument)
+        monkeypatch.setattr("fantwin.pipeline.selftest.scratch_site.FANTWIN", words)
+        overrides = [f"bus.endpoint='{endpoint}'", f"tray.0.port='{tmp_path / 'tray'}'"]
+        _run(load_config(DEMO_FOLDER / "demo.toml", overrides), overrides, tmp_path, Console(file=io.StringIO()))
+
+    return run
+
+
+def test_a_pipeline_that_does_not_stop_is_one_line_and_is_killed(tmp_path, run_demo, monkeypatch):
     monkeypatch.setattr("fantwin.pipeline.cli.watch.demo._STOP_TIMEOUT_S", 0.2)
-    overrides = [f"bus.endpoint='{endpoint}'", f"tray.0.port='{tmp_path / 'tray'}'"]
-    config = load_config(DEMO_FOLDER / "demo.toml", overrides)
     with pytest.raises(UserError, match=r"did not stop within 0\.2 s.*up\.log"):
-        _run(config, overrides, tmp_path, Console(file=io.StringIO()))
+        run_demo(STUBBORN, str(tmp_path))
     assert not is_running(int((tmp_path / "up").read_text()))
 
 
@@ -118,18 +127,15 @@ sys.exit(1)
     ("log", "reason"),
     [
         (
-            "scorer: started\nfantwin: stage recorder cannot write [here]\nrecorded: nothing\n",
-            "stage recorder cannot write",
+            "scorer: started\nfantwin: no room [here]\nrecorded: nothing\n",
+            "the recorder cannot write",
         ),
         ("", "no output"),
     ],
 )
-def test_the_reason_of_a_failure_is_in_the_terminal(tmp_path, endpoint, monkeypatch, log, reason):
-    monkeypatch.setattr("fantwin.pipeline.selftest.scratch_site.FANTWIN", (sys.executable, "-c", FAILING, log))
-    overrides = [f"bus.endpoint='{endpoint}'", f"tray.0.port='{tmp_path / 'tray'}'"]
-    config = load_config(DEMO_FOLDER / "demo.toml", overrides)
+def test_the_reason_of_a_failure_is_in_the_terminal(run_demo, log, reason):
     with pytest.raises(UserError, match=f"^the pipeline did not run to its end: {reason}.*full log: .*up.log"):
-        _run(config, overrides, tmp_path, Console(file=io.StringIO()))
+        run_demo(FAILING, log)
 
 
 def test_a_demo_ignores_the_state_of_an_earlier_one_and_does_not_touch_other_files(tmp_path):

@@ -6,7 +6,7 @@ import json
 import re
 import socket
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing
 from importlib.metadata import PackageNotFoundError
 from pathlib import Path
@@ -44,6 +44,13 @@ def examine(config: Path | None = None, *settings: str) -> tuple[int, dict]:
     return done.exit_code, json.loads(done.stdout)
 
 
+@pytest.fixture
+def demo(port: str, tmp_path: Path) -> Callable[..., tuple[int, dict]]:
+    """Examines the configuration of the demo, with some settings of its own."""
+    settings = (f"tray.0.port='{port}'", f"run_folder='{tmp_path}'")
+    return lambda *more: examine(DEMO / "demo.toml", *settings, *more)
+
+
 def test_an_installation_in_order_is_fine_and_each_package_that_fantwin_needs_is_looked_at(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     code, found = examine()
@@ -55,15 +62,14 @@ def test_an_installation_in_order_is_fine_and_each_package_that_fantwin_needs_is
     assert listed == set(PROJECT["optional-dependencies"]) - {"all", "dev", "bench"}
 
 
-def test_a_bus_that_others_reach_without_certificates_is_a_problem(tmp_path, port):
-    settings = (f"tray.0.port='{port}'", f"run_folder='{tmp_path}'", "bus.endpoint='tcp/0.0.0.0:17447'")
-    code, found = examine(DEMO / "demo.toml", *settings)
+def test_a_bus_that_others_reach_without_certificates_is_a_problem(demo):
+    code, found = demo("bus.endpoint='tcp/0.0.0.0:17447'")
     assert code == 1
     assert [line for line in found["problems"] if "can drive the fans" in line and "--insecure" in line]
 
 
-def test_a_configuration_in_order_can_start(tmp_path, port):
-    code, found = examine(DEMO / "demo.toml", f"tray.0.port='{port}'", f"run_folder='{tmp_path}'")
+def test_a_configuration_in_order_can_start(demo):
+    code, found = demo()
     assert (code, found["problems"]) == (0, [])
     assert {"acquisition/tray1: can start", "twin_integrator: can start"} <= set(found["good"])
 
@@ -82,9 +88,8 @@ def test_a_configuration_in_order_can_start(tmp_path, port):
         ("scorer.alarm_shrae=1", ["scorer.alarm_shrae", "did you mean 'alarm_share'"]),
     ],
 )
-def test_each_problem_is_one_line_that_says_what_to_do(tmp_path, port, setting, words):
-    settings = [f"tray.0.port='{port}'", f"run_folder='{tmp_path}'", setting]
-    code, found = examine(DEMO / "demo.toml", *settings)
+def test_each_problem_is_one_line_that_says_what_to_do(demo, setting, words):
+    code, found = demo(setting)
     assert code == 1
     (line, *again) = found["problems"]
     assert not again or setting.startswith("run_folder")  # the recorder, too, says that it cannot write there
@@ -113,12 +118,11 @@ def test_only_the_lines_of_the_named_trays_are_checked(tmp_path, port):
     assert problems("--tray", "c") == [f"{path}: no tray called 'c'; known: a, b"]
 
 
-def test_row_15_a_foreign_program_at_the_endpoint_is_a_problem(tmp_path, port, monkeypatch):
+def test_row_15_a_foreign_program_at_the_endpoint_is_a_problem(demo, monkeypatch):
     monkeypatch.setattr("fantwin.pipeline.bus.opening.MEETING_LIMIT_S", 0.0)
     with socket.create_server(("127.0.0.1", 0)) as listening:
         endpoint = f"tcp/127.0.0.1:{listening.getsockname()[1]}"
-        settings = [f"tray.0.port='{port}'", f"run_folder='{tmp_path}'", f"bus.endpoint='{endpoint}'"]
-        code, found = examine(DEMO / "demo.toml", *settings)
+        code, found = demo(f"bus.endpoint='{endpoint}'")
     assert code == 1
     assert found["problems"] == [
         f"bus.endpoint = '{endpoint}': the program that listens there is not fantwin, or hangs, so stages cannot "
@@ -126,22 +130,19 @@ def test_row_15_a_foreign_program_at_the_endpoint_is_a_problem(tmp_path, port, m
     ]
 
 
-def test_the_ports_of_the_own_running_site_are_no_problem_and_those_of_a_stranger_are(tmp_path, port, endpoint):
+def test_the_ports_of_the_own_running_site_are_no_problem_and_those_of_a_stranger_are(demo, endpoint):
     with socket.create_server(("127.0.0.1", 0)) as taken, Bus(BusConfig(endpoint=endpoint)) as bus:
         viewer_port = taken.getsockname()[1]
-        settings = [f"tray.0.port='{port}'", f"run_folder='{tmp_path}'", f"bus.endpoint='{endpoint}'"]
-        settings += [
-            f"viewer.grpc_port={viewer_port}",
-            "launcher.stages=['resampler', 'viewer']",
-        ]
-        code, found = examine(DEMO / "demo.toml", *settings)
+        settings = [f"bus.endpoint='{endpoint}'", f"viewer.grpc_port={viewer_port}"]
+        settings.append("launcher.stages=['resampler', 'viewer']")
+        code, found = demo(*settings)
         assert code == 1
         assert f"viewer: viewer.grpc_port: port {viewer_port} on 127.0.0.1 is taken" in found["problems"][0]
         assert f"bus.endpoint {endpoint}: fantwin answers there" in found["good"]
 
         session = Session.of_this_process("viewer", Shard("all", ()), 1, "viewer-all-1")
         bus.declare_alive(session.key("demo"))
-        code, found = examine(DEMO / "demo.toml", *settings)
+        code, found = demo(*settings)
         assert (code, found["problems"]) == (0, [])
         runs = f"viewer: runs already ({session.process})"
         assert {f"bus.endpoint {endpoint}: site 'demo' runs there", runs, "resampler: can start"} <= set(found["good"])
@@ -175,9 +176,9 @@ def test_running_from_files_without_an_installation_is_a_problem(monkeypatch):
     assert found["problems"] == ["fantwin is not installed: in its checkout, pip install -e ."]
 
 
-def test_little_disk_is_a_problem(tmp_path, port, monkeypatch):
+def test_little_disk_is_a_problem(demo, monkeypatch):
     monkeypatch.setattr(module, "_MIN_FREE_BYTES", 1 << 62)
-    _, found = examine(DEMO / "demo.toml", f"tray.0.port='{port}'", f"run_folder='{tmp_path}'")
+    _, found = demo()
     assert "make room" in found["problems"][0]
 
 

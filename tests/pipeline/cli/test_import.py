@@ -9,11 +9,12 @@ import pytest
 from fantwin.pipeline.recordings.reading import read_metadata, read_recording
 from fantwin.pipeline.recordings.runs import read_runs
 from fantwin.pipeline.replay.resolve_config import default_config, first_raw
-from fantwin.schemas.messages import Array, Raw
+from fantwin.schemas.messages import Array
 from fantwin.schemas.tacho import Tacho
 from fantwin.twin.models.physical import PhysicalModel
 from tests.support.fantwin_command import fantwin
 from tests.support.twin_files import write_twin
+from tests.support.written_recordings import raw_columns
 
 
 def measured(folder: Path, rows: int = 1234, start_s: float = 0.0) -> tuple[Path, Array]:
@@ -26,17 +27,6 @@ def measured(folder: Path, rows: int = 1234, start_s: float = 0.0) -> tuple[Path
     return path, values
 
 
-def columns(recording: Path) -> tuple[Array, Array, Array]:
-    messages = [entry.message for entry in read_recording(recording)]
-    assert all(isinstance(message, Raw) for message in messages)
-    raws = [message for message in messages if isinstance(message, Raw)]
-    return (
-        np.concatenate([raw.host_receive_t_ns for raw in raws]),
-        np.concatenate([raw.command for raw in raws]),
-        np.concatenate([raw.speed_rad_s for raw in raws]),
-    )
-
-
 ARGUMENTS = ("--time", "t:s", "--command", "u", "--speed", "y1:rpm", "--speed", "y2:rpm")
 
 
@@ -46,7 +36,7 @@ def test_the_recording_holds_the_numbers_of_the_table(tmp_path):
     result = fantwin("import", path, *ARGUMENTS, "-o", recording)
     assert result.exit_code == 0
     assert result.stdout.startswith(f"{recording}: 1234 samples of 2 fans over 12.3 s")
-    t_ns, command, speed_rad_s = columns(recording)
+    t_ns, command, speed_rad_s = raw_columns(recording)
     np.testing.assert_allclose(t_ns / 1e9, values[:, 0], rtol=0, atol=1e-9)
     np.testing.assert_array_equal(command, values[:, [1, 1]])
     np.testing.assert_allclose(speed_rad_s / (2 * np.pi / 60), values[:, 2:], rtol=1e-14)
@@ -84,7 +74,7 @@ def test_columns_beside_command_and_speed_go_into_the_recording_and_out_into_tab
 def test_json_output_has_the_counts_and_times_before_zero_are_kept(tmp_path):
     path, values = measured(tmp_path, start_s=-5.0)
     fantwin("import", path, *ARGUMENTS, "-o", tmp_path / "r.mcap")
-    np.testing.assert_allclose(columns(tmp_path / "r.mcap")[0] / 1e9, values[:, 0], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(raw_columns(tmp_path / "r.mcap")[0] / 1e9, values[:, 0], rtol=0, atol=1e-9)
     lines = path.read_text().splitlines()
     path.write_text("\n".join([*lines[:100], lines[99], *lines[400:]]) + "\n")
     summary = json.loads(fantwin("import", path, *ARGUMENTS, "-o", tmp_path / "r.mcap", "--force", "--json").stdout)

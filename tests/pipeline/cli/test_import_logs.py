@@ -10,11 +10,11 @@ import pytest
 
 from fantwin.pipeline.recordings.reading import read_recording
 from fantwin.pipeline.recordings.runs import read_runs
-from fantwin.schemas.fields import Array
 from fantwin.schemas.messages import Raw
 from fantwin.schemas.tacho import Tacho
-from tests.support.fantwin_command import error_of, fantwin, usage_error_of
+from tests.support.fantwin_command import error_of, fantwin
 from tests.support.written_logs import write_rosbag, write_ulog
+from tests.support.written_recordings import raw_columns
 
 RPM = 2 * np.pi / 60
 T_S = np.arange(0, 4, 0.02)
@@ -36,15 +36,6 @@ def ulog(folder: Path) -> Path:
     return path
 
 
-def samples(recording: Path) -> tuple[Array, Array, Array]:
-    raws = [entry.message for entry in read_recording(recording) if isinstance(entry.message, Raw)]
-    return (
-        np.concatenate([raw.host_receive_t_ns for raw in raws]),
-        np.concatenate([raw.command for raw in raws]),
-        np.concatenate([raw.speed_rad_s for raw in raws]) / RPM,
-    )
-
-
 def test_ulog_with_commands_held_at_the_times_of_the_readings(tmp_path: Path) -> None:
     recording = tmp_path / "r.mcap"
     words = ("--command", "actuator_outputs.output[*]", "--speed", "esc_status.esc[{fan}].esc_rpm:rpm")
@@ -56,9 +47,9 @@ def test_ulog_with_commands_held_at_the_times_of_the_readings(tmp_path: Path) ->
         in result.stdout
     )
     assert "commands at 250 Hz, speeds at 50 Hz; each speed has the command held then" in result.stdout
-    t_ns, command, speed = samples(recording)
+    t_ns, command, speed_rad_s = raw_columns(recording)
     np.testing.assert_allclose(t_ns / 1e9, T_S + 0.009, atol=1e-9)
-    np.testing.assert_allclose(speed, SPEEDS, rtol=1e-12)
+    np.testing.assert_allclose(speed_rad_s / RPM, SPEEDS, rtol=1e-12)
     held_us = (t_ns // 1000 - 1000) // 4000 * 4000 + 1000  # the last command before the reading
     expected = np.interp(np.minimum(held_us, 3_997_000) / 1e6, T_S, COMMANDS[:, 0])
     np.testing.assert_allclose(command, np.column_stack([expected] * 2), rtol=1e-6)
@@ -68,16 +59,14 @@ def test_ulog_with_commands_held_at_the_times_of_the_readings(tmp_path: Path) ->
     (first, *_) = [entry.message for entry in read_recording(recording)]
     assert isinstance(first, Raw)
     np.testing.assert_allclose(first.supply_voltage_v, [[12.0, 12.1]], rtol=1e-6)
-    np.testing.assert_allclose(samples(recording)[2], SPEEDS, rtol=1e-12)
+    np.testing.assert_allclose(raw_columns(recording)[2] / RPM, SPEEDS, rtol=1e-12)
 
 
 def test_electrical_speeds_and_the_tacho_that_is_declared(tmp_path: Path) -> None:
     path, recording = ulog(tmp_path), tmp_path / "r.mcap"
     words = ("--command", "actuator_outputs.output[*]", "--speed", "esc_status.esc[*].esc_rpm:erpm", "-o", recording)
-    assert "give the magnetic poles of the motor, for example --poles 14" in usage_error_of("import", path, *words)
-    assert "poles come in pairs" in usage_error_of("import", path, *words, "--poles", "13")
     fantwin("import", path, *words, "--poles", 14, "--tacho", "count:window_s=0.02")
-    np.testing.assert_allclose(samples(recording)[2], SPEEDS / 7, rtol=1e-12)
+    np.testing.assert_allclose(raw_columns(recording)[2] / RPM, SPEEDS / 7, rtol=1e-12)
     assert read_runs(recording).tacho == (Tacho(kind="count", window_s=0.02),) * 2
 
 
@@ -91,10 +80,10 @@ def test_a_ros_bag_with_times_of_its_messages(tmp_path: Path, storage: str) -> N
     summary = json.loads(result.stdout)
     assert (summary["samples"], summary["fans"]) == (200, 2)
     assert summary["notes"] == ["/fans/command: messages without a time of their own; that of the bag is used"]
-    t_ns, command, speed = samples(recording)
+    t_ns, command, speed_rad_s = raw_columns(recording)
     np.testing.assert_allclose(t_ns / 1e9, 100 + T_S, atol=1e-9)
     np.testing.assert_array_equal(command, COMMANDS)
-    np.testing.assert_allclose(speed, SPEEDS, rtol=1e-12)
+    np.testing.assert_allclose(speed_rad_s / RPM, SPEEDS, rtol=1e-12)
 
 
 def test_the_fields_are_listed_with_their_rates(tmp_path: Path) -> None:
@@ -106,39 +95,5 @@ def test_the_fields_are_listed_with_their_rates(tmp_path: Path) -> None:
     lines = fantwin("import", path, "--list").stdout.splitlines()
     assert lines[-1].startswith(f"{path}: ULog, {len(found)} fields")
     assert any(line.startswith(field) for line in lines)
-
-
-def test_a_mistake_is_one_line_that_says_what_to_do(tmp_path: Path) -> None:
-    path, out = ulog(tmp_path), ("-o", tmp_path / "r.mcap")
-    speed = "esc_status.esc[*].esc_rpm:rpm"
-    assert "an import needs -o, --command and --speed; --list shows the fields" in usage_error_of("import", path)
-    for words, error in (
-        (("--command", "actuator_output.output[0]", "--speed", speed), "did you mean 'actuator_outputs.output[0]'"),
-        (
-            ("--command", "motor[*]", "--speed", speed),
-            "no column matches motor[*]; it has actuator_outputs.output[0], ",
-        ),
-        (("--command", "actuator_outputs.output[*]", "--speed", "esc_status.esc[*].esc_voltage:V"), "unknown unit 'V'"),
-        (
-            ("--command", "actuator_outputs.output[*]", "--speed", "esc_status.esc[0].esc_rpm"),
-            "give one as --speed, too",
-        ),
-        (
-            ("--command", "actuator_outputs.output[*]", "--speed", speed, "--speed", speed),
-            "give one as --speed, too",
-        ),
-        (("--command", "actuator_outputs.output[*]", "--speed", speed, "--time", "t"), "a ULog has its own times"),
-    ):
-        assert error in error_of("import", path, *words, *out)
     path.write_bytes(path.read_bytes()[:20])
     assert "this ULog has no fields with numbers; is it damaged?" in error_of("import", path, "--list")
-    nested = {f"f{depth}": (f"f{depth + 1}[10] a;", ()) for depth in range(12)}
-    write_ulog(path, {**nested, "f12": ("float a;", ())})
-    assert path.stat().st_size < 500, "a few bytes that name a million million fields"
-    assert "no ULog that can be read: the format" in error_of("import", path, "--list")
-    write_ulog(path, {"a": ("b[2] x;", ()), "b": ("a y;", ())})
-    assert "contains itself" in error_of("import", path, "--list")
-    (tmp_path / "bag").mkdir()
-    (tmp_path / "bag" / "metadata.yaml").write_text("none")
-    assert "no ROS 2 bag that can be read" in error_of("import", tmp_path / "bag", "--list")
-    assert list(tmp_path.glob("*.mcap")) == []

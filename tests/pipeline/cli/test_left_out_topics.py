@@ -33,11 +33,6 @@ def lean(whole: Path) -> Path:
     return whole.with_name("lean.mcap")
 
 
-@pytest.fixture(scope="module")
-def without_raw(whole: Path) -> Path:
-    return whole.with_name("without-raw.mcap")
-
-
 def advice(path: Path, *topics: str) -> str:
     return (
         f"its recorder left out {', '.join(topics)} (recorder.topics): `fantwin replay {path} --offline -o WHOLE.mcap` "
@@ -116,7 +111,8 @@ def test_topics_that_are_not_there_cannot_be_replayed(lean):
         assert error_of("replay", lean, *words) == f"{lean}: {advice(lean, 'grid')}"
 
 
-def test_without_raw_samples_there_is_nothing_to_make_the_rest_of(without_raw, whole):
+def test_without_raw_samples_there_is_nothing_to_make_the_rest_of(whole):
+    without_raw = whole.with_name("without-raw.mcap")
     for words in (("replay", "--offline"), ("report",), ("evaluate", whole.with_name("twin.onnx"))):
         assert error_of(*words, without_raw) == (
             f"{without_raw}: no raw samples in this recording: its recorder left out raw (recorder.topics), and "

@@ -24,6 +24,7 @@ from fantwin.pipeline.cli.in_parallel import RecordingsInParallel
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.learning.training_data import Part, read_recording_data
 from fantwin.twin.evaluation.resampling import thinned
+from fantwin.twin.export.onnx_twin import OnnxTwin
 from tests.support.but_for_times import but_for_times, content_of
 from tests.support.fan_data import published_run
 from tests.support.fantwin_command import error_of, fantwin
@@ -94,6 +95,7 @@ def test_networks_that_are_trained_two_at_a_time_give_the_same_twin(folder: Path
         result = fantwin("train", folder / RECORDINGS[0], *options, "-o", output / "trained.onnx")
         assert result.exit_code == 0, result.output
         assert ("training, 2 networks at a time" in result.stderr) == (jobs == 2)
+        assert OnnxTwin(output / "trained.onnx").card.training.networks == 2
         outcomes.append(outcome_of(result.stdout, output))
     assert outcomes[0] == outcomes[1]
 

@@ -11,7 +11,6 @@ import pytest
 from fantwin.pipeline.bus.rights import SiteRoles
 from fantwin.pipeline.bus.router import open_router
 from fantwin.pipeline.cli.watch import one_stage
-from tests.support.fantwin_command import as_typed
 from tests.support.fantwin_command import fantwin as called
 from tests.support.secured_site import SITE, SecuredSite, free_endpoint
 
@@ -27,17 +26,6 @@ def fewer_rights(site: SecuredSite) -> SiteRoles:
     """The resampler may not publish."""
     roles = dict(site.site.roles)
     return SiteRoles(SITE, {**roles, "resampler": replace(roles["resampler"], writes=())})
-
-
-def test_a_stage_with_a_certificate_of_another_role_ends_with_1_and_one_line(site):
-    site.certificates.show_as("resampler", "viewer")
-    with site.running():
-        done = as_typed("up", "--only", "resampler", "-c", site.config.path)
-    assert done.returncode == 1
-    assert done.stderr.startswith("fantwin: its certificate says 'viewer', which may not publish grid of a"), (
-        done.stderr
-    )
-    assert done.stderr.count("\n") == 1
 
 
 def test_whoever_may_not_command_is_told_the_role_that_may_in_words_of_the_documentation(site):

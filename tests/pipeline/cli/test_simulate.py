@@ -137,28 +137,6 @@ def test_a_signal_completes_the_truth_and_removes_the_link(tmp_path: Path) -> No
     assert not (tmp_path / "tray").is_symlink()
 
 
-def test_unread_samples_are_counted_and_a_later_reader_sees_the_gap(tmp_path: Path) -> None:
-    with simulated(tmp_path) as (stop, _):
-        first = Reader(tmp_path / "tray")
-        first.read_until(10)
-        first.serial.close()
-        threading.Event().wait(1.0)  # nobody reads 100 samples
-        second = Reader(tmp_path / "tray")
-        second.read_until(10)
-        stop.set()
-        second.read_all()
-    truth = truth_of(tmp_path)
-    first_end, second_start, end = (
-        each.sequence for each in (first.samples[-1], second.samples[0], second.samples[-1])
-    )
-    assert first_end is not None
-    assert second_start is not None
-    assert end is not None
-    assert second_start > first_end
-    assert truth["samples_sent"] + truth["samples_unsent"] == end + 1
-    assert truth["samples_unsent"] > 50
-
-
 def test_commands_and_set_points_show_in_the_samples(tmp_path: Path) -> None:
     with simulated(tmp_path, fans=2, overrides=["speed_unit=rpm", "noise_rad_s=0"]) as (stop, _):
         reader = Reader(tmp_path / "tray", fans=2)

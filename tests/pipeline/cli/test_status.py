@@ -127,20 +127,6 @@ def status_words(site: Site) -> list[object]:
     return ["status", "-c", DEMO / "demo.toml", "--set", endpoint, "--set", ONLY_THE_SCORER]
 
 
-def test_row_18_the_loss_of_a_stage_that_was_restarted_while_it_is_watched_does_not_start_at_0_again(site):
-    watcher = site.watcher()
-    follower = replace(
-        HEALTH, header=Header("scorer-all-2", 0, ""), t_ns=HEALTH.t_ns + NS_PER_S, uptime_s=180.0, inputs=(), lost=2
-    )
-    assert view(site, watcher, HEALTH, follower).health.header.producer == "scorer-all-2"
-    assert watcher.losses() == {"scorer": 7 + 2}
-    judge(watcher)
-    (stage,) = document(watcher)["stages"]
-    assert (stage["lost"], stage["uptime_s"]) == (7 + 2, 180.0)
-    (row,) = (line for line in shown(watcher).splitlines() if line.strip().startswith("scorer "))
-    assert (row.split()[2:4], row.split()[-1]) == (["3", "min"], "9")
-
-
 def test_row_10_what_was_refused_in_the_name_of_another_is_said_and_is_no_loss(site):
     watcher = site.watcher()
     refusals = (Counter(name="refused_forged", value=12),)

@@ -111,18 +111,6 @@ def test_ctrl_c_during_training_leaves_no_twin(folder, tmp_path, monkeypatch):
     assert result.stderr.splitlines()[-1].startswith("interrupted: no twin was written")
 
 
-def test_a_model_is_trained_and_its_file_evaluates_to_the_printed_figures(folder, tmp_path):
-    file = tmp_path / "twin.onnx"
-    arguments = ("--validate", folder / "held-out.mcap", "--iterations", 2, "--networks", 2, "--json")
-    result = json.loads(fantwin("train", folder / "healthy.mcap", "--to", 15, *arguments, "-o", file).stdout)
-    assert (result["model"], result["twin"], result["evaluated_on"]) == ("hybrid", str(file), "held-out")
-    evaluated = json.loads(fantwin("evaluate", file, folder / "held-out.mcap", "--json").stdout)
-    for figure in ("rmse", "max_error", "r2", "one_step_rmse", "coverage_2_sigma"):
-        assert evaluated[figure] == pytest.approx(result[figure], rel=1e-4), figure
-    assert evaluated["samples"] == 4000
-    assert OnnxTwin(file).card.training.networks == 2
-
-
 def evaluated(*words: object) -> dict[str, Any]:
     return json.loads(fantwin("evaluate", *words, "--json").stdout)
 

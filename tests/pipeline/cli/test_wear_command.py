@@ -8,24 +8,23 @@ import threading
 from collections.abc import Sequence
 from dataclasses import replace
 from datetime import datetime
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from fantwin.pipeline.recordings.writing import RecordingWriter
 from fantwin.pipeline.runtime.stage import Core
 from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Message, ScorerSnapshot
-from fantwin.schemas.topics import tray_key
 from fantwin.scoring.wear.recorded_wear import shown
 from fantwin.scoring.wear.trend import NS_PER_DAY
 from tests.support.fantwin_command import error_of, fantwin
 from tests.support.running_chain import SITE, TRAY
 from tests.support.running_scorer import RunningScorer
+from tests.support.small_recordings import write
 from tests.support.wear_data import LOSS, START_NS, worn_snapshot
 
-KEY = tray_key(SITE, TRAY, "snapshot")
 FANS, HEALTHY, WORN = 3, 0, 1
 PER_DAY = -LOSS / 30.0
 
@@ -38,10 +37,7 @@ def notes() -> list[ScorerSnapshot]:
 
 
 def recording(path: Path, notes: Sequence[ScorerSnapshot]) -> Path:
-    with RecordingWriter(path, {}) as writer:
-        for memory in notes:
-            writer.add_message(KEY, memory, memory.t_ns)
-    return path
+    return write(path, notes, {"site": SITE}, at=attrgetter("t_ns"))
 
 
 def rows(*words: object) -> dict[int, dict[str, Any]]:

@@ -13,6 +13,7 @@ from fantwin.pipeline.runtime.publishing import PERIOD_NS, ConsumedReports
 from fantwin.schemas.header import Header, InputPosition
 from fantwin.schemas.messages import Consumed, Grid
 from fantwin.schemas.streams import continues
+from tests.support.made_messages import filled
 
 STEP_NS = 1_000_000_000
 
@@ -38,9 +39,7 @@ class Resampler:
     def _puts_out(self, position: InputPosition) -> None:
         header = Header("resampler-1", len(self.grids), "a", position)
         t_ns = np.array([0, 1]) + len(self.grids) * STEP_NS
-        one = np.ones((2, 1))
-        valid = {"valid": one > 0, "invalid_reason": one.astype(np.uint8)}
-        grid = Grid(header=header, fans=1, period_ns=1, t_ns=t_ns, command=one, speed_rad_s=one, **valid)
+        grid = filled(Grid, 2, 1, header=header, period_ns=1, t_ns=t_ns)
         self.grids.append(grid)
         self.reported += self.reports.after("grid", grid)
 

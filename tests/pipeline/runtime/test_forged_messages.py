@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import zenoh
 
-from fantwin.pipeline.bus.identity import SHOWN_S, Forgeries, names_another, new_session_id
+from fantwin.pipeline.bus.identity import SHOWN_S, Forgeries, new_session_id
 from fantwin.pipeline.bus.recovery import recovery_key
 from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.runtime.sessions import Session
@@ -116,14 +116,6 @@ def test_row_10_forged_alarms_do_not_make_the_real_one_a_duplicate(config):
         health = bench.health_with(lambda health: bool(health.inputs))
         bench.end()
     assert [(line.received, line.duplicated) for line in health.inputs if line.key == key] == [(1, 0)]
-
-
-def test_a_name_is_that_of_a_session_only_with_its_id():
-    own, other = new_session_id(), new_session_id()
-    assert not names_another(f"scorer-all-{own}", own)
-    assert names_another(f"scorer-all-{other}", own)
-    assert names_another(f"scorer-all-{other}", ""), "a message without a sender is nobody's"
-    assert not names_another("a program of others", own)
 
 
 def test_a_forged_message_is_named_for_a_while_and_what_cannot_be_read_is_none():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,11 +21,14 @@ HOUR_NS = 3600 * NS_PER_S
 FIRST = JudgedStretch("tray1", "twin", NS_PER_S, NS_PER_S + HOUR_NS, 8 * HOUR_NS, 0.1)
 
 
-def test_a_stretch_that_grows_for_long_does_not_push_out_the_ones_before_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.fixture
+def store(tmp_path: Path) -> Iterator[AlarmHistory]:
+    with closing(AlarmHistory(tmp_path / "alarms.sqlite")) as store:
+        yield store
+
+
+def test_a_stretch_that_grows_for_long_does_not_push_out_the_ones_before_it(store, monkeypatch) -> None:
     monkeypatch.setattr(alarm_rates, "MOST_KEPT", 10)
-    store = AlarmHistory(tmp_path / "alarms.sqlite")
     rates = AlarmRates(store)
     store.add(alarm(0, FIRST.last_t_ns, sequence=1, transition=Transition.RAISED))
     rates.catch_up([FIRST])
@@ -33,11 +38,9 @@ def test_a_stretch_that_grows_for_long_does_not_push_out_the_ones_before_it(
     observed = rates.observed()["tray1"]
     assert observed.since_t_ns == FIRST.first_t_ns and observed.fan_hours == pytest.approx(8.0)
     assert observed.unmarked == 1
-    store.close()
 
 
-def test_alarms_count_from_the_first_to_the_last_score_of_the_twin_in_force(tmp_path: Path) -> None:
-    store = AlarmHistory(tmp_path / "alarms.sqlite")
+def test_alarms_count_from_the_first_to_the_last_score_of_the_twin_in_force(store) -> None:
     rates = AlarmRates(store)
     other = replace(FIRST, twin="former", first_t_ns=FIRST.last_t_ns + HOUR_NS, last_t_ns=FIRST.last_t_ns + 2 * HOUR_NS)
     last = replace(FIRST, first_t_ns=other.last_t_ns + HOUR_NS, last_t_ns=other.last_t_ns + 2 * HOUR_NS)
@@ -47,7 +50,6 @@ def test_alarms_count_from_the_first_to_the_last_score_of_the_twin_in_force(tmp_
         store.add(alarm(0, t_ns, sequence=number, transition=Transition.RAISED))
     rates.catch_up([FIRST, other, last])
     assert rates.observed()["tray1"].unmarked == len(within)
-    store.close()
 
 
 def test_the_time_of_fans_that_are_sampled_slowly_counts() -> None:

@@ -20,17 +20,12 @@ GAP = (FanState.UNKNOWN, InvalidReason.GAP)
 
 def newest(tray: str, t_ns: int, *fans: tuple[Any, ...]) -> Score:
     """A score of one sample; each fan: its state, and its score, or the reason why it has none."""
-    judged = [fan[0] != FanState.UNKNOWN for fan in fans]
-    return Score(
-        header=Header("p", 0, tray),
-        fans=len(fans),
-        period_ns=1,
-        t_ns=np.array([t_ns]),
-        state=np.array([[fan[0] for fan in fans]], np.uint8),
-        invalid_reason=np.array([[0 if ok else fan[1] for ok, fan in zip(judged, fans, strict=True)]], np.uint8),
-        valid=np.array([judged]),
-        score=np.array([[fan[1] if ok else np.nan for ok, fan in zip(judged, fans, strict=True)]], np.float32),
-    )
+    states = [fan[0] for fan in fans]
+    valid = [state != FanState.UNKNOWN for state in states]
+    reasons = [0 if ok else fan[1] for ok, fan in zip(valid, fans, strict=True)]
+    scores = [fan[1] if ok else np.nan for ok, fan in zip(valid, fans, strict=True)]
+    columns = {"state": states, "valid": valid, "invalid_reason": reasons, "score": scores}
+    return made_messages.filled(Score, 1, len(fans), header=Header("p", 0, tray), period_ns=1, t_ns=t_ns, **columns)
 
 
 def alarm(tray: str, fan: int, onset_t_ns: int, **changes: Any) -> Alarm:

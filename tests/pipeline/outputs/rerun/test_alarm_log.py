@@ -8,8 +8,8 @@ import pytest
 
 from fantwin.pipeline.outputs.rerun.alarm_log import LINE_LENGTH, log_line
 from fantwin.schemas.enums import Severity, Statistic, Transition
-from fantwin.schemas.header import Header
-from fantwin.schemas.messages import Alarm, Diagnosis
+from fantwin.schemas.messages import Diagnosis
+from tests.support import made_messages
 
 RAISED, REPUBLISHED = Transition.RAISED, Transition.REPUBLISHED
 DRAG = (Diagnosis(cause="external_torque", probability=0.64),)
@@ -42,8 +42,7 @@ CALM = {"active": False, "severity": Severity.NONE}
 def test_a_line_says_what_happened_and_is_short(
     transition: Transition, more: dict[str, Any], level: str, text: str
 ) -> None:
-    fields = {"fan": 0, "active": True, "severity": Severity.WARNING, "t_ns": 1, "onset_t_ns": 1, "score": 1.73}
-    fields |= {"residual_rad_s": 0.0, "residual_std_rad_s": 0.0, "message": "so " * 99, "transition": transition}
-    line = log_line(Alarm(header=Header("p", 0, "tray1"), **fields | more))
+    fields = {"severity": Severity.WARNING, "score": 1.73, "message": "so " * 99, "transition": transition}
+    line = log_line(made_messages.alarm(0, 1, **fields | more))
     assert line == ("tray1", 1, level, f"fan 0: {text}")
     assert len(line.text) <= LINE_LENGTH

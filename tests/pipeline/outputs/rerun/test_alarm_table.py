@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from itertools import count
 from typing import Any
 
 from fantwin.pipeline.outputs.rerun.alarm_log import ALARMS_LISTED, alarm_table
 from fantwin.pipeline.site.alarm_book import AlarmBook
 from fantwin.schemas.enums import Severity, Statistic, Transition
-from fantwin.schemas.header import Header
-from fantwin.schemas.messages import Alarm, Diagnosis
+from fantwin.schemas.messages import Diagnosis
+from tests.support import made_messages
 from tests.support.score_data import START_NS
 
 
@@ -17,17 +18,11 @@ class Table:
 
     def __init__(self) -> None:
         self._book = AlarmBook()
-        self._count = 0
+        self._numbers = count()
 
     def add(self, fan: int, transition: Transition, **more: Any) -> None:
-        self._count += 1
-        onset_t_ns = START_NS + fan * 1_000_000_000
-        fields = {"active": True, "severity": Severity.ALARM, "t_ns": onset_t_ns, "score": 2.0}
-        fields |= {"residual_rad_s": 0.0, "residual_std_rad_s": 1.0, "statistic": Statistic.DEVIATION, "message": "so"}
-        header = Header("scorer", self._count, "tray1")
-        self._book.add(
-            Alarm(header=header, fan=fan, onset_t_ns=onset_t_ns, transition=transition, **{**fields, **more})
-        )
+        fields = {"sequence": next(self._numbers), "score": 2.0, "statistic": Statistic.DEVIATION, **more}
+        self._book.add(made_messages.alarm(fan, START_NS + fan * 1_000_000_000, transition=transition, **fields))
 
     def text(self) -> str:
         return alarm_table(self._book.all(), START_NS)
@@ -38,9 +33,8 @@ def rows(table: Table) -> list[str]:
 
 
 def test_active_alarms_come_first_with_cause_and_who_has_seen_them_and_those_over_and_seen_are_gone() -> None:
-    table = Table()
+    table = alarms = Table()
     assert rows(table) == [] and table.text().startswith("#### No alarms")
-    alarms = table
     alarms.add(1, Transition.RAISED)
     alarms.add(1, Transition.DIAGNOSED, causes=(Diagnosis(cause="drag_up", probability=0.9),))
     alarms.add(2, Transition.RAISED, severity=Severity.WARNING)
@@ -61,8 +55,7 @@ def test_active_alarms_come_first_with_cause_and_who_has_seen_them_and_those_ove
 
 def test_of_many_alarms_the_newest_are_listed_and_the_rest_counted() -> None:
     table = Table()
-    alarms = table
     for fan in range(ALARMS_LISTED + 5):
-        alarms.add(fan, Transition.RAISED)
+        table.add(fan, Transition.RAISED)
     assert len(rows(table)) == ALARMS_LISTED and rows(table)[0].startswith(f"| **tray1/{ALARMS_LISTED + 4}**")
     assert "and 5 more: `fantwin alarms` lists them" in table.text()

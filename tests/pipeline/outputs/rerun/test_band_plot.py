@@ -8,20 +8,17 @@ from types import MappingProxyType
 
 import matplotlib.image
 import numpy as np
-import pytest
 from matplotlib.colors import to_rgb
 from typer.testing import CliRunner
 
 from fantwin.pipeline.cli.main import app
 from fantwin.pipeline.cli.recordings.view import view
-from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.outputs.rerun import band_plot
-from fantwin.pipeline.outputs.rerun.band_plot import Fault, plot_bands, plot_recording, read_trace
-from fantwin.pipeline.recordings.writing import RecordingWriter
+from fantwin.pipeline.outputs.rerun.band_plot import Fault, plot_bands, read_trace
 from fantwin.pipeline.site.trace import trace_of
 from fantwin.schemas.messages import Alarm, Score
-from fantwin.schemas.topics import tray_key
 from tests.support.score_data import START_NS, made_up_tray
+from tests.support.small_recordings import write
 
 FAULT = Fault("covered-inlet", 2, START_NS + 8_000_000_000, START_NS + 14_000_000_000)
 
@@ -89,26 +86,6 @@ def test_the_command_plots_a_recording_with_its_true_faults(tmp_path: Path) -> N
     assert coverage(output, band_plot.FAULT) > 0.001
 
 
-def test_a_plot_that_cannot_be_drawn_is_a_one_line_error(tmp_path: Path) -> None:
-    scores, _ = made_up_tray(seconds=1)
-    others, _ = made_up_tray(seconds=1, tray="tray2")
-    both = record(tmp_path / "both.mcap", [*scores, *others], [])
-    empty = record(tmp_path / "empty.mcap", [], [])
-    output = tmp_path / "bands.png"
-    for expected, call in {
-        "holds no scores": lambda: plot_recording([empty], output),
-        "choose one with --tray: tray1, tray2": lambda: plot_recording([both], output),
-        "no tray called 'x'; there are tray1, tray2": lambda: plot_recording([both], output, tray="x"),
-        "has no fan 9": lambda: plot_recording([both], output, tray="tray1", fans=[9]),
-        "not a truth file": lambda: plot_recording([both], output, tray="tray1", truth=tmp_path / "none.json"),
-        "cannot write the plot": lambda: plot_recording([both], tmp_path / "bands.wrong", tray="tray1"),
-    }.items():
-        with pytest.raises(UserError, match=expected) as caught:
-            call()
-        assert "\n" not in str(caught.value)
-    assert not output.exists()
-
-
 ZONE_ON_WHITE = tuple(1 - 0.6 * (1 - part) for part in to_rgb(band_plot.ZONE))
 
 
@@ -121,9 +98,4 @@ def coverage(path: Path, color: str | tuple[float, ...]) -> float:
 def record(
     path: Path, scores: Sequence[Score], alarms: Sequence[Alarm], metadata: Mapping[str, str] = MappingProxyType({})
 ) -> Path:
-    with RecordingWriter(path, metadata) as writer:
-        for score in scores:
-            writer.add_message(tray_key("site", score.header.tray, "score"), score, int(score.t_ns[-1]))
-        for alarm in alarms:
-            writer.add_message(tray_key("site", alarm.header.tray, "alarm"), alarm, alarm.t_ns)
-    return path
+    return write(path, [*scores, *alarms], {"site": "site", **metadata}, at=lambda message: int(np.max(message.t_ns)))

@@ -15,9 +15,13 @@ from tests.support.drawn_views import sent
 from tests.support.score_data import START_NS, made_up_tray
 
 
-def test_what_is_written_is_in_the_file_after_a_flush(tmp_path: Path) -> None:
-    path = tmp_path / "view.rrd"
-    path.touch()
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    (tmp_path / "view.rrd").touch()
+    return tmp_path / "view.rrd"
+
+
+def test_what_is_written_is_in_the_file_after_a_flush(path: Path) -> None:
     content = np.random.default_rng(1).bytes(300_000)
     file = ViewFile(path)
     with file.pipe.open("wb", buffering=0) as pipe:
@@ -48,9 +52,7 @@ def test_row_09_a_view_on_a_full_disk_is_reported_and_the_viewer_goes_on_and_end
     assert core.counters()["samples_drawn"] == sum(len(score.t_ns) for score in scores)
 
 
-def test_the_file_ends_before_it_exceeds_its_limit(tmp_path: Path) -> None:
-    path = tmp_path / "view.rrd"
-    path.touch()
+def test_the_file_ends_before_it_exceeds_its_limit(path: Path) -> None:
     file = ViewFile(path, limit_bytes=200_000)
     with file.pipe.open("wb", buffering=0) as pipe:
         file.release_pipe()
