@@ -19,6 +19,7 @@ from fantwin.pipeline.runtime.stage import Context
 from fantwin.pipeline.sources.simulated.device import PseudoTerminal
 from fantwin.schemas.messages import Array, Raw
 from fantwin.schemas.units import NS_PER_S
+from tests.support.made_messages import filled
 from tests.support.running_acquisition import SITE, acquisition, push_config
 
 TOML = """
@@ -43,12 +44,7 @@ def context_of(config: Config) -> Context:
 def line_of(at_s: Array, speed_rad_s: Array, fans: int = 2) -> list[Raw]:
     """A sample at each time, of fans of one speed."""
     return [
-        Raw(
-            fans=fans,
-            host_receive_t_ns=np.array([round((1e9 + second) * NS_PER_S)]),
-            command=np.full((1, fans), 0.5),
-            speed_rad_s=np.full((1, fans), speed),
-        )
+        filled(Raw, 1, fans, host_receive_t_ns=round((1e9 + second) * NS_PER_S), command=0.5, speed_rad_s=speed)
         for second, speed in zip(at_s, speed_rad_s, strict=True)
     ]
 

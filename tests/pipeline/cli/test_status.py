@@ -39,6 +39,7 @@ from tests.support.fantwin_command import error_of
 from tests.support.fantwin_command import fantwin as fantwin_here
 from tests.support.running_chain import DEMO, FANS, SITE, TRAY, RunningCommand, eventually
 from tests.support.score_data import one_sample
+from tests.support.stub_bus import SCORER, StubBus
 
 HEALTH = made_messages.health(
     "scorer",
@@ -54,53 +55,43 @@ HEALTH = made_messages.health(
 ALARM = made_messages.alarm(
     2, 1_700_000_000 * NS_PER_S, producer="scorer-all-1", message="fan 2 is slower than its twin"
 )
+ALARM_KEY = tray_key("s", TRAY, "alarm")
 TRAYS = load_config(DEMO / "demo.toml").trays
 
 
 class Site:
-    """A made-up stage on a real bus, and a watcher in a session of its own."""
+    """A made-up stage on a real bus."""
 
     def __init__(self, endpoint: str) -> None:
-        self.buses = [Bus(BusConfig(endpoint=endpoint)) for _ in range(2)]
-        stage, outside = self.buses
-        self.health = self._publisher(stage, health_key(SITE, "scorer", "all"), "health", HEALTH.header.producer)
-        self.alarm = self._publisher(stage, tray_key(SITE, TRAY, "alarm"), "alarm", ALARM.header.producer)
-        self.score = self._publisher(stage, tray_key(SITE, TRAY, "score"), "score", HEALTH.header.producer)
-        stage.declare_alive(alive_key(SITE, "scorer", "all"))
-        self.outside = outside
+        self.endpoint, self.bus = endpoint, Bus(BusConfig(endpoint=endpoint))
+        self.health = self._publisher(health_key(SITE, "scorer", "all"), "health")
+        self.alarm = self._publisher(tray_key(SITE, TRAY, "alarm"), "alarm")
+        self.score = self._publisher(tray_key(SITE, TRAY, "score"), "score")
+        self.bus.declare_alive(alive_key(SITE, "scorer", "all"))
 
-    @staticmethod
-    def _publisher(bus: Bus, key: str, topic: str, producer: str) -> Publisher:
-        return bus.publisher(key, BY_NAME[topic], type_name(BY_NAME[topic].message), producer)
-
-    def watcher(self) -> SiteWatcher:
-        """One that has heard nothing yet."""
-        return SiteWatcher(self.outside, SITE, trays=TRAYS, has_scores=True)
-
-    def close(self) -> None:
-        for bus in self.buses:
-            bus.close()
+    def _publisher(self, key: str, topic: str) -> Publisher:
+        return self.bus.publisher(key, BY_NAME[topic], type_name(BY_NAME[topic].message), HEALTH.header.producer)
 
 
 @pytest.fixture
 def site(endpoint: str) -> Iterator[Site]:
     site = Site(endpoint)
     yield site
-    site.close()
+    site.bus.close()
 
 
-def view(site: Site, watcher: SiteWatcher, *healths: Health) -> StageView:
-    """The view of the watcher after `healths`, each published until the watcher shows it."""
-    for health in healths:
+@pytest.fixture
+def stub() -> Any:
+    return StubBus()
 
-        def heard(health: Health = health) -> StageView | None:
-            site.health.put(encode(health))
-            (*_, last) = watcher.stages() or [None]
-            return last if last and last.health.t_ns == health.t_ns and last.alive else None
 
-        eventually(heard, "the watcher hears it")
-    (last,) = watcher.stages()
-    return last
+def watching(stub: Any, health: Health) -> SiteWatcher:
+    """A watcher that has heard the health of the scorer, and whoever asks gets the alarms of before."""
+    watcher = SiteWatcher(stub, "s", trays=TRAYS, has_scores=True)
+    stub.show(SCORER)
+    stub.say(health)
+    watcher.ask_for_past_alarms()
+    return watcher
 
 
 def judge(watcher: SiteWatcher, *reasons: InvalidReason) -> None:
@@ -123,23 +114,20 @@ def document(watcher: SiteWatcher) -> Any:
 
 
 def status_words(site: Site) -> list[object]:
-    endpoint = f"bus.endpoint='{site.buses[0]._config.endpoint}'"
+    endpoint = f"bus.endpoint='{site.endpoint}'"
     return ["status", "-c", DEMO / "demo.toml", "--set", endpoint, "--set", ONLY_THE_SCORER]
 
 
-def test_row_10_what_was_refused_in_the_name_of_another_is_said_and_is_no_loss(site):
-    watcher = site.watcher()
+def test_row_10_what_was_refused_in_the_name_of_another_is_said_and_is_no_loss(stub):
     refusals = (Counter(name="refused_forged", value=12),)
-    view(site, watcher, replace(HEALTH, inputs=(), counters=refusals, lost=0))
+    watcher = watching(stub, replace(HEALTH, inputs=(), counters=refusals, lost=0))
     assert "scorer: refused: 12 messages in the name of another session\n" in shown(watcher)
     assert watcher.losses() == {"scorer": 0}
 
 
-def test_stages_rates_losses_problems_and_alarms_from_before_the_watcher_came_are_shown(site):
-    watcher = site.watcher()
-    site.alarm.put(encode(ALARM))
-    view(site, watcher, replace(HEALTH, problem="the line is silent"))
-    watcher.ask_for_past_alarms()
+def test_stages_rates_losses_problems_and_alarms_from_before_the_watcher_came_are_shown(stub):
+    stub.kept = [(ALARM_KEY, encode(ALARM))]
+    watcher = watching(stub, replace(HEALTH, problem="the line is silent"))
     judge(watcher)
     reported = document(watcher)
     (stage,), (alarm,) = reported["stages"], reported["alarms"]
@@ -151,7 +139,7 @@ def test_stages_rates_losses_problems_and_alarms_from_before_the_watcher_came_ar
     assert "scorer: the line is silent" in shown(watcher)
 
 
-def test_alarms_are_shown_with_their_states_and_probable_causes(site):
+def test_alarms_are_shown_with_their_states_and_probable_causes(stub):
     over = {"active": False, "acknowledged": True}
     shelved = {"fan": 4, "onset_t_ns": 0, "severity": Severity.NONE, "shelved_until_t_ns": 2**63 - 1, **over}
     cause = Diagnosis(cause="drag_up", probability=0.87)
@@ -164,10 +152,8 @@ def test_alarms_are_shown_with_their_states_and_probable_causes(site):
         )
     ):
         header, changes = Header("scorer-all-1", number, TRAY), {"t_ns": ALARM.t_ns + number}
-        site.alarm.put(encode(replace(ALARM, header=header, **changes | more)))
-    watcher = site.watcher()
-    view(site, watcher, HEALTH)
-    watcher.ask_for_past_alarms()
+        stub.kept.append((ALARM_KEY, encode(replace(ALARM, header=header, **changes | more))))
+    watcher = watching(stub, HEALTH)
     judge(watcher, *[InvalidReason.NONE] * 2, InvalidReason.STOPPED)
     text = " ".join(shown(watcher).split())
     assert "fan 2: active, acknowledged, now stopped by its command, more drag 87 %; " in text
@@ -179,9 +165,8 @@ def test_alarms_are_shown_with_their_states_and_probable_causes(site):
     assert (reported[3]["retained"], reported[4]["presented"]) == (False, False)
 
 
-def test_row_01_a_missing_stage_has_a_row_and_no_alarms_is_not_said_while_a_fan_is_not_judged(site):
-    watcher = site.watcher()
-    view(site, watcher, HEALTH)
+def test_row_01_a_missing_stage_has_a_row_and_no_alarms_is_not_said_while_a_fan_is_not_judged(stub):
+    watcher = watching(stub, HEALTH)
     judge(watcher)
     watcher.model._fleet._judged_s[0] = -np.inf
     judge(watcher, InvalidReason.NO_SPEED)
@@ -193,8 +178,8 @@ def test_row_01_a_missing_stage_has_a_row_and_no_alarms_is_not_said_while_a_fan_
     assert document(watcher)["not_judged"] == [{"tray": TRAY, "fans": [0], "why": "no speed"}]
 
 
-def test_a_site_without_a_scorer_is_well_and_does_not_say_that_there_are_no_alarms(site):
-    watcher = site.watcher()
+def test_a_site_without_a_scorer_is_well_and_does_not_say_that_there_are_no_alarms(stub):
+    watcher = SiteWatcher(stub, "s", trays=TRAYS, has_scores=True)
     recorder = replace(HEALTH, stage="recorder", header=Header("recorder-all-1", 0, ""))
     line = Input(key="fantwin/demo/tray1/raw", producer="p", received=9, missing=3, duplicated=0, next_sequence=12)
     state = StageState("recorder", Word.OK, "", StageView(replace(recorder, inputs=(line,)), None, alive=True), True)
@@ -209,13 +194,10 @@ def test_a_site_without_a_scorer_is_well_and_does_not_say_that_there_are_no_alar
     assert "no alarms" not in text
 
 
-def test_a_stage_that_vanished_is_shown_as_gone_and_without_stages_no_table_and_alarms_are_unknown(site):
-    watcher = site.watcher()
-    view(site, watcher, HEALTH)
-    site.buses[0].close()
-    eventually(lambda: not watcher.stages()[0].alive, "the watcher sees it go")
-    gone = shown(watcher)
-    empty = shown(site.watcher())
+def test_a_stage_that_vanished_is_shown_as_gone_and_without_stages_no_table_and_alarms_are_unknown(stub):
+    watcher = watching(stub, HEALTH)
+    stub.show(SCORER, alive=False)
+    gone, empty = shown(watcher), shown(SiteWatcher(stub, "s", trays=TRAYS, has_scores=True))
     assert "gone" in gone and "stages" not in empty
     for text in (gone, empty):
         assert "no stage of site 'demo' answers at tcp/" in text
