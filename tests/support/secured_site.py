@@ -15,9 +15,8 @@ from fantwin.pipeline.bus.router import open_router
 from fantwin.pipeline.bus.settings import Settings
 from fantwin.pipeline.config.loading import parse_config
 from fantwin.pipeline.config.settings import Config
-from fantwin.schemas.topics import alive_key, rights_key
+from fantwin.schemas.topics import rights_key
 from tests.support.ports import free_port
-from tests.support.running_chain import eventually
 from tests.support.site_certificates import SiteCertificates
 
 SITE, TRAYS = "site", ("a", "b")
@@ -87,12 +86,6 @@ class SecuredSite:
             session = self.sessions[role] = zenoh.open(settings.config)
             self._stack.callback(session.close)
         return self.sessions[role]
-
-    def sees(self, stage: str) -> bool:
-        """Whether a process of a stage comes to be on the bus."""
-        key = alive_key(SITE, stage, "all")
-        liveliness = self.session("viewer").liveliness()
-        return eventually(lambda: [reply for reply in liveliness.get(key) if reply.ok], f"{stage} is there")
 
     def flush(self, role: str) -> None:
         """Return when the router has handled all that this session has sent: a connection keeps the order."""

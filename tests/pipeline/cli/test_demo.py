@@ -128,7 +128,7 @@ sys.exit(1)
     [
         (
             "scorer: started\nfantwin: no room [here]\nrecorded: nothing\n",
-            "the recorder cannot write",
+            "no room",
         ),
         ("", "no output"),
     ],
