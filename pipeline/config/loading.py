@@ -291,7 +291,7 @@ def _problem(found: ErrorDetails, model: type[BaseModel], section: str) -> str:
     if found["type"] == "missing":
         return f"{where!r} is missing"
     message = found["msg"].removeprefix("Value error, ")
-    may_be_secret = str(found["loc"][-1]) == "url"  # somebody has written a password into it
+    may_be_secret = found["loc"][-1:] == ("url",)  # somebody has written a password into it
     given = "" if may_be_secret or isinstance(found["input"], dict) else f" = {_shown(found['input'])}"
     return f"{where}{given}: {message[0].lower()}{message[1:]}"
 
