@@ -1,7 +1,7 @@
 """Gateway: the web server of a site: operators' page, API, live events and metrics (docs/how-to/gateway.md).
 
 Reads `score`, `alarm`, `twin`, `health`, and `snapshot` for the wear, and writes `request`. One core serves all trays.
-With many fans, a few samples a second of each tray are decoded, and all samples of those trays that somebody looks at.
+With many fans, about one score a second of each tray is read, and all of those trays that somebody looks at.
 
 The server runs in a thread of its own: it reads what the core has collected, and leaves requests for the core to send.
 """
@@ -28,14 +28,16 @@ from fantwin.pipeline.site.request_desk import RequestDesk
 from fantwin.pipeline.site.site_core import SiteCore
 from fantwin.pipeline.site.site_json import alarm_json, curves_json, fleet_json, stages_json
 from fantwin.pipeline.site.site_model import SiteModel
+from fantwin.schemas.blocks import can_join, join
 from fantwin.schemas.envelope import Envelope
-from fantwin.schemas.messages import Alarm, Message
+from fantwin.schemas.messages import Alarm, Message, Score
 from fantwin.schemas.units import NS_PER_S
 
 if TYPE_CHECKING:
     from fantwin.pipeline.certificates import Certificate
     from fantwin.pipeline.outputs.web.access import Access
 
+SAMPLES_PERIOD_NS = NS_PER_S // 5
 FLEET_PERIOD_NS = NS_PER_S
 STAGES_PERIOD_NS = 2 * NS_PER_S
 
@@ -55,17 +57,26 @@ class GatewayCore(SiteCore):
         """certificate: with which the server shows who it is; None: it serves http."""
         super().__init__(model, desk)
         self._feed, self._server, self._access, self._certificate = feed, server, access, certificate
-        self._fleet_ns = self._stages_ns = 0
+        self._fleet_ns = self._stages_ns = self._samples_ns = 0
+        self._scores: dict[str, list[Score]] = {}
+        """by tray: those that are to be sent to the pages that show one of its fans; they differ in samples only"""
 
     def add_score(self, envelope: Envelope) -> None:
-        """Keep it, and send it to the pages that show one of its fans."""
+        """Keep it, also for the pages that show one of its fans."""
         score = self._model.add_score(envelope, every_s=self._every_s)
-        tray = self._model.tray(envelope.header.tray)
-        if score is None or tray is None:
+        name = envelope.header.tray
+        if score is None or name not in self._feed.looked_at:
             return
-        for name, fan in self._feed.looked_at():
-            if name == tray.name:
-                self._feed.publish("samples", curves_json(curves_of(score, fan), tray), about=(name, fan))
+        scores = self._scores.setdefault(name, [])
+        if scores and not can_join(scores[0], score):
+            self._send_samples(name)
+        self._scores.setdefault(name, []).append(score)
+
+    def _send_samples(self, name: str) -> None:
+        tray, score = self._model.tray(name), join(self._scores.pop(name))
+        assert tray, "only scores of known trays are kept"
+        for fan in self._feed.looked_at.get(name, ()):
+            self._feed.publish("samples", curves_json(curves_of(score, fan), tray), about=(name, fan))
 
     def add_alarm(self, alarm: Alarm) -> None:
         """Keep it, and send a transition to all pages."""
@@ -76,8 +87,12 @@ class GatewayCore(SiteCore):
             self._feed.publish("alarm", alarm_json(current) | {"now": self._model.words_now([fan])[0]})
 
     def tick(self, now_ns: int) -> Sequence[Message]:
-        """Send the pages the state of the fleet, and the scorers what operators ask."""
+        """Send the pages samples and the state of the fleet, and the scorers what operators ask."""
         requests = super().tick(now_ns)
+        if abs(now_ns - self._samples_ns) >= SAMPLES_PERIOD_NS:
+            self._samples_ns = now_ns
+            for name in list(self._scores):
+                self._send_samples(name)
         if abs(now_ns - self._fleet_ns) >= FLEET_PERIOD_NS:
             self._fleet_ns = now_ns
             if self._feed.readers:
@@ -97,9 +112,9 @@ class GatewayCore(SiteCore):
         """Requests sent, pages that are open, and what could not be shown."""
         return {"pages_open": self._feed.readers, **super().counters()}
 
-    def needs_score(self, tray: str) -> bool:
-        """Whether the score of a tray that has arrived is to be decoded: all, of a tray that somebody looks at."""
-        return super().needs_score(tray) or any(name == tray for name, _ in self._feed.looked_at())
+    def wants(self, tray: str) -> bool:
+        """Whether the next score of a tray is to be decoded: all, of a tray that somebody looks at."""
+        return tray in self._feed.looked_at or super().wants(tray)
 
     def problem(self) -> str:
         """Problem of the server, its certificate, the users and the history."""

@@ -111,9 +111,14 @@ class Bus:
         self._claims.append(("declare_queryable", recovery_key(key, producer)))
         return Publisher(self._session, key, topic, encoding, producer, self._kept_bytes)
 
-    def subscribe(self, key_expression: str, on_message: Callable[[str, bytes], None]) -> Callable[[], None]:
+    def subscribe(
+        self,
+        key_expression: str,
+        on_message: Callable[[str, bytes], None],
+        is_wanted: Callable[[], bool] = lambda: True,
+    ) -> Callable[[], None]:
         """Call `on_message(key, payload)` for what other sessions publish, from a thread of the bus. Returns what ends
-        that.
+        that. A message that comes while `is_wanted` says no is not read.
 
         While it blocks, publishers wait. Messages of one session arrive in the order of publishing, over all keys. A
         message that is larger than any of its topic is refused, and counted in `refused_too_large`; one in the name of
@@ -122,6 +127,8 @@ class Bus:
         limit = largest_bytes(key_expression)
 
         def receive(sample: zenoh.Sample) -> None:
+            if not is_wanted():
+                return
             if len(sample.payload) > limit:
                 self.refused_too_large += 1
                 return

@@ -7,8 +7,9 @@ how much of each sequence there should be, and which producers there are.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 
 from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.config.roles import roles_of
@@ -55,6 +56,7 @@ class Receiver:
         shard: the trays of the process.
         producer: its name; its own messages are not taken.
         sessions, clock, health: what is received changes them.
+        wants: whether a core needs the next message of a tray on an undecoded topic.
     """
 
     stage: Stage
@@ -67,6 +69,7 @@ class Receiver:
     clock: StageClock
     health: HealthBuilder
     due: DueMessages
+    wants: Callable[[str], bool]
     counts: Counter[str] = field(default_factory=Counter)
     """of messages that could not be taken, by reason"""
 
@@ -79,19 +82,21 @@ class Receiver:
         self._unreadable: Counter[str] = Counter()
         """by key, the number of messages that cannot be read; at most MOST_UNREADABLE_KEYS keys"""
         self._recovery = Recovery(self.bus, self.inbox, self.bus.answer_timeout_s, only_rare=stage.may_drop)
-        self.tracker = SequenceTracker(self._recovery.ask, sessions=self.sessions)
         reads = stage.reads_as_configured(config)
         self.keys = {tray_key(config.site, tray, topic) for topic in reads if topic != "health" for tray in shard.trays}
         """all that the stage reads, health apart"""
-        self._unhurried = {key for key in self.keys if topic_of(key).name in stage.undecoded}
+        self._undecoded = {key for key in self.keys if topic_of(key).name in stage.undecoded}
+        self.tracker = SequenceTracker(self._recovery.ask, sessions=self.sessions, sampled=self._undecoded)
         main = {tray_key(config.site, tray, topic): tray for topic in stage.reads[:1] for tray in shard.trays}
         self._silences = Silences(main, self.sessions)
 
     def start(self, *, follows_clock: bool) -> None:
         """Subscribe to what the stage reads, to health, to who is there and, if it follows them, to the clocks of the
         trays."""
-        for key in sorted(self.keys):
+        for key in sorted(self.keys - self._undecoded):
             self.bus.subscribe(key, self.on_message)
+        for key in sorted(self._undecoded):
+            self.bus.subscribe(key, self.on_message, partial(self.wants, tray_of(key)))
         if follows_clock:
             for tray in self.shard.trays:
                 self.bus.subscribe(tray_key(self._site, tray, "clock"), self.on_message)
@@ -101,7 +106,7 @@ class Receiver:
 
     def on_message(self, key: str, payload: bytes) -> None:
         """A message has come, in a thread of the bus: put it into the inbox."""
-        is_urgent = not (self._is_patient or key in self._unhurried)
+        is_urgent = not (self._is_patient or key in self._undecoded)
         self.inbox.put(FromBus(key, payload, HOST_CLOCK.now_ns()), is_urgent=is_urgent)
 
     def _on_health(self, key: str, payload: bytes) -> None:

@@ -125,6 +125,7 @@ class Runner:
             clock=self._clock,
             health=self._health,
             due=self._due,
+            wants=lambda tray: self._parts[tray if tray in self._parts else ""].core.wants(tray),
         )
         self._tracker = self._receiver.tracker
         self._signs_of_life = SignsOfLife.from_environment()

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
 from typing import TypeAlias
@@ -197,9 +197,17 @@ class SequenceTracker:
     counted.
     """
 
-    def __init__(self, ask: Ask, now_s: Callable[[], float] = time.monotonic, sessions: Sessions | None = None) -> None:
-        """sessions: the stages that are alive."""
+    def __init__(
+        self,
+        ask: Ask,
+        now_s: Callable[[], float] = time.monotonic,
+        sessions: Sessions | None = None,
+        sampled: Collection[str] = (),
+    ) -> None:
+        """sessions: the stages that are alive. sampled: keys of which some messages are left out, so that a gap is no
+        loss."""
         self._ask = ask
+        self._sampled = frozenset(sampled)
         self._now_s = now_s
         self._sessions = sessions or Sessions()
         self._streams = TrackedStreams(now_s, self._sessions)
@@ -218,6 +226,8 @@ class SequenceTracker:
             return []
         waiting = stream.waiting
         if waiting is None:
+            if envelope.key in self._sampled:
+                stream.next_sequence = max(envelope.header.sequence, stream.next_sequence or 0)
             return self._take(stream, envelope)
         waiting.hold(envelope)
         if len(waiting.held) > MOST_HELD_MESSAGES or waiting.held_bytes > MOST_HELD_BYTES:
@@ -234,7 +244,7 @@ class SequenceTracker:
     def reconcile(self, health: Health, keys: Iterable[str]) -> list[Envelope]:
         """Request messages on `keys` that a producer reports as published and that never arrived. On a topic with few
         messages no next message would show the gap."""
-        wanted, due = set(keys), []
+        wanted, due = set(keys) - self._sampled, []
         for (key, producer), published in output_streams(health).items():
             stream = self._streams.heard(key, producer) if key in wanted else None
             if stream is None or stream.waiting:

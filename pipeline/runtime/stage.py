@@ -98,6 +98,11 @@ class Core(Protocol):
         """What the core works with and has done, a line each, for people; nothing that is wrong."""
         return ()
 
+    def wants(self, tray: str) -> bool:
+        """Whether the next message of a tray on an `undecoded` topic is needed: if not, it is not read, and is no loss.
+        Called for each message that comes, in a thread of the bus."""
+        return True
+
     def accepts(self) -> AcceptedSamples | None:
         """What a client may push to it; None: nothing."""
         return None
@@ -222,8 +227,8 @@ class Stage:
         build: builds the core, and its source if it has one.
         core_per_tray: a core for each tray, or one core that serves all trays of the process.
         wants_envelopes: whether `step` is given envelopes instead of messages.
-        undecoded: topics whose messages `step` is given as envelopes, of which only the header has been decoded: for a
-            core that looks into few of them, at the next tick.
+        undecoded: topics whose messages `step` is given as envelopes, of which only the header has been decoded, at the
+            next tick, and of which a core may leave out what it does not want (`Core.wants`).
         is_patient: nobody waits for what it does with a message: messages are taken at the next tick, together.
         joint: for cores that process the blocks of several trays in one pass; None: each tray alone.
         check: lists, without side effects, what would keep the stage from working (a missing port, a twin that

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -49,10 +50,10 @@ class Curves:
     channels: tuple[str, ...] = ()
 
 
-def curves_of(score: Score, fan: int, rows: slice = slice(None)) -> Curves:
+def curves_of(score: Score, fan: int) -> Curves:
     """Those of a score with `COLUMNS`."""
     channels = channels_of(score)
-    return Curves(score.t_ns[rows], values_of(score, channels, rows)[:, fan], channels)
+    return Curves(score.t_ns, values_of(score, channels, np.s_[:, fan]), channels)
 
 
 def channels_of(score: Score) -> tuple[str, ...]:
@@ -72,7 +73,7 @@ class FanHistory:
         a replay that begins again, empties the ring."""
         ring = self._rings[score.header.tray]
         ring.have(channels_of(score))
-        ring.add(int(score.t_ns[-1]), values_of(score, ring.channels, slice(-1, None))[0])
+        ring.add(int(score.t_ns[-1]), values_of(score, ring.channels, -1))
 
     def of(self, tray: str, fan: int, since_t_ns: int) -> Curves:
         """What is kept of a fan, oldest first."""
@@ -110,21 +111,24 @@ class _Ring:
         return Curves(self._t_ns[order], self._values[order, fan], self.channels)
 
 
-def values_of(score: Score, channels: Sequence[str], rows: slice = slice(None)) -> Array:
-    """The curves of all fans in a score with `COLUMNS`, (n, fans, len(CURVES) + len(channels)) float32."""
-    valid = score.valid[rows]
+def values_of(score: Score, channels: Sequence[str], at: Any) -> Array:
+    """The curves in a score with `COLUMNS`, (..., len(CURVES) + len(channels)) float32.
+
+    at: the samples and fans, as an index of its columns (n, fans).
+    """
+    valid = score.valid[at]
     unknown = np.full(valid.shape, np.nan)
 
     def judged(values: Array) -> Array:
-        return np.where(valid, values[rows], np.nan)
+        return np.where(valid, values[at], np.nan)
 
     columns = (
-        score.measured_speed_rad_s[rows],
+        score.measured_speed_rad_s[at],
         judged(score.predicted_speed_rad_s),
         judged(np.sqrt(score.band_variance)),
         judged(score.torque_balance_command) if len(score.torque_balance_command) else unknown,
         judged(score.score) if len(score.score) else unknown,
-        score.command[rows],
-        *(values[rows] if len(values := getattr(score, name)) else unknown for name in channels),
+        score.command[at],
+        *(values[at] if len(values := getattr(score, name)) else unknown for name in channels),
     )
     return np.stack(columns, axis=-1).astype(np.float32)

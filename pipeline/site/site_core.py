@@ -18,8 +18,8 @@ from fantwin.schemas.units import NS_PER_S
 ALL_SAMPLES = 64
 """number of fans up to which all samples are kept; of a larger site, some of each tray"""
 SILENCE_PERIOD_NS = NS_PER_S
-SAMPLED_S = 1.0
-"""time between two scores of a tray of a larger site that are decoded and kept"""
+SAMPLED_S = 0.9
+"""least time between two scores of a tray of a larger site that are read: where one comes each second, it is read"""
 
 
 class SiteCore(Core):
@@ -41,7 +41,7 @@ class SiteCore(Core):
         if tray is None:
             self._counts["unknown_tray"] += 1
         elif isinstance(item, Envelope):
-            if self.needs_score(tray.name):
+            if self.wants(tray.name):
                 self.add_score(item)
         elif isinstance(item, Score):
             raise TypeError("a stage of a SiteCore declares undecoded=('score',)")
@@ -84,8 +84,8 @@ class SiteCore(Core):
         """Problem of the history; empty if all is well."""
         return self._model.problem()
 
-    def needs_score(self, tray: str) -> bool:
-        """Whether the score of a tray that has arrived is to be decoded."""
+    def wants(self, tray: str) -> bool:
+        """Whether the next score of a tray is to be decoded."""
         return self._model.wants_score(tray, self._every_s)
 
     @abstractmethod

@@ -22,7 +22,7 @@ from fantwin.pipeline.site.alarm_book import AlarmBook
 from fantwin.pipeline.site.alarm_history import AlarmHistory
 from fantwin.pipeline.site.alarm_rates import LEARNED, AlarmRates, JudgedTime
 from fantwin.pipeline.site.fan_history import COLUMNS, Curves, FanHistory, channels_of, values_of
-from fantwin.pipeline.site.fleet import Fan, FanGroup, FanNow, Fleet, last_sample
+from fantwin.pipeline.site.fleet import IS_AT_REST, Fan, FanGroup, FanNow, Fleet, last_sample
 from fantwin.pipeline.site.stage_states import HeardHealth, StageState, stage_states
 from fantwin.schemas.codec import CodecError, decode
 from fantwin.schemas.enums import Feedback, InvalidReason, StageStatus, Transition
@@ -30,7 +30,6 @@ from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.health import Health
 from fantwin.schemas.messages import Alarm, Array, ModelCard, Score, ScorerSnapshot
 from fantwin.scoring.alarms.current_alarms import CurrentAlarm
-from fantwin.scoring.alarms.unscored_monitor import JUDGED_AT_REST
 from fantwin.scoring.calibration.calibration import ObservedRate, declared_per_day
 from fantwin.scoring.wear.recorded_wear import wear_in, wear_rows
 
@@ -273,8 +272,8 @@ class SiteModel:
             TrayNow(
                 tray,
                 int(score.t_ns[-1]),
-                values_of(score, channels_of(score))[-1],
-                score.valid[-1] | np.isin(score.invalid_reason[-1], JUDGED_AT_REST),
+                values_of(score, channels_of(score), -1),
+                score.valid[-1] | IS_AT_REST[score.invalid_reason[-1]],
                 score.invalid_reason[-1],
                 is_heard,
                 channels_of(score),

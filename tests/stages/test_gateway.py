@@ -116,8 +116,9 @@ def test_live_events_bring_an_alarm_and_the_samples_of_the_fan_that_is_looked_at
                 return json.loads(stream.readline().decode().removeprefix("data: "))
 
     assert event("fleet")["counts"] == {"in_alarm": 0, "suspect": 0, "not_judged": 1, "silenced": 0}
-    gateway.feed(score(1.0), alarm())
+    gateway.feed(score(1.0))
     assert event("samples")["measured"] == [1000.0] * 5
+    gateway.feed(alarm())
     assert event("alarm")["fan"] == 2
     connection.close()
 

@@ -26,7 +26,7 @@ class StubBus:
         self.watched: dict[str, Callable[[str, bool], None]] = {}
         self.kept: list[tuple[str, bytes]] = []
 
-    def subscribe(self, key: str, on_message: Callable[[str, bytes], None]) -> None:
+    def subscribe(self, key: str, on_message: Callable[[str, bytes], None], _is_wanted: object = None) -> None:
         self.subscribers[key] = on_message
 
     def watch_alive(self, key: str, on_change: Callable[[str, bool], None]) -> None:

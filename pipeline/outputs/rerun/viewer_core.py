@@ -93,8 +93,8 @@ class ViewerCore(SiteCore):
         self._lines.append(log_line(alarm))
         self._model.add_alarm(alarm)
 
-    def needs_score(self, tray: str) -> bool:
-        """Whether the score of a tray that has arrived is to be decoded: all, where fans of the tray are drawn."""
+    def wants(self, tray: str) -> bool:
+        """Whether the next score of a tray is to be decoded: all, where fans of the tray are drawn."""
         is_drawn = not self._fleet or bool(self._views[tray].fans)
         return is_drawn or self._model.wants_score(tray, ADDED_EVERY_NS / NS_PER_S)
 

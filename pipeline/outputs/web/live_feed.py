@@ -13,9 +13,10 @@ import gzip
 import json
 import threading
 import time
-from collections.abc import AsyncIterator, Callable, Iterator, Sequence
+from collections.abc import AsyncIterator, Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from itertools import chain
 from typing import Any
 
 from starlette.requests import Request
@@ -70,7 +71,6 @@ FanName = tuple[str, int]
 
 @dataclass(eq=False)
 class _Reader:
-    fan: FanName | None
     waiting: asyncio.Queue[bytes] = field(default_factory=lambda: asyncio.Queue(MOST_WAITING))
     has_missed: bool = False
 
@@ -96,7 +96,10 @@ class LiveFeed:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._readers: list[_Reader] = []
+        self._readers: dict[FanName | None, list[_Reader]] = {}
+        """by the fan that they look at"""
+        self.looked_at: Mapping[str, Collection[int]] = {}
+        """the fans that somebody looks at, by tray; replaced as a whole"""
         self._loop: asyncio.AbstractEventLoop | None = None
         """of the server, in which all readers are"""
         self._ended = False
@@ -104,25 +107,21 @@ class LiveFeed:
     def publish(self, name: str, data: Any, about: FanName | None = None) -> None:
         """Send an event to all readers, or to those that look at one fan."""
         with self._lock:
-            readers = [each for each in self._readers if about is None or each.fan == about]
+            readers = self._all() if about is None else list(self._readers.get(about, ()))
         if readers:
             self._put(readers, encoded(name, data))
 
     @property
     def readers(self) -> int:
         """How many there are."""
-        return len(self._readers)
-
-    def looked_at(self) -> set[FanName]:
-        """The fans that somebody looks at."""
         with self._lock:
-            return {each.fan for each in self._readers if each.fan is not None}
+            return len(self._all())
 
     def end(self) -> None:
         """No more events: the readers are sent away."""
         with self._lock:
             self._ended = True
-            readers = list(self._readers)
+            readers = self._all()
         self._put(readers, b"")
 
     async def events(self, first: bytes, fan: FanName | None, may_read: Callable[[], bool]) -> AsyncIterator[bytes]:
@@ -161,17 +160,29 @@ class LiveFeed:
         if readers and self._loop:
             self._loop.call_soon_threadsafe(put)
 
+    def _all(self) -> list[_Reader]:
+        return list(chain.from_iterable(self._readers.values()))
+
     @contextmanager
     def _joined(self, fan: FanName | None) -> Iterator[_Reader]:
-        reader = _Reader(fan)
+        reader = _Reader()
         with self._lock:
             self._loop = asyncio.get_running_loop()
-            self._readers.append(reader)
+            self._readers.setdefault(fan, []).append(reader)
+            self._note_looked_at()
         try:
             yield reader
         finally:
             with self._lock:
-                self._readers.remove(reader)
+                self._readers[fan].remove(reader)
+                self._note_looked_at()
+
+    def _note_looked_at(self) -> None:
+        self._readers = {fan: readers for fan, readers in self._readers.items() if readers}
+        found: dict[str, list[int]] = {}
+        for tray, number in filter(None, self._readers):
+            found.setdefault(tray, []).append(number)
+        self.looked_at = found
 
 
 class EventStream(StreamingResponse):

@@ -209,6 +209,18 @@ def test_a_topic_declared_undecoded_reaches_the_core_with_its_header_only_and_in
     assert all(counter.name != "undecodable" for counter in bench.end().counters)
 
 
+def test_what_a_core_does_not_want_of_an_undecoded_topic_is_not_read_and_is_no_loss(config, monkeypatch):
+    holder, answers = Holder(), iter((True, False, True))
+    monkeypatch.setattr(holder, "wants", lambda _tray: next(answers))
+    bench = Bench(toy(lambda _context: BuiltStage(holder), undecoded=("raw",)), config)
+    for number in range(3):
+        bench.feed(TRAY_A, number)
+    eventually(lambda: len(holder.held) == 2, "two of three reach the core")
+    assert [envelope.header.sequence for envelope in holder.held] == [0, 2]
+    (line,) = (each for each in bench.end().inputs if each.key == tray_key("s", TRAY_A, "raw"))
+    assert (line.received, line.missing) == (2, 0)
+
+
 def test_row_18_undecodable_bytes_of_a_stranger_are_counted_and_are_no_loss_of_the_stage(config):
     bench = Bench(toy(), config)
     bench.publisher[TRAY_A]._publisher.put(b"\xff\xff\xff")
