@@ -348,4 +348,4 @@ def newest_t_ns(message: Message) -> int:
     times = getattr(message, time_column(type(message)))
     if isinstance(times, int):
         return times
-    return int(times[-1]) if len(times) else 0
+    return times.item(-1) if len(times) else 0

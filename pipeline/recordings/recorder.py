@@ -225,14 +225,14 @@ class Recorder(Core):
             self._part.add(card.received_at(self._began_ns))
 
     def _is_flush_due(self) -> bool:
-        """Return whether a message would be unflushed for too long at the next tick; not at every tick behind a
-        backlog."""
+        """Return whether a message would be unflushed for too long at the next tick; behind a backlog, where each has
+        waited for long, once in FLUSH_S."""
         is_soon = self._is_urgent or self._unflushed_bytes >= FLUSH_BYTES
         flush_ns = (FLUSH_S if is_soon else LONGEST_FLUSH_S) * NS_PER_S
         return (
             self._unflushed_ns is not None
             and self._now_ns - self._unflushed_ns >= flush_ns - TICK_NS
-            and self._now_ns - self._flushed_ns >= flush_ns / 4
+            and self._now_ns - self._flushed_ns >= self._soon_ns - TICK_NS
         )
 
     def _is_full(self, part: RecordingWriter) -> bool:
