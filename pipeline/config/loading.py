@@ -176,10 +176,10 @@ def _checked(
     for key in own:
         if key not in File.model_fields:
             raise ConfigError(f"{path}: unknown key {_shown(key)}{nearest(key, [*File.model_fields, *STAGES])}")
-    file = checked_section(File, own, path, "")
+    file = checked_section(File, own, path, "", overrides)
     enabled = enabled_stages(file.launcher, table)
     sections = {
-        name: checked_section(STAGES[name].load().config, table.get(name, {}), path, name)
+        name: checked_section(STAGES[name].load().config, table.get(name, {}), path, name, overrides)
         for name in (enabled if stages is None else stages)
     }
     names = [tray.name for tray in file.tray]
@@ -256,8 +256,10 @@ def set_key(table: dict[str, Any], override: str) -> None:
 _Model = TypeVar("_Model", bound=BaseModel)
 
 
-def checked_section(model: type[_Model], values: Any, path: Path, section: str) -> _Model:
-    """A section of the file `path` as its model; an empty name is that of the whole file.
+def checked_section(
+    model: type[_Model], values: Any, path: Path, section: str, overrides: Iterable[str] = ()
+) -> _Model:
+    """A section of the file `path` as its model; an empty name is that of the whole file. overrides: set on top of it.
 
     Raises:
         ConfigError: a key or a value is wrong; one line names the nearest known key.
@@ -267,11 +269,13 @@ def checked_section(model: type[_Model], values: Any, path: Path, section: str) 
     try:
         return model.model_validate(values)
     except ValidationError as error:
-        raise ConfigError(f"{path}: {_problems(error, model, section)}") from error
+        raise ConfigError(_problems(error, model, section, path, overrides)) from error
 
 
-def _problems(error: ValidationError, model: type[BaseModel], section: str) -> str:
-    """What is wrong in a section, in one line."""
+def _problems(
+    error: ValidationError, model: type[BaseModel], section: str, path: Path, overrides: Iterable[str]
+) -> str:
+    """What is wrong in a section, in one line; of what was set on the command line, the file is not to blame."""
     # a list whose only entry is wrong counts as too short, too: what is wrong within it says what to correct
     found = error.errors()
     found = [each for each in found if not any(_is_within(other["loc"], each["loc"]) for other in found)]
@@ -280,11 +284,18 @@ def _problems(error: ValidationError, model: type[BaseModel], section: str) -> s
     found = [each for each in found if each["type"] != "missing" or each["loc"][:-1] not in misspelt]
     found.sort(key=lambda each: each["type"] != "extra_forbidden")
     more = f" (and {len(found) - MOST_SHOWN} more)" if len(found) > MOST_SHOWN else ""
-    return "; ".join(_problem(each, model, section) for each in found[:MOST_SHOWN]) + more
+    keys = [f"{override.partition('=')[0].strip()}." for override in overrides]
+    is_set = all(any(f"{_where(each, section)}.".startswith(key) for key in keys) for each in found)
+    problems = "; ".join(_problem(each, model, section) for each in found[:MOST_SHOWN])
+    return f"{'--set' if is_set else path}: {problems}{more}"
+
+
+def _where(found: ErrorDetails, section: str) -> str:
+    return ".".join(str(part) for part in ((section,) if section else ()) + found["loc"])
 
 
 def _problem(found: ErrorDetails, model: type[BaseModel], section: str) -> str:
-    where = ".".join(str(part) for part in ((section,) if section else ()) + found["loc"])
+    where = _where(found, section)
     if found["type"] == "extra_forbidden":
         known = _keys_at(model, found["loc"][:-1])
         return f"unknown key {_shown(where)}{nearest(str(found['loc'][-1]), known)}"

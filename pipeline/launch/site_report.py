@@ -14,6 +14,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from datetime import datetime
 
 from fantwin.pipeline.runtime.figures import without_figures
 from fantwin.pipeline.runtime.health import LATENCY_WINDOW_S
@@ -82,7 +83,8 @@ def _folded(line: str, repeated: int) -> str:
 
 
 class EventLog:
-    """Writes lines to a file descriptor. `say` may be called from any thread, never blocks and never raises."""
+    """Writes lines, each with its time of day, to a file descriptor. `say` may be called from any thread, never blocks
+    and never raises."""
 
     def __init__(self, descriptor: int, now_s: Callable[[], float] = time.monotonic) -> None:
         self._descriptor = descriptor
@@ -126,7 +128,7 @@ class EventLog:
         with self._lock:
             unwritten, self._unwritten = self._unwritten, 0
         note = f"({unwritten} lines could not be written)\n" if unwritten else ""
-        data = f"{note}{one_line(line)}\n".encode(errors="replace")
+        data = f"{note}{datetime.now():%H:%M:%S}  {one_line(line)}\n".encode(errors="replace")
         try:
             while data:
                 data = data[os.write(self._descriptor, data) :]

@@ -28,5 +28,13 @@ def left_out_hint(paths: Collection[Path], topics: Collection[str]) -> str:
     line = f"its recorder left out {', '.join(missing)} (recorder.topics)"
     if left_out(paths, (RAW,)):
         return f"{line}, and without {RAW} nothing can be made again"
-    files = " ".join(map(str, paths))
-    return f"{line}: `fantwin replay {files} --offline -o WHOLE.mcap` makes a recording with all topics"
+    return f"{line}: {_replay(paths)} makes a recording with all topics"
+
+
+def how_to_score(paths: Collection[Path]) -> str:
+    """How to make the scores that a recording does not have, in a line."""
+    return left_out_hint(paths, ("score",)) or f"{_replay(paths, '--twin TWIN.onnx ')} makes them with a twin"
+
+
+def _replay(paths: Collection[Path], options: str = "") -> str:
+    return f"`fantwin replay {' '.join(map(str, paths))} --offline {options}-o WHOLE.mcap`"

@@ -50,10 +50,11 @@ class CurrentAlarm:
         return f"at {clock(self.message_t_ns)}: {about}" if about and self.message_t_ns else about
 
     def line(self) -> str:
-        """The last transition, for a log; a silenced active alarm is marked as such."""
+        """The last transition, for a log; a silenced active alarm is marked as such. A refusal says so itself."""
         alarm = self.newest
         word = self.severity() if alarm.active else alarm.transition.name.lower().replace("_", " ")
-        return f"{word}  {alarm.header.tray}  {alarm.message}"
+        is_said = alarm.transition == Transition.REFUSED and not alarm.active
+        return "  ".join(([] if is_said else [word]) + [alarm.header.tray, alarm.message])
 
     def severity(self) -> str:
         """The severity in a log; that of a silenced alarm is marked as such."""

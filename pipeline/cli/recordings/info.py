@@ -23,7 +23,7 @@ from fantwin.pipeline.recordings.clips.clip import clip_lines
 from fantwin.pipeline.recordings.contents import contents_of, continuity, losses_of, messages_as_text
 from fantwin.pipeline.recordings.dates import format_clock, format_local
 from fantwin.pipeline.recordings.metadata import CONFIGURATION
-from fantwin.pipeline.recordings.reading import left_out_of
+from fantwin.pipeline.recordings.reading import left_out_of, read_recording
 from fantwin.pipeline.recordings.records import active_path
 from fantwin.pipeline.recordings.repair import recover as recover_file
 from fantwin.pipeline.recordings.run_recordings import RECORDING_KEY, recorded_files
@@ -32,6 +32,7 @@ from fantwin.pipeline.recordings.sequence_ledger import StreamCounts, sum_by_key
 from fantwin.pipeline.site.loss_accounting import label, losses, refused, refused_lines
 from fantwin.pipeline.site.stage_states import note_lines, notes_as_json
 from fantwin.schemas.health import Health
+from fantwin.schemas.messages import Raw
 from fantwin.schemas.streams import StreamId
 from fantwin.schemas.units import NS_PER_S
 
@@ -75,7 +76,7 @@ def info(
         raise UsageError("-o is for --repair: nothing else is written")
     with working(f"reading {', '.join(str(file) for file in files)}"):
         present = recorded_files(map(_present, files), with_unfinished=True)
-        parts = sorted(map(contents_of, present), key=lambda part: part.first_ns or 0)
+        parts = sorted(map(_contents, present), key=lambda part: part.first_ns or 0)
     breaks = continuity(parts)
     if json_output:
         typer.echo(json.dumps(as_json(parts, breaks)))
@@ -88,6 +89,16 @@ def info(
 def _present(file: Path) -> Path:
     """The file, or its active name if it is still being written."""
     return active_path(file) if not file.exists() and active_path(file).exists() else file
+
+
+def _contents(file: Path) -> Contents:
+    """What is in a file. One whose messages were all received at one time begins with its first raw sample."""
+    part = contents_of(file)
+    if part.first_ns is None or part.first_ns != part.last_ns:
+        return part
+    raws = (each.message for each in read_recording(file, ("raw",)))
+    times = [int(raw.host_receive_t_ns[0]) for raw in raws if isinstance(raw, Raw) and len(raw.host_receive_t_ns)]
+    return replace(part, first_ns=min((part.first_ns, *times)))
 
 
 def _sessions(parts: Iterable[Contents]) -> list[Health]:
@@ -280,7 +291,7 @@ def repair(file: Path, output: Path | None, *, json_output: bool) -> None:
     """
     with working(f"reading {file}"):
         recovery = recover_file(file, output)
-        part = contents_of(recovery.path)
+        part = _contents(recovery.path)
     found, lost = recovery.found, losses_of(recovery.found)
     if json_output:
         original = str(recovery.original) if recovery.original else None

@@ -165,7 +165,7 @@ def read_scenario(path: Path | None, overrides: Sequence[str], options: dict[str
     for override in overrides:
         set_key(table, override)
     table |= {key: value for key, value in options.items() if value is not None}
-    found = checked_section(Scenario, table, path or UNNAMED, "")
+    found = checked_section(Scenario, table, path or UNNAMED, "", overrides)
     if path is None or found.file is None:
         return found
     return found.model_copy(update={"file": found.file.model_copy(update={"path": path.parent / found.file.path})})

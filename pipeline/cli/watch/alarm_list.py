@@ -45,7 +45,7 @@ from fantwin.schemas.units import NS_PER_S
 from fantwin.scoring.alarms.alarm_state import is_listed, is_presented
 from fantwin.scoring.alarms.current_alarms import CurrentAlarm, clock, current_alarm
 from fantwin.scoring.calibration.calibration import ObservedRate, declared_per_day, together
-from fantwin.scoring.diagnosis.causes import CANNOT_TELL, CAUSES, MIN_PROBABILITY, with_share
+from fantwin.scoring.diagnosis.causes import CANNOT_TELL, CAUSES, MIN_PROBABILITY, most_probable, with_share
 from fantwin.scoring.wear.slow_change import is_of_slow_change
 
 _SCORES_S = 3.0  # a score of every tray arrives in this time
@@ -162,7 +162,7 @@ def _transition_line(alarm: Alarm) -> Text:
             f"{alarm.transition.name.replace('_', ' ')}{by}",
             STYLES.get(alarm.severity, "bold red") if alarm.active else "",
         ),
-        f"{why}  {alarm.message}",
+        f"{why}  {alarm.message.removeprefix(f'fan {alarm.fan}: ').removeprefix('refused: ')}",
     )
 
 
@@ -205,14 +205,14 @@ def _line(alarm: Episode) -> Text:
     """One alarm, for people."""
     length_s = None if alarm.cleared_ns is None else (alarm.cleared_ns - alarm.onset_ns) / NS_PER_S
     lasted = "not over" if length_s is None else f"for {duration_text(length_s)}"
-    cause = f"  {with_share(alarm.causes[0])}" if alarm.causes else ""
+    causes = "".join(f"  {cause}" for cause in most_probable(alarm.causes))
     by = f" by {alarm.feedback_by}" if alarm.feedback_by else ""
     reason = f": {alarm.feedback_reason}" if alarm.feedback_reason else ""
     is_marked = alarm.feedback != Feedback.NONE
     return Text.assemble(
         f"{format_local(alarm.onset_ns)}  {alarm.tray} fan {alarm.fan}  ",
         (f"{alarm.severity.upper():7}", STYLES[Severity[alarm.severity.upper()]]),
-        f"  {lasted}{cause}  ",
+        f"  {lasted}{causes}  ",
         (f"{alarm.feedback.words}{by}{reason}" if is_marked else "not marked", "bold" if is_marked else ""),
     )
 

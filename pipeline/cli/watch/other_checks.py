@@ -59,19 +59,29 @@ def _written(path: Path, found: Sequence[Found]) -> list[str]:
     chips = [each for each in found if each.kind == "hwmon" and each.tray]
     if not chips:
         raise UserError(f"{path}: not written: no hwmon chip has a fan to watch")
+    done = "written"
     try:
         with path.open("x", encoding="utf-8") as file:
             file.write("\n".join(['site = "site"\n', *(each.toml for each in chips)]))
     except FileExistsError as error:
-        raise UserError(
-            f"{path}: exists and was not changed: paste the [[tray]] that it lacks, or name a new file"
-        ) from error
+        if lacking := [str(each.tray["name"]) for each in chips if each.tray["name"] not in _trays_in(path)]:
+            todo = f"paste the [[tray]] that it lacks ({', '.join(lacking)}), or name a new file"
+            raise UserError(f"{path}: exists and was not changed: {todo}") from error
+        done = "has all hwmon chips with fans already, not changed"
     except OSError as error:
         raise UserError(f"{path}: cannot be written: {error.strerror}; name another file") from error
     guessed = "the device there is only guessed; paste its [[tray]] to watch it"
     why = [guessed if each.tray else next(iter(each.missing), "it cannot be watched") for each in found]
     left_out = [f"left out: {each.title}: {line}" for each, line in zip(found, why, strict=True) if each not in chips]
-    return [*left_out, f"written: {path}; next: fantwin doctor -c {path}"]
+    return [*left_out, f"{done}: {path}; next: fantwin doctor -c {path}"]
+
+
+def _trays_in(path: Path) -> set[str]:
+    """The trays of a configuration; none if it cannot be read."""
+    try:
+        return {tray.name for tray in load_config(path, stages=()).trays}
+    except UserError:
+        return set()
 
 
 def send_test_messages(config: Path, overrides: Sequence[str], targets: Sequence[str], *, json_output: bool) -> None:

@@ -23,7 +23,7 @@ from matplotlib.patches import Patch
 
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.recordings.dates import format_utc, has_date
-from fantwin.pipeline.recordings.left_out import left_out_hint
+from fantwin.pipeline.recordings.left_out import how_to_score
 from fantwin.pipeline.recordings.reading import read_metadata, read_recording
 from fantwin.pipeline.site.trace import Trace, state_changes, trace_of
 from fantwin.schemas.channels import CHANNELS, Channel, axis_range
@@ -101,8 +101,7 @@ def read_trace(recordings: Sequence[Path], tray: str | None, speed_unit: SpeedUn
         damage += [reading.damage] if reading.damage else []
     where = ", ".join(str(path) for path in recordings)
     if not scores:
-        why = left_out_hint(recordings, ("score",)) or "did twin_integrator and scorer run?"
-        raise UserError(f"{where}: holds no scores to plot; {why}")
+        raise UserError(f"{where}: holds no scores to plot; {how_to_score(recordings)}")
     if tray is None:
         if len(scores) > 1:
             raise UserError(f"{where}: there are several trays; choose one with --tray: {', '.join(sorted(scores))}")

@@ -10,7 +10,7 @@ from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.outputs.rerun.rerun_sink import ViewOptions
 from fantwin.pipeline.outputs.rerun.viewer_core import view_of_site
-from fantwin.pipeline.recordings.left_out import left_out_hint
+from fantwin.pipeline.recordings.left_out import how_to_score
 from fantwin.pipeline.recordings.parts import in_order, read_parts
 from fantwin.pipeline.recordings.reading import RecordingMetadata
 from fantwin.pipeline.recordings.run_recordings import run_metadata
@@ -42,8 +42,7 @@ def recorded_site(recordings: Iterable[Path]) -> RecordedSite:
     counts = {tray: int(fans) for tray, fans in stated.items() if fans}
     trays = [TrayConfig(name=tray, fans=fans, speed_unit=_unit(metadata, tray)) for tray, fans in counts.items()]
     if not trays:
-        why = left_out_hint(parts, ("score",)) or "did twin_integrator and scorer run?"
-        raise UserError(f"{', '.join(map(str, parts))}: holds no scores to show; {why}")
+        raise UserError(f"{', '.join(map(str, parts))}: holds no scores to show; {how_to_score(parts)}")
     return RecordedSite(metadata.metadata.get("site", "site"), trays, parts)
 
 

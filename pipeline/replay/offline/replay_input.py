@@ -32,6 +32,8 @@ from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.messages import Alarm, Message, ModelCard
 from fantwin.schemas.topics import tray_of
 
+NAME_ONE = "name one with `fantwin replay --offline --twin TWIN.onnx -o WHOLE.mcap`"
+
 
 class ReadPlan(NamedTuple):
     """Plan of how to decide a tray again, as its recording tells it."""
@@ -187,7 +189,7 @@ def open_replay_input(
         else:
             any_twin = twin or next(iter(recorded.values()), None)
             if any_twin is None:
-                raise RecordingError(f"{ordered[0]}: no twin in this recording: name one with --twin FILE.onnx")
+                raise RecordingError(f"{ordered[0]}: no twin in this recording: {NAME_ONE}")
             base = default_config(ordered[0], metadata, first, any_twin, overrides, stages.names)
         trays = tuple(base.tray(name) for name in first if tray in (None, name))
         is_as_recorded = attached is not None and config is None and not overrides and twin is None
@@ -256,4 +258,4 @@ def _twin_of(
     cards = (each.message for path in paths for each in rare_messages(path, "twin") if tray_of(each.key) == tray.name)
     if any(isinstance(card, ModelCard) and card.content for card in cards):  # learned while it was recorded
         return None
-    raise RecordingError(f"{paths[0]}: no twin of {tray.name} in this recording: name one with --twin FILE.onnx")
+    raise RecordingError(f"{paths[0]}: no twin of {tray.name} in this recording: {NAME_ONE}")

@@ -48,6 +48,12 @@ def recording(path: Path) -> Path:
     return path
 
 
+def test_a_recording_of_a_single_message_lasts_as_long_as_its_samples(tmp_path):
+    fantwin("simulate", "--fans", 1, "--recording", tmp_path / "one.mcap", "--duration", 0.5)
+    (file,) = shown(tmp_path / "one.mcap")["files"]
+    assert (file["messages"], round(file["duration_s"], 1)) == (1, 0.5)
+
+
 def test_topics_metadata_twins_and_stages_are_in_the_json_and_in_the_text(tmp_path):
     whole = shown(recording(tmp_path / "r.mcap"), exit_code=3)
     assert whole["topics"][RAW_KEY] == {

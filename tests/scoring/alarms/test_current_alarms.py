@@ -38,6 +38,11 @@ def test_an_answer_keeps_the_message_and_the_causes():
     assert (standing.message, standing.causes, standing.acknowledged_by) == ("DIAGNOSED at 2", causes, "Ann")
 
 
+def test_a_refusal_is_said_once_in_a_log():
+    refused = one(alarm(Transition.REFUSED, active=False, message="fan 0: refused: no alarm has been raised"))
+    assert refused.line() == "a  fan 0: refused: no alarm has been raised"
+
+
 def test_a_new_occurrence_has_nothing_of_the_one_before():
     causes = (Diagnosis(cause="drag_up", probability=0.8),)
     standing = one(

@@ -70,10 +70,12 @@ def test_the_command_writes_a_new_configuration_and_prints_json(root: Path, tmp_
     assert all(isinstance(tray.source, HwmonConfig) and tray.source.writable for tray in config.trays)
     assert "left out: acpitz" not in result.stderr, "it has no fans"
     text = file.read_text(encoding="utf-8")
-    assert (
-        error_of(*words) == f"{file}: exists and was not changed: paste the [[tray]] that it lacks, or name a new file"
-    )
-    assert file.read_text(encoding="utf-8") == text
+    again = fantwin(*words)
+    assert (again.exit_code, file.read_text(encoding="utf-8")) == (0, text)
+    assert f"has all hwmon chips with fans already, not changed: {file}" in again.stderr
+    file.write_text(text.replace('"thinkpad"', '"other"'), encoding="utf-8")
+    lacks = "exists and was not changed: paste the [[tray]] that it lacks (thinkpad), or name a new file"
+    assert error_of(*words) == f"{file}: {lacks}"
 
 
 def test_a_port_of_which_nothing_is_known_is_no_tray_and_what_is_not_written_is_said(
