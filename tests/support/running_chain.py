@@ -165,7 +165,7 @@ class Chain:
     def process_ids(self) -> dict[str, int]:
         """The ids of the processes that `up` last reported as started, by label."""
         assert self.up
-        found = (re.match(r"(\S+): started, process (\d+)", line) for line in self.up.lines)
+        found = (re.search(r"(\S+): started, process (\d+)", line) for line in self.up.lines)
         return {match[1]: int(match[2]) for match in found if match}
 
     def kill(self, watcher: SiteWatcher, label: str) -> float:
