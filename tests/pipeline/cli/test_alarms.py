@@ -330,8 +330,8 @@ def test_the_alarms_of_recordings_have_the_feedback_of_later_ones_and_the_rate_t
 def test_the_history_names_both_of_two_causes_that_are_equally_probable(tmp_path: Path) -> None:
     raised = next(each for each in golden_alarms() if each.transition == Transition.RAISED)
     causes = tuple(Diagnosis(cause=cause, probability=0.4) for cause in ("drag_up", "friction_up"))
-    with RecordingWriter(tmp_path / "two.mcap", {"site": "golden", "trays": "tray1"}) as writer:
-        writer.add_message(tray_key("golden", "tray1", "alarm"), replace(raised, causes=causes), raised.t_ns)
+    about = {"site": "golden", "trays": "tray1"}
+    write(tmp_path / "two.mcap", [replace(raised, causes=causes)], about, start=raised.t_ns)
     shown = fantwin("alarms", "--history", "--recordings", tmp_path / "two.mcap").stdout
     assert "  more drag 40 %  more friction 40 %  " in shown
 
