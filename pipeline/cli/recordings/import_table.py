@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -139,26 +138,22 @@ def _list_fields(file: Path, kind: LogFormat | None, *, json_output: bool) -> No
         raise UsageError(f"{file}: --list is for logs; the first line of a table names its columns")
     log = open_log(file, kind)
     series = log.read(log.names)
-    if json_output:
-        rows = [
-            {"name": name, "values": len(each.values), "rate_hz": each.rate_hz, **_range(each.values)}
-            for name, each in series.items()
-        ]
-        typer.echo(json.dumps({"format": kind.title, "fields": rows}))
-        return
     width = max(map(len, log.names), default=0)
+    rows: list[dict[str, Any]] = []
+    lines: list[str] = []
     for name, each in series.items():
-        low, high = _range(each.values).values()
-        span = "no numbers" if low is None else f"{low:10.6g} to {high:.6g}"
-        typer.echo(f"{name:{width}}  {len(each.values):7d} values  {each.rate_hz:8.3g} Hz  {span}")
-    typer.echo(f"{file}: {kind.title}, {len(log.names)} fields")
+        low, high = _range(each.values)
+        count, span = len(each.values), "no numbers" if low is None else f"{low:10.6g} to {high:.6g}"
+        rows.append({"name": name, "values": count, "rate_hz": each.rate_hz, "lowest": low, "highest": high})
+        lines.append(f"{name:{width}}  {count:7d} values  {each.rate_hz:8.3g} Hz  {span}")
+    lines.append(f"{file}: {kind.title}, {len(log.names)} fields")
+    show({"format": kind.title, "fields": rows}, *lines, json_output=json_output)
 
 
-def _range(values: Array) -> dict[str, float | None]:
+def _range(values: Array) -> tuple[float, float] | tuple[None, None]:
+    """Lowest and highest value; None without a number."""
     known = values[np.isfinite(values)]
-    if not len(known):
-        return {"lowest": None, "highest": None}
-    return {"lowest": float(known.min()), "highest": float(known.max())}
+    return (float(known.min()), float(known.max())) if len(known) else (None, None)
 
 
 def _channels(given: Sequence[str]) -> dict[str, list[str]]:

@@ -11,10 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import typer
-from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
-from rich.table import Table
 
 from fantwin.pipeline.cli.in_parallel import RecordingsInParallel
 from fantwin.pipeline.cli.printing import table_of
@@ -150,9 +148,7 @@ def print_result(result: dict[str, Any], output: Path | None) -> None:
 
 def _print_recordings(console: Console, result: dict[str, Any]) -> None:
     """A row for each recording, and the alarms of those that have any."""
-    table = Table("recording", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    for column in ("time", "alarms", "lost"):
-        table.add_column(column, justify="right", no_wrap=True)
+    table = table_of(["recording"], ("time", "alarms", "lost"))
     for one in result["recordings"]:
         alarms = str(len(one["alarms"]))
         table.add_row(escape(one["files"][0]), _duration(one["hours"]), alarms, str(one["lost"]))

@@ -82,14 +82,6 @@ def calibrate(
             help="Also with too few data to show the rate, which is then only a target.",
         ),
     ] = False,
-    alarms_left_out: Annotated[
-        int,
-        typer.Option(
-            min=0,
-            help="Number of alarms, perhaps false ones, that were raised during these recordings, and whose time is "
-            "not in them: they count as found.",
-        ),
-    ] = 0,
     output: Annotated[
         Path | None, typer.Option("-o", "--output", metavar="OUT.onnx", help="Write to this file, not into TWIN.onnx.")
     ] = None,
@@ -116,7 +108,7 @@ def calibrate(
     """
     _refuse_wrong_arguments(twin, healthy or [], verify or [], overrides or [])
     finding = {"--false-alarms-per-day": false_alarms_per_day, "--extrapolate": extrapolate, "--output": output}
-    finding |= {"--alarms-left-out": alarms_left_out, "--from": from_s > 0.0, "--to": to_s < math.inf}
+    finding |= {"--from": from_s > 0.0, "--to": to_s < math.inf}
     if not healthy and (given := [name for name, value in finding.items() if value]):
         raise UsageError(
             f"{given[0]} needs recordings to calibrate on, and there are none: those after --verify only test; "
@@ -135,7 +127,7 @@ def calibrate(
             for line in marked.lines:
                 typer.echo(line, err=True)
             part = HealthyPart(twin, tuple(overrides or ()), from_s, to_s, tray, marked.left_out)
-            how = {"extrapolate": extrapolate, "alarms_left_out": alarms_left_out, "progress": show_part}
+            how = {"extrapolate": extrapolate, "progress": show_part}
             found = calibrated_on(healthy, part, false_alarms_per_day, pool.map, **how)
             calibration, speed_unit = found.calibration, found.learned[0].tray.speed_unit
             output = output or twin

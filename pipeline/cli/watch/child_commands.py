@@ -16,10 +16,7 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from itertools import count
 from pathlib import Path
-from tempfile import TemporaryFile
 from typing import Any, Self
-
-import typer
 
 from fantwin.pipeline.acquisition.raw_samples import RawSamples
 from fantwin.pipeline.bus.session import join_bus
@@ -57,13 +54,13 @@ class Commands:
         self.say = say
         self.to_standard_error = to_standard_error
 
-    def run(self, *words: object, site: RecordingSite | None = None, findings: Any = None) -> None:
+    def run(self, *words: object, site: RecordingSite | None = None, as_messages: bool = False) -> None:
         """Run a command to its end; it ends early if its site does or the user wants to stop.
 
         Args:
             words: the command.
             site: of which it needs the samples.
-            findings: a file for what it prints.
+            as_messages: what it prints goes to standard error.
 
         Raises:
             Stopped: the user wants to stop.
@@ -71,7 +68,7 @@ class Commands:
         """
         line = [str(word) for word in words]
         self.say(f"fantwin {shlex.join(line)}")
-        child = started(line, stdout=findings or (STANDARD_ERROR if self.to_standard_error else None))
+        child = started(line, stdout=STANDARD_ERROR if as_messages or self.to_standard_error else None)
         while child.poll() is None:
             is_stopped = self.stop.wait(_POLL_S)
             if site:
@@ -85,20 +82,6 @@ class Commands:
             site.check()
         if child.returncode:
             raise UserError(f"`fantwin {line[0]}` failed (exit code {child.returncode}) and has said why")
-
-    def check(self, *words: object) -> None:
-        """Run a command that prints what it finds; if it fails, that is the reason, and goes to standard error.
-
-        Raises as `run`.
-        """
-        with TemporaryFile("w+", encoding="utf-8") as findings:
-            failed = True
-            try:
-                self.run(*words, findings=findings)
-                failed = False
-            finally:
-                findings.seek(0)
-                typer.echo(findings.read(), nl=False, err=failed or self.to_standard_error)
 
 
 class RecordingSite:

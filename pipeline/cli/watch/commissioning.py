@@ -101,7 +101,7 @@ class Commissioning:
         """
         some = self._works if len(self._works) < len(self._settings.trays) else ()
         lines = [word for work in some for word in self._tray_words(work)]
-        self._commands.check("doctor", *self._configured, *RECORDING_ONLY, *lines)
+        self._commands.run("doctor", *self._configured, *RECORDING_ONLY, *lines, as_messages=True)
         if self._plan.sweep is None:
             self._record_ordinary_operation()
         else:

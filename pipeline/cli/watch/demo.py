@@ -10,23 +10,19 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console, Group
-from rich.live import Live
+from rich.console import Console
 from rich.markup import escape
-from rich.table import Table
-from rich.text import Text
 
 from fantwin.pipeline.bus.session import Bus, join_bus
 from fantwin.pipeline.cli.options import JsonOption
 from fantwin.pipeline.cli.printing import table_of
-from fantwin.pipeline.cli.progress import working
+from fantwin.pipeline.cli.progress import Reporter, working
 from fantwin.pipeline.cli.watch.demo_report import Summary, summarise
-from fantwin.pipeline.cli.watch.status import stage_table
 from fantwin.pipeline.config.roles import roles_of
 from fantwin.pipeline.config.settings import Config, TrayConfig
 from fantwin.pipeline.errors import UserError
@@ -35,12 +31,10 @@ from fantwin.pipeline.files import write_whole
 from fantwin.pipeline.launch.this_host import load_for_this_host, page_addresses
 from fantwin.pipeline.runtime.signals import stop_on_signals
 from fantwin.pipeline.selftest.scratch_site import free_port, lines_of, started
-from fantwin.pipeline.site.fan_history import CURVES
-from fantwin.pipeline.site.fleet import Fan, FanGroup
-from fantwin.pipeline.site.site_model import SiteModel
+from fantwin.pipeline.site.fleet import Fan
 from fantwin.pipeline.site.site_watcher import SiteWatcher
 from fantwin.schemas.enums import FanState
-from fantwin.schemas.units import NS_PER_S, RAD_S_PER_UNIT
+from fantwin.schemas.units import NS_PER_S
 from fantwin.scoring.diagnosis.causes import short_name
 
 DEMO_FOLDER = Path(__file__).parents[2] / "demo"
@@ -57,7 +51,6 @@ OUTPUTS = (
 )
 ERROR_PREFIX = "fantwin: "
 """start of the line in which a command says why it failed"""
-_STYLES = {FanGroup.NORMAL: "green", FanGroup.SUSPECT: "yellow", FanGroup.NOT_JUDGED: "dim", FanGroup.AT_REST: "dim"}
 _START_TIMEOUT_S = _STOP_TIMEOUT_S = 60.0
 
 
@@ -137,7 +130,7 @@ def _run(config: Config, overrides: list[str], out: Path, console: Console) -> d
         console.print(f"simulated tray of {tray.fans} fans; starting {count} stages, each as a process of its own")
         for address in page_addresses(config):
             console.print(f"operators' page, while the demo runs: {address}", soft_wrap=True)
-        _watch(config, bus, device, pipeline, stop, console)
+        _watch(config, bus, device, pipeline, stop)
         if pipeline.poll() is None:
             pipeline.send_signal(signal.SIGINT)
         try:
@@ -170,53 +163,28 @@ def _child(words: list[str], **streams: object) -> Iterator[subprocess.Popen[str
 
 
 def _watch(
-    config: Config,
-    bus: Bus,
-    device: subprocess.Popen[str],
-    pipeline: subprocess.Popen[str],
-    stop: threading.Event,
-    console: Console,
+    config: Config, bus: Bus, device: subprocess.Popen[str], pipeline: subprocess.Popen[str], stop: threading.Event
 ) -> None:
     """Show what happens until the tray has sent its last sample, or a process ends too early."""
     watcher = SiteWatcher(bus, config.site, roles_of(config), config.trays, has_scores=True)
     began_s = time.monotonic()
-    next_line_s = 0.0
-    with Live(console=console, refresh_per_second=4, transient=True) if console.is_terminal else nullcontext() as live:
+    with Reporter() as reporter:
         while device.poll() is None and pipeline.poll() is None and not stop.wait(0.25):
-            now_s = time.monotonic()
-            if live:
-                live.update(Group(stage_table(watcher, config), _fan_table(config.trays[0], watcher.model)))
-            elif now_s >= next_line_s:
-                next_line_s = now_s + 4.0
-                console.print(f"{now_s - began_s:5.0f} s  {_line(config.trays[0], watcher)}")
-            if not watcher.model.trays_now() and now_s > began_s + _START_TIMEOUT_S:
+            reporter.show("running", note=_line(config.trays[0], watcher))
+            if not watcher.model.trays_now() and time.monotonic() > began_s + _START_TIMEOUT_S:
                 raise UserError(
                     f"no score arrived within {_START_TIMEOUT_S:.0f} s; see up.log, and run `fantwin doctor`"
                 )
 
 
 def _line(tray: TrayConfig, watcher: SiteWatcher) -> str:
-    """The state of the fans in one line, where there is no terminal."""
+    """The state of the fans in one line."""
     if not watcher.model.trays_now():
         return "waiting for the first score"
     states = [watcher.model.fan_now(Fan(tray.name, fan)).state for fan in range(tray.fans)]
     notable = (f"fan {fan} {state}" for fan, state in enumerate(states) if state != FanState.NORMAL.words)
     said = f"all fans {states[0]}" if len(set(states)) == 1 else ", ".join(notable)
     return f"{said}; lost {sum(watcher.losses().values())}"
-
-
-def _fan_table(tray: TrayConfig, model: SiteModel) -> Table:
-    """Every fan beside its twin."""
-    columns = ("command", "measured", "twin", "residual")
-    table = table_of(["fan"], columns, ["state"], title=f"{tray.name}, speeds in {tray.speed_unit}")
-    for now in model.trays_now():
-        for fan, values in enumerate(now.values):
-            measured, twin, *_, command = values[: len(CURVES)]
-            speeds = (measured / RAD_S_PER_UNIT[tray.speed_unit], twin / RAD_S_PER_UNIT[tray.speed_unit])
-            shown = model.fan_now(Fan(tray.name, fan))
-            cells = (f"{command:.2f}", *(f"{speed:.0f}" for speed in speeds), f"{speeds[0] - speeds[1]:+.0f}")
-            table.add_row(str(fan), *cells, Text(shown.state, style=_STYLES.get(shown.group, "bold red")))
-    return table
 
 
 def _draw(out: Path, console: Console) -> None:

@@ -97,7 +97,8 @@ class Played:
         self.stopped: tuple[str, str] = ("", "")
         """the same, of the one during which its user stops"""
 
-    def run(self, *words: object, site: PlayedSite | None = None) -> None:
+    def run(self, *words: object, site: PlayedSite | None = None, as_messages: bool = False) -> None:
+        assert as_messages is (words[0] == "doctor")
         line = [str(word).replace(f"{self.folder}/", "") for word in words]
         self.lines.append(" ".join(line))
         here = line[0], _after("--tray", line)
@@ -132,8 +133,7 @@ def played(tmp_path: Path, endpoint: str, monkeypatch: pytest.MonkeyPatch) -> Pl
     monkeypatch.setattr(commission, "stop_on_signals", threading.Event)  # this process has its own
     monkeypatch.setattr(commissioning, "RecordingSite", PlayedSite)
     monkeypatch.setattr(commissioning, "time", SimpleNamespace(monotonic=lambda: PlayedSite.now_s))
-    for name in ("run", "check"):
-        monkeypatch.setattr(Commands, name, played.run)
+    monkeypatch.setattr(Commands, "run", played.run)
     return played
 
 
@@ -251,13 +251,15 @@ def test_a_wrong_tacho_of_a_tray_is_found_before_it_is_swept_again(
     assert (played.folder / "b.onnx").exists()
 
 
-def test_why_its_doctor_step_fails_is_on_standard_error(tmp_path: Path, endpoint: str) -> None:
+def test_why_its_doctor_step_fails_is_on_standard_error(
+    tmp_path: Path, endpoint: str, capfd: pytest.CaptureFixture[str]
+) -> None:
     configuration = tmp_path / "fantwin.toml"
     text = f'[bus]\nendpoint = "{endpoint}"\n[[tray]]\nname = "tray1"\nfans = 1\nport = "none"\n'
     configuration.write_text(text, encoding="utf-8")
     done = as_typed("commission", "-c", configuration)
     assert done.returncode == 1
-    assert "FIX  acquisition/tray1: " in done.stderr
+    assert "FIX  acquisition/tray1: " in capfd.readouterr().err, "of the child"
     assert done.stderr.rstrip().endswith("fantwin: `fantwin doctor` failed (exit code 1) and has said why")
     (line,) = done.stdout.splitlines()
     assert line.startswith("fantwin doctor -c ")
