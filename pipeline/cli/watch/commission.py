@@ -84,8 +84,8 @@ def commission(
     missing is shown. The calibration is from little data: calibrate again after a few days.
 
     A tray that fails is left out: the others get their twins, but `fantwin up` is not started. Ctrl-C ends `commission`
-    without further twins. Recordings stay, in folders `commissioned-N` of their own, which the limits of `[recorder]`
-    do not touch. With --json, `fantwin up` is not started.
+    without further twins. Recordings stay, in folders `commissioned-N` of their own; the recorder's limits
+    do not touch them. With --json, `fantwin up` is not started.
 
     Exit codes: 0 success; 1 at least one tray failed, and one line says why; 3 success, but data were lost while
     recording; 130 Ctrl-C. Once `fantwin up` is started, the exit code is that of `up`.
