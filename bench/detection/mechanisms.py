@@ -10,7 +10,7 @@ import numpy as np
 
 from fantwin.scoring.model.faults import BEFORE_GROWTH
 from fantwin.scoring.model.healthy import COUNT, FALL, LATE, RISE, SLOW
-from fantwin.scoring.model.priors import Priors
+from fantwin.scoring.model.population import Priors
 
 Change = Callable[[Any], Any]
 NONE = 1e-9

@@ -33,7 +33,7 @@ from fantwin.pipeline.replay.offline.rescoring import rescore
 from fantwin.schemas.enums import Feedback
 from fantwin.schemas.messages import Alarm
 from fantwin.scoring.calibration.calibration import Calibration, daily_interval, expected_alarms, is_exceeded
-from fantwin.scoring.model.priors import Priors
+from fantwin.scoring.model.population import Priors
 
 
 @dataclass(frozen=True)

@@ -61,6 +61,10 @@ class LearnedTwinIntegrator(Core):
         """Counters of all twins so far."""
         return self._counts + Counter(self._counting.counters())
 
+    def notes(self) -> Sequence[str]:
+        """Notes of the twin in force."""
+        return self._core.notes() if self._core else ()
+
     def problem(self) -> str:
         """A twin that could not take over, or what is wrong with the one in force."""
         return self._problem or self._counting.problem()

@@ -19,7 +19,7 @@ from fantwin.schemas.units import S_PER_DAY
 from fantwin.scoring.calibration.calibration import Calibration
 from fantwin.scoring.diagnosis.ranked_causes import Advice, SteadyFan
 from fantwin.scoring.model.operation import Fans
-from fantwin.scoring.model.priors import Priors
+from fantwin.scoring.model.population import Priors
 from fantwin.scoring.unseen_error import UnseenError
 
 COUNT_NOISE_RAD_S = 0.8

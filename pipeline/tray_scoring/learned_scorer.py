@@ -9,7 +9,7 @@ goes on.
 from __future__ import annotations
 
 import json
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -27,7 +27,9 @@ from fantwin.schemas.messages import Message, ModelCard, Prediction, Request, Sc
 from fantwin.scoring.score_message import unscored
 
 MOST_HELD = 4096
-"""messages that wait for their twin: 40 s at 100 Hz"""
+"""messages that wait for their twin: 3 minutes in blocks of 0.05 s"""
+MOST_REQUESTS = 64
+"""the newest requests of operators, which wait for the first twin"""
 LIMITS = ("name", "calibration")
 """the entries of a card that do not affect predictions"""
 CoreOf = Callable[[TrayTwin, ScorerSnapshot | None], ScorerCore]
@@ -48,7 +50,7 @@ class LearnedTwinScorer(Core):
         self._cards: dict[str, ModelCard] = {}
         self._snapshot: ScorerSnapshot | None = None
         """to continue from with the first twin"""
-        self._requests: list[Request] = []
+        self._requests: deque[Request] = deque(maxlen=MOST_REQUESTS)
         """that wait for it"""
         self._held: list[Prediction] = []
         """from the first one of a twin that has not arrived yet, after a restart"""
@@ -168,8 +170,9 @@ class LearnedTwinScorer(Core):
         self._core, self._twin, self._snapshot, self._problem = core, name, None, ""
         if continues:
             emitted += core.last_snapshot()  # a scorer that is killed now continues with the new twin
-        requests, self._requests = self._requests, []
-        return [*emitted, *(message for request in requests for message in core.step(request))]
+        emitted += [message for request in self._requests for message in core.step(request)]
+        self._requests.clear()
+        return emitted
 
     def _has_other_limits_only(self, card: ModelCard) -> bool:
         """Whether a twin predicts as the current one does."""

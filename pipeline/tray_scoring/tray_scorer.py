@@ -248,13 +248,13 @@ class TrayScorer(Saved):
         self._see(one, self.alarms.active)
         self._now = self._columns(score, active, is_worn, against.score[row] if against else np.zeros(self.fans))
         is_large = self._stands | (np.abs(decision.fault[0]) >= self._alarm_share)
-        began_ns = np.where(decision.active, decision.number - decision.onset + 1, 1)
+        bins_since_onset = np.where(decision.active, decision.number - decision.onset + 1, 1)
         decided = Decided(
             min(one.t_ns, int(item.t_ns[row])),  # a bin ends with its last sample, which is before its end
             judged,
             active,
             np.where(is_large, int(Severity.ALARM), int(Severity.WARNING)),
-            one.t_ns - began_ns * round(decision.bin_s * NS_PER_S),
+            one.t_ns - bins_since_onset * round(decision.bin_s * NS_PER_S),
             round(decision.bin_s * NS_PER_S),
         )
         return self.alarms.update(decided, self)

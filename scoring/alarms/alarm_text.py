@@ -129,8 +129,8 @@ class AlarmText:
 
 
 def deviation_in(message: str, fan: int) -> str:
-    """The part of the line of a raised alarm that says how far the fan is off, without its name and cause."""
-    return message.removeprefix(f"fan {fan}: ").partition("; ")[0]
+    """The part of the line of a raised alarm that says how far the fan is off, without its name and causes."""
+    return message.removeprefix(f"fan {fan}: ").partition("; ")[0].partition(": ")[0]
 
 
 def _after_restart(alarm: Alarm) -> str:

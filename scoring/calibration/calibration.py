@@ -22,7 +22,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_serializer
 
 from fantwin.schemas.messages import Array
 from fantwin.schemas.twin_card import CardError, TwinCard
-from fantwin.scoring.model.priors import Priors
+from fantwin.scoring.model.population import Priors
 
 COVERAGE = 0.95
 HOURS_PER_DAY = 24.0

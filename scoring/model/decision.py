@@ -16,7 +16,7 @@ from fantwin.scoring.model.in_alarm import FansInAlarm
 from fantwin.scoring.model.missing import MissingReadings
 from fantwin.scoring.model.onsets import Evidence, Hypotheses
 from fantwin.scoring.model.operation import Fans, Inputs, Operation
-from fantwin.scoring.model.priors import Priors
+from fantwin.scoring.model.population import Priors
 from fantwin.scoring.model.wrong import FAR_SIGMAS, WrongReadings
 from fantwin.scoring.saved import Saved
 

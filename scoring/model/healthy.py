@@ -40,7 +40,7 @@ import numpy as np
 
 from fantwin.schemas.messages import Array
 from fantwin.scoring.model.operation import Fans, Inputs
-from fantwin.scoring.model.priors import Priors
+from fantwin.scoring.model.population import Priors
 from fantwin.scoring.saved import Saved
 
 KNOTS = np.array([0.09, 0.14, 0.2, 0.28, 0.38, 0.5, 0.63, 0.77, 0.9, 1.02])

@@ -24,7 +24,7 @@ from fantwin.schemas.messages import Array
 from fantwin.schemas.units import NS_PER_S
 from fantwin.scoring.model.bins import Bin
 from fantwin.scoring.model.operation import Fans, Inputs, Operation
-from fantwin.scoring.model.priors import Priors
+from fantwin.scoring.model.population import Priors
 
 SEGMENT_S = 2.0
 NEAR, FAR, FARTHEST = 2, 5, 15

@@ -29,7 +29,7 @@ from pydantic import FiniteFloat
 
 from fantwin.schemas.messages import Array
 from fantwin.schemas.units import NS_PER_S
-from fantwin.scoring.model.priors import Positive
+from fantwin.scoring.model.population import Positive
 
 NS_PER_DAY = 86_400 * NS_PER_S
 CAPACITY = 128

@@ -12,7 +12,7 @@ import pytest
 from fantwin.schemas.units import NS_PER_S
 from fantwin.scoring.model.bins import Bins, bin_ns_of
 from fantwin.scoring.model.decision import Decision
-from fantwin.scoring.model.priors import Priors
+from fantwin.scoring.model.population import Priors
 from tests.support.healthy_running import TOP_RAD_S, made_fans, running
 
 ROOT = Path(__file__).parents[2]

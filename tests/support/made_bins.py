@@ -17,7 +17,7 @@ from fantwin.scoring.model.decision import Decision
 from fantwin.scoring.model.faults import COLUMNS, OF_TACHO, STUCK, forces
 from fantwin.scoring.model.healthy import AGE, AIR, FALL, FAULT, LATE, LOCAL, RISE, SAG, WANDER, HealthyFans, K, hats
 from fantwin.scoring.model.operation import Fans, Operation
-from fantwin.scoring.model.priors import Priors
+from fantwin.scoring.model.population import Priors
 from tests.support.scored_blocks import EPOCH_NS
 
 PRIORS = Priors()

@@ -29,7 +29,7 @@ from fantwin.pipeline.replay.offline.calibration_of_twin import (
 from fantwin.pipeline.replay.offline.healthy_runs import HealthyPart
 from fantwin.schemas.units import RAD_S_PER_UNIT
 from fantwin.scoring.calibration.calibration import Calibration, changed_priors, expected_alarms, needed_fan_hours
-from fantwin.scoring.model.priors import Priors
+from fantwin.scoring.model.population import Priors
 
 EXIT_BROKEN = 3
 MEANING = {

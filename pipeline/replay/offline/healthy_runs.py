@@ -27,7 +27,7 @@ from fantwin.scoring.model.bins import Bin, Bins, bin_ns_of
 from fantwin.scoring.model.decision import Decision
 from fantwin.scoring.model.learned import HealthyRun, RunSums
 from fantwin.scoring.model.operation import Fans
-from fantwin.scoring.model.priors import Priors
+from fantwin.scoring.model.population import Priors
 
 REPORTED_EVERY_S = 5.0
 """of the time that the work takes"""

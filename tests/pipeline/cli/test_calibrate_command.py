@@ -25,7 +25,7 @@ from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Alarm, Raw
 from fantwin.schemas.topics import tray_key
 from fantwin.scoring.calibration.calibration import Calibration
-from fantwin.scoring.model.priors import Priors
+from fantwin.scoring.model.population import Priors
 from tests.support.fantwin_command import error_of, fantwin
 from tests.support.healthy_site import (
     FANS,

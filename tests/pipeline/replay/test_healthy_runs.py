@@ -30,7 +30,7 @@ from fantwin.pipeline.replay.offline.kept_bins import KeptBins, RecordedTray, Tr
 from fantwin.scoring.calibration.calibration import is_exceeded
 from fantwin.scoring.model.bins import Bins, bin_ns_of
 from fantwin.scoring.model.learned import RunSums
-from fantwin.scoring.model.priors import Priors
+from fantwin.scoring.model.population import Priors
 from tests.support.healthy_running import made_fans, running
 from tests.support.healthy_site import recorded, start_ns
 from tests.support.twin_files import write_twin

@@ -23,7 +23,7 @@ from fantwin.scoring.calibration.calibration import (
     supports,
     together,
 )
-from fantwin.scoring.model.priors import Priors
+from fantwin.scoring.model.population import Priors
 
 DAYS_100 = 2400.0
 

@@ -13,7 +13,7 @@ from fantwin.scoring.diagnosis.causes import CAUSES
 from fantwin.scoring.model import decision
 from fantwin.scoring.model.decision import Decision
 from fantwin.scoring.model.faults import BEFORE_GROWTH, DRIVE, FALLS, FAULTS, RISES, SCALE, Fault
-from fantwin.scoring.model.priors import Priors
+from fantwin.scoring.model.population import Priors
 from tests.support.made_bins import MadeFans, bin_of, plays, with_reading
 from tests.support.scored_blocks import twin_of
 

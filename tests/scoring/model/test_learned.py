@@ -13,7 +13,7 @@ from fantwin.scoring.model.bins import Bin, Bins, bin_ns_of
 from fantwin.scoring.model.decision import Decision
 from fantwin.scoring.model.learned import HealthyRun, RunSums, learned_priors
 from fantwin.scoring.model.operation import Fans
-from fantwin.scoring.model.priors import Priors
+from fantwin.scoring.model.population import Priors
 from tests.support.healthy_running import made_fans, running
 
 FANS = 24

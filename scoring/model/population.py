@@ -1,4 +1,4 @@
-"""Priors of the model of a healthy fan."""
+"""Priors of the model of a healthy fan: what is known of a population of fans."""
 
 from __future__ import annotations
 
