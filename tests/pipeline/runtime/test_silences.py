@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from typing import Any
 
 import pytest
 
@@ -41,7 +42,7 @@ class Consumer:
             Output(key=KEY, published=published, has_more=has_more),
             Output(key="x", published=9, has_more=True),
         )
-        about = {
+        about: dict[str, Any] = {
             "status": status,
             "t_ns": round(self.now_s * NS_PER_S),
             "outputs": (own, another),

@@ -139,7 +139,7 @@ def test_a_kind_and_a_trainer_that_are_unknown_are_refused_in_one_line(rough) ->
     with pytest.raises(TwinError, match="kind 'oracle' is unknown; use one of physical, narx"):
         train_twin([rough[1]], [], "oracle", name="x")
     with pytest.raises(TwinError, match="trainer 'luck' is unknown"):
-        train_twin([rough[1]], [], "hybrid", name="x", trainer="luck")
+        train_twin([rough[1]], [], "hybrid", name="x", trainer="luck")  # pyright: ignore[reportArgumentType]
 
 
 def untrained(runs: list[Run]) -> Hybrid:

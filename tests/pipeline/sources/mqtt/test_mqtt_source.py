@@ -28,7 +28,7 @@ from tests.support.ports import free_port
 from tests.support.running_chain import eventually
 
 SAMPLE = '{"t": 1.0, "command": [0.5, 0.5], "speed": [100, 200]}'
-NUMBERS = {"topic": "plant/fan{1}/rpm", "command_topic": "plant/fan{1}/pwm"}
+NUMBERS: dict[str, Any] = {"topic": "plant/fan{1}/rpm", "command_topic": "plant/fan{1}/pwm"}
 
 
 @pytest.fixture(scope="module")
