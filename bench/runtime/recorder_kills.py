@@ -19,7 +19,8 @@ from bench.printing import JsonOption, progress, show
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
-from bench.runtime.killed_recorder import FLUSH_S, Kills
+from bench.runtime.killed_recorder import Kills
+from fantwin.pipeline.recordings.recorder_config import FLUSH_S
 
 LOADS = {"8 fans": (1, 8), "200 fans": (4, 50)}
 """Trays, and fans of each; 100 Hz, four topics a tray."""

@@ -96,7 +96,7 @@ def calibrated_on(
     each: MapRecordings,
     *,
     extrapolate: bool,
-    alarms_left_out: int,
+    alarms_left_out: int = 0,
     progress: Callable[[str], None] = lambda _: None,
 ) -> CalibratedTwin:
     """Calibrate a twin. part: the twin, and what counts of each recording. per_day: false alarms of a fan a day.

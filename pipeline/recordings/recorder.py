@@ -232,7 +232,7 @@ class Recorder(Core):
         return (
             self._unflushed_ns is not None
             and self._now_ns - self._unflushed_ns >= flush_ns - TICK_NS
-            and self._now_ns - self._flushed_ns >= self._soon_ns - TICK_NS
+            and self._now_ns - self._flushed_ns >= FLUSH_S * NS_PER_S - TICK_NS
         )
 
     def _is_full(self, part: RecordingWriter) -> bool:

@@ -15,6 +15,12 @@ from fantwin.schemas.units import NS_PER_S
 from tests.support.one_learner import START_NS, Learner, restarted
 
 
+@pytest.fixture(autouse=True)
+def _first_after_five_minutes(monkeypatch: pytest.MonkeyPatch) -> None:
+    for module in ("learner_core", "learning_schedule"):
+        monkeypatch.setattr(f"fantwin.pipeline.learning.{module}.FIRST_S", 300.0)
+
+
 def test_the_first_version_waits_for_enough_running_and_enough_movement(tmp_path: Path) -> None:
     learner = Learner(tmp_path)
     learner.run(600, moves=False)
