@@ -8,6 +8,7 @@ of snapshots (schemas.formats).
 from __future__ import annotations
 
 import base64
+import re
 from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, TypeAlias
 
@@ -101,7 +102,7 @@ def from_json(kept: Kept, of_part: str = "") -> dict[str, Array]:
             found |= from_json(value, f"{name}.")
             continue
         dtype, shape, data = value
-        if np.dtype(dtype).hasobject:
+        if not re.fullmatch("[<>|][biuf][1248]", dtype):
             raise ValueError(f"{name} holds no numbers")
         found[name] = np.frombuffer(base64.b64decode(data, validate=True), dtype).reshape(shape)
     return found

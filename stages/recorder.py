@@ -67,7 +67,8 @@ def _clips_of(parts: RecordingParts, config: RecorderConfig) -> AlarmClips:
         disk_bytes = parts.disk_bytes()
     most_bytes = round(disk_bytes * config.keep_share_of_disk * CLIPS_SHARE)
     tracker = ClipTracker(clips_in(list_path(parts.path)), most_bytes, kept_s=86_400 * config.keep_days)
-    return AlarmClips(tracker, parts.path, ClipCutter(parts.path, parts.free_bytes, least_free_bytes(disk_bytes)).cut)
+    cutter = ClipCutter(parts.path, parts.free_bytes, lambda: least_free_bytes(parts.disk_bytes()))
+    return AlarmClips(tracker, parts.path, cutter.cut)
 
 
 def check(context: Context) -> list[str]:

@@ -30,6 +30,7 @@ from fantwin.pipeline.site.loopback import check_free
 
 PAGE_ABOVE_DATA = 100
 """between the port of the data and that of the page, as between those that Rerun takes by itself"""
+PORTS = {"grpc_port": "viewer.grpc_port", "web_port": "the page of viewer.grpc_port"}
 FILE_BYTES = 1_000_000_000
 """size at which the view's file ends"""
 
@@ -116,7 +117,7 @@ def check(context: Context) -> list[str]:
     if not (config.file or config.grpc_port):
         problems.append("viewer.grpc_port = 0 and no viewer.file: nothing would be shown; set one of them")
     ports = {} if context.is_running else _ports(context)
-    attempts = [partial(check_free, port, f"viewer.{key}", "viewer.grpc_port = 0") for key, port in ports.items()]
+    attempts = [partial(check_free, port, PORTS[key], "viewer.grpc_port = 0") for key, port in ports.items()]
     return [*problems, *refusals(partial(shown_fans, config.show, context.trays), *attempts)]
 
 

@@ -102,6 +102,8 @@ class SecurityConfig(Section):
     @classmethod
     def _are_new_roles(cls, value: tuple[str, ...]) -> tuple[str, ...]:
         for name in value:
+            if name == "ca":
+                raise ValueError("ca.pem is the certificate of the authority: choose another name than 'ca'")
             if name in STAGES or name in OWN_ROLES:
                 raise ValueError(f"{name!r} is a role of its own, with other rights: choose another name")
         return value

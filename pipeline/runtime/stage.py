@@ -100,7 +100,7 @@ class Core(Protocol):
 
     def wants(self, tray: str) -> bool:
         """Whether the next message of a tray on an `undecoded` topic is needed: if not, it is not read, and is no loss.
-        Called for each message that comes, in a thread of the bus."""
+        Called for each message that comes, in a thread of the bus, so that it must never wait."""
         return True
 
     def accepts(self) -> AcceptedSamples | None:

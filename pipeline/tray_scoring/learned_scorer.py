@@ -9,7 +9,7 @@ goes on.
 from __future__ import annotations
 
 import json
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -18,6 +18,7 @@ from pathlib import Path
 from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.prediction.new_samples import BEGINNING_NS, are_newer
 from fantwin.pipeline.prediction.tray_twin import TrayTwin, tray_twin, without_metadata
+from fantwin.pipeline.runtime.inbox import MOST_REQUESTS
 from fantwin.pipeline.runtime.stage import Core, StageError
 from fantwin.pipeline.tray_scoring.scorer_core import ScorerCore
 from fantwin.pipeline.tray_scoring.snapshot_store import SnapshotStore
@@ -28,8 +29,6 @@ from fantwin.scoring.score_message import unscored
 
 MOST_HELD = 4096
 """messages that wait for their twin: 3 minutes in blocks of 0.05 s"""
-MOST_REQUESTS = 64
-"""the newest requests of operators, which wait for the first twin"""
 LIMITS = ("name", "calibration")
 """the entries of a card that do not affect predictions"""
 CoreOf = Callable[[TrayTwin, ScorerSnapshot | None], ScorerCore]
@@ -50,7 +49,7 @@ class LearnedTwinScorer(Core):
         self._cards: dict[str, ModelCard] = {}
         self._snapshot: ScorerSnapshot | None = None
         """to continue from with the first twin"""
-        self._requests: deque[Request] = deque(maxlen=MOST_REQUESTS)
+        self._requests: list[Request] = []
         """that wait for it"""
         self._held: list[Prediction] = []
         """from the first one of a twin that has not arrived yet, after a restart"""
@@ -83,7 +82,10 @@ class LearnedTwinScorer(Core):
             return [message for prediction in held for message in self.step(prediction)]
         if isinstance(item, Request):
             if self._core is None:
-                self._requests.append(item)
+                if len(self._requests) < MOST_REQUESTS:
+                    self._requests.append(item)
+                else:
+                    self._counts["refused_requests"] += 1
                 return []
             return self._core.step(item)
         if self._held or (item.twin and item.twin not in self._cards):

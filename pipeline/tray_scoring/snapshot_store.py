@@ -83,7 +83,7 @@ class SnapshotStore:
         The last one counts also if it is of another twin: what operators have set since must not be forgotten.
 
         Raises:
-            StageError: the file cannot be read, or the last snapshot has an unknown format.
+            StageError: the file cannot be read or has an unknown format, or what others keep is of a newer version.
         """
         own = self._read()
         if self._elsewhere is None:
@@ -94,7 +94,11 @@ class SnapshotStore:
             self._is_asked = True
             from_what = "from the file here" if own else "without a snapshot"
             self.note = f"continued {from_what}: {why}" if why else ""
-        found = [*([own] if own else []), *self._kept]
+        newest_known = max(SNAPSHOT.read)
+        kept = [each for each in self._kept if each.format in SNAPSHOT.read or each.format > newest_known]
+        if self._kept and not kept:
+            self.note = "what the recorder keeps is of an older version of fantwin, and was left out"
+        found = [*([own] if own else []), *kept]
         last = max(found, key=lambda each: (each.t_ns <= self._now_ns + AHEAD_NS, each.t_ns), default=None)
         if last is not None and last is not own:
             self.note = f"continued from the snapshot that the recorder keeps; {_beside(last, own)}"

@@ -59,7 +59,9 @@ def clips_of(monkeypatch: pytest.MonkeyPatch) -> Callable[..., AlarmClips]:
         for name, seconds in (("BEFORE_NS", 0.5), ("AFTER_NS", after_s), ("SETTLED_NS", 0.3)):
             monkeypatch.setattr(tracker, name, round(seconds * SECOND_NS))
         of_recording = ClipTracker(clips_in(list_path(recording)), most_bytes=0)
-        return AlarmClips(of_recording, recording, ClipCutter(recording, lambda: FREE, least_free_bytes=1000).cut)
+        return AlarmClips(
+            of_recording, recording, ClipCutter(recording, lambda: FREE, least_free_bytes=lambda: 1000).cut
+        )
 
     return make
 

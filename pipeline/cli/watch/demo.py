@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -197,6 +198,10 @@ def _draw(out: Path, console: Console) -> None:
         plot_recording(sorted(out.glob("recording*.mcap")), out / "bands.png", truth=out / "truth.json")
 
 
+_TIME = re.compile(r"^\d\d:\d\d:\d\d +")
+"""of an event of `fantwin up`"""
+
+
 def _unfinished(what: str, log: Path) -> UserError:
     return UserError(f"the {what} did not run to its end: {_reason(log)} (full log: {log})")
 
@@ -206,7 +211,7 @@ def _reason(log: Path) -> str:
     lines = lines_of(log)
     for mark in (ERROR_PREFIX, "ended with status", "cannot start", "not arrive", "never ready", "killed"):
         if found := [line for line in lines if mark in line]:
-            return found[-1].removeprefix(ERROR_PREFIX)
+            return _TIME.sub("", found[-1]).removeprefix(ERROR_PREFIX)
     return lines[-1]
 
 

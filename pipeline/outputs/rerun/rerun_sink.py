@@ -184,9 +184,9 @@ class RerunSink:
             StageError: the file cannot be written, or a port is taken.
         """
         grpc_port, web_port = options.grpc_port, options.web_port
-        for key, port in (("grpc_port", grpc_port), ("web_port", web_port)):
+        for what, port in (("viewer.grpc_port", grpc_port), ("the page of viewer.grpc_port", web_port)):
             if port is not None:
-                check_free(port, f"viewer.{key}", "viewer.grpc_port = 0")
+                check_free(port, what, "viewer.grpc_port = 0")
         self._recording = rr.RecordingStream(APPLICATION)
         self._bands = RerunBands(self._recording)
         self._is_fleet = is_fleet(trays)

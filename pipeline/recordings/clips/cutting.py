@@ -59,13 +59,14 @@ class ClipCutter:
     Attributes:
         recording: its first part.
         free_bytes: of its disk; raises DiskError.
-        least_free_bytes: half of it may be used while a clip is written, until the oldest part is deleted.
+        least_free_bytes: that stay free; half of them may be used while a clip is written, until the oldest part is
+            deleted.
         margin_s: of raw samples before all else.
     """
 
     recording: Path
     free_bytes: Callable[[], int]
-    least_free_bytes: int = 0
+    least_free_bytes: Callable[[], int] = lambda: 0
     margin_s: float = CLOCK_MARGIN_S
 
     def cut(self, clip: Clip) -> CutResult:
@@ -73,7 +74,7 @@ class ClipCutter:
         path = clip_folder(self.recording) / clip.name
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            self._require(self.least_free_bytes + ROOM_BYTES)
+            self._require(self.least_free_bytes() + ROOM_BYTES)
             lacks = self._write(clip, path)
             return CutResult(clip.name, path.stat().st_size, lacks)
         except RecordingError as error:
@@ -125,7 +126,7 @@ class ClipCutter:
                         writer.add(envelope)
                         topics.add(envelope.topic)
                 time.sleep(REST_S)
-                self._require(self.least_free_bytes // 2)
+                self._require(self.least_free_bytes() // 2)
             if not topics:
                 raise RecordingError("nothing of that time is recorded any more")
         return lacks or ("" if "raw" in topics else "it has no raw samples")

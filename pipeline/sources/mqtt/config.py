@@ -65,6 +65,9 @@ class MqttConfig(SourceConfig, BrokerSettings, frozen=True):
 
     @model_validator(mode="after")
     def _topics_fit(self) -> Self:
+        for name in ("topic", "command_topic", "send_topic"):
+            if set("{}") & set(_FAN.sub("", getattr(self, name))):
+                raise ValueError(f"{name}: braces hold the number of the first fan, as in plant/fan{{1}}/rpm")
         if self.has_values and not self.command_topic:
             raise ValueError("give command_topic: without the commands nothing can be judged")
         for name in ("topic", "command_topic") if self.command_topic else ():

@@ -13,6 +13,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
+from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.extras import require
 from fantwin.pipeline.sources.json_samples import JsonSamplesError, batches_of, parse_samples
 from fantwin.pipeline.sources.mqtt.client import NOT_REACHED, connection_problems, new_client, refusal
@@ -102,6 +103,8 @@ class MqttSource:
             for fan in range(context.fans if config.has_values else 1)
         }
         """subscribed topics; of numbers, with the fan of the topic, and whether it is its speed"""
+        if config.has_values and len(self._topics) < 2 * context.fans:
+            raise UserError("source mqtt: topic and command_topic of two fans are the same topic")
         self._recent: deque[tuple[str, bytes]] = deque(maxlen=MOST_RECENT)
         self._is_up = False
         self._is_refused = False

@@ -162,7 +162,9 @@ def test_what_cannot_be_written_leaves_no_file_and_can_be_tried_again(undisturbe
     assert result.may_pass and not result.size_bytes and "File too large" in result.problem
     assert list(folder.glob("*.mcap*")) == []
     room = iter([5_000_000, 1_000_000, 1_000, 1_000])
-    result = cutter(tmp_path / "recording.mcap", free_bytes=lambda: next(room), least_free_bytes=10_000).cut(clip)
+    result = cutter(tmp_path / "recording.mcap", free_bytes=lambda: next(room), least_free_bytes=lambda: 10_000).cut(
+        clip
+    )
     assert result.may_pass and not result.size_bytes and "0.0 MB are free" in result.problem
     assert list(folder.glob("*.mcap*")) == [], "room ran out while it was written"
     result = cutter(tmp_path / "recording.mcap").cut(clip)

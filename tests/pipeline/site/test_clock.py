@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import threading
+from concurrent.futures import ThreadPoolExecutor, wait
+
 import pytest
 
 from fantwin.pipeline.config.settings import TrayConfig
@@ -13,8 +16,9 @@ from fantwin.schemas.enums import Action
 from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.messages import Request
 from fantwin.schemas.topics import tray_key
+from tests.support.running_chain import DEADLINE_S
 from tests.support.running_core import FANS, SITE, TRAY
-from tests.support.site_messages import score
+from tests.support.site_messages import alarm, score
 
 
 class _Clock:
@@ -27,6 +31,20 @@ class _Clock:
 @pytest.fixture
 def clock() -> _Clock:
     return _Clock()
+
+
+def test_the_bus_never_waits_for_a_disk_on_which_the_history_is_saved(tmp_path, clock, monkeypatch):
+    saving, may_end = threading.Event(), threading.Event()
+    store = AlarmHistory(tmp_path / "alarms.sqlite")
+    monkeypatch.setattr(store, "add", lambda _alarm: (saving.set(), may_end.wait())[0])
+    model = SiteModel(SITE, (TrayConfig(name=TRAY, fans=FANS),), store, now_s=clock)
+    with ThreadPoolExecutor(2) as threads:
+        threads.submit(model.add_alarm, alarm())
+        saving.wait()
+        asked = threads.submit(model.wants_score, TRAY, 1.0)
+        is_wanted = wait([asked], timeout=DEADLINE_S).done
+        may_end.set()
+    assert is_wanted and asked.result()
 
 
 def test_a_tray_without_a_score_is_silent_after_a_while_and_until_its_next_score(tmp_path, clock):

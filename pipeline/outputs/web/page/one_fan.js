@@ -9,6 +9,7 @@ import { ask, learn } from "./server.js";
 import { wearTable } from "./wear.js";
 
 const KEPT_S = 3600;
+const MISSED_S = 2;  // without samples for longer, some were missed
 const HOLE_S = 12;  // without samples for longer, there is a hole in the plots
 const COLUMNS = ["t_s", "measured", "predicted", "half_width", "torque_balance_command", "score", "command"];
 const WINDOWS = [["1 min", 60], ["10 min", 600], ["1 hour", KEPT_S]];
@@ -47,20 +48,18 @@ export class FanView {
     this.begin();
   }
 
-  // Also after the server was away.
+  // Also after the server was away, and after events were missed; one after another.
   begin() {
-    learn(() => this.start());
+    this.begun = (this.begun ?? Promise.resolve()).then(() => learn(() => this.start()));
   }
 
   async start() {
     const past = await ask(`${this.path}/curves?seconds=${KEPT_S}`);
     await this.learn();
     this.speedUnit = past.speed_unit;
-    if (this.plots.length) {  // what has come in the meantime stays, and what a server that has just begun lacks
-      const had = this.columns, before = had.t_s.findIndex((t_s) => t_s >= (past.t_s[0] ?? Infinity));
-      if (before >= 0) this.columns = Object.fromEntries(this.names.map((name) => [name, had[name].slice(0, before)]));
-      this.add(past);
-      this.add(had);
+    if (this.plots.length) {
+      this.columns = this.filled(this.columns, past);
+      this.refresh();
       return;
     }
     const live = this.columns;
@@ -68,6 +67,18 @@ export class FanView {
     this.columns = Object.fromEntries(this.names.map((name) => [name, past[name] ?? past.t_s.map(() => null)]));
     this.draw();
     this.add(live);
+  }
+
+  // The samples of the page, and those of the server where the page has none for a while.
+  filled(had, past) {
+    const rows = [], t_s = had.t_s;
+    let at = 0;
+    past.t_s.forEach((t, i) => {
+      while (t_s[at] < t) rows.push([had, at++]);
+      if (t_s[at] !== t && (t_s[at] ?? Infinity) - (t_s[at - 1] ?? -Infinity) > MISSED_S) rows.push([past, i]);
+    });
+    while (at < t_s.length) rows.push([had, at++]);
+    return Object.fromEntries(this.names.map((name) => [name, rows.map(([of, i]) => of[name]?.[i] ?? null)]));
   }
 
   // What does not come by itself: since when, the twin and the wear.
