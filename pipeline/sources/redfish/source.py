@@ -140,13 +140,15 @@ class RedfishSource(PollingSource):
         return found
 
     def _find_chassis(self) -> Json:
-        members = map(_link, _list(self._get("/redfish/v1/Chassis"), "Members"))
-        paths = [self._config.chassis] if self._config.chassis else [*filter(None, members)]
+        paths = filter(None, map(_link, _list(self._get("/redfish/v1/Chassis"), "Members")))
         found = {
-            path: chassis for path in paths if {"ThermalSubsystem", "Thermal"} & (chassis := self._get(path)).keys()
+            path.rstrip("/"): chassis
+            for path in paths
+            if {"ThermalSubsystem", "Thermal"} & (chassis := self._get(path)).keys()
         }
-        if len(found) == 1:
-            return next(iter(found.values()))
+        wanted = [self._config.chassis] if self._config.chassis else list(found)
+        if len(wanted) == 1 and wanted[0] in found:
+            return found[wanted[0]]
         raise DeviceError(f"chassis with fans: {', '.join(found) or 'none'}; let source.url end with the path of one")
 
     def _fan_objects(self) -> list[Json]:

@@ -70,7 +70,9 @@ def test_what_does_not_fit_the_controller_is_one_line() -> None:
             connected(url, fans=["FAN9", "FAN1"]).read()
         with pytest.raises(DeviceError, match="^2 fans, this tray has 3"):
             connected(url, 3).read()
-        with pytest.raises(DeviceError, match="^chassis with fans: none; let source.url end with the path of one"):
+        with pytest.raises(
+            DeviceError, match="^chassis with fans: /redfish/v1/Chassis/1U; let source.url end with the path of one"
+        ):
             connected(f"{url}/redfish/v1/Chassis/Rack")
 
 
