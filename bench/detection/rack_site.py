@@ -155,7 +155,7 @@ class RackSite:
         self._versions = TwinVersions(learned, name)
         self._seen = pickle.loads((place / SEEN).read_bytes()) if kept.exists() else _Seen(list(changed_days))
         learning = LearningAtOnce(learned, name, DECLARED_PER_DAY, self._seen.learning_s)
-        self._learner = LearnerCore(RACK_FANS, of.config, history, self._versions, OrdinaryOperation(tray), learning)
+        self._learner = LearnerCore(RACK_FANS, history, self._versions, OrdinaryOperation(tray), learning)
         self._stages: list[Core] = [
             load_stage(stage).build(contexts[stage]).core for stage in ("resampler", "twin_integrator", "scorer")
         ]

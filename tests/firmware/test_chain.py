@@ -105,7 +105,7 @@ def test_a_blocked_rotor_on_the_pins_is_an_alarm(board: SimulatedBoard, chain: C
     check_that_the_pins_were_recorded(trace, clock_s, raws)
     raised = [alarm for alarm in alarms if alarm.transition == Transition.RAISED]
     if behind_s < CATCHES_UP_S:
-        assert {alarm.fan for alarm in raised} == {FAN}, [alarm.message for alarm in raised]
+        assert {alarm.fan for alarm in raised} == {FAN}, ([alarm.message for alarm in raised], pace)
     raised = [alarm for alarm in raised if alarm.fan == FAN]
     received_s = np.concatenate([raw.host_receive_t_ns for raw in raws]) / NS_PER_S
     blocked_s = trace.blocked_s[FAN][0]

@@ -36,7 +36,7 @@ class Consumer:
         producer: str = "p",
         *,
         has_more: bool = False,
-        **fields: object,
+        **fields: Any,
     ) -> None:
         own, another = (
             Output(key=KEY, published=published, has_more=has_more),
