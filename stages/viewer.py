@@ -29,7 +29,7 @@ from fantwin.pipeline.site.fleet import Fan
 from fantwin.pipeline.site.loopback import check_free
 
 PAGE_ABOVE_DATA = 100
-"""between the port of the data and that of the page, as between those that Rerun takes by itself"""
+"""distance from the port of the data to that of the page, so that a hundred shards have room on one host"""
 PORTS = {"grpc_port": "viewer.grpc_port", "web_port": "the page of viewer.grpc_port"}
 FILE_BYTES = 1_000_000_000
 """size at which the view's file ends"""

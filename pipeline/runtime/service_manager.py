@@ -42,7 +42,7 @@ class SignsOfLife:
 
     @classmethod
     def from_environment(cls) -> SignsOfLife:
-        """The notifier that the environment asks for."""
+        """The signs of life that the environment asks for."""
         file = os.environ.get(FILE_VARIABLE)
         return cls(os.environ.get(VARIABLE), Path(file) if file else None)
 

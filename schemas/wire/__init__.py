@@ -35,7 +35,7 @@ DELIMITERS: dict[Protocol, bytes] = {"binary": b"\0", "text": b"\n"}
 """between frames; one more is no frame and no fault"""
 
 MAX_FRAME_BYTES = 16 * MAX_FANS * (2 + len(CHANNELS))
-"""of both forms: a number takes at most so much of a text line; bounds the memory of a decoder"""
+"""longest frame of both forms, 16 bytes for each number of a text line; it bounds the memory of a decoder"""
 
 
 def encode(protocol: Protocol, frame: Frame) -> bytes:

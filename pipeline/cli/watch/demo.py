@@ -199,7 +199,7 @@ def _draw(out: Path, console: Console) -> None:
 
 
 _TIME = re.compile(r"^\d\d:\d\d:\d\d +")
-"""of an event of `fantwin up`"""
+"""time at the beginning of an event of `fantwin up`"""
 
 
 def _unfinished(what: str, log: Path) -> UserError:
