@@ -11,7 +11,6 @@ import numpy as np
 
 from fantwin.schemas.tacho import INSTANTANEOUS
 from fantwin.schemas.twin_card import DataCard, TrainingCard, TwinCard
-from fantwin.twin.each_network import ForEachNetwork, one_after_another
 from fantwin.twin.errors import TwinError
 from fantwin.twin.evaluation.accuracy import (
     Evaluation,
@@ -36,6 +35,7 @@ from fantwin.twin.kinds import ModelKind, find_kind
 from fantwin.twin.models.fan_ode import NetworkOde
 from fantwin.twin.models.model import Model
 from fantwin.twin.models.physics import PARAMETER_NAMES
+from fantwin.twin.network_training import ForEachNetwork, one_after_another
 from fantwin.twin.progress import Progress, unreported, within
 from fantwin.twin.reference import at_reference
 from fantwin.twin.runs import Array, Run, common_fans, common_tacho

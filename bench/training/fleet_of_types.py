@@ -2,8 +2,8 @@
 
 The plant is that of `fantwin simulate` (simulation.plant) with three sets of nominal parameters; the fans of a type
 differ by a normal variation of each parameter, friction and electrical lag included. A twin of each type is trained on
-a few fans; others are placed by some minutes of their own (twin.placing). Their errors are those of another run, under
-other random stairs, as multiples of the floor, which is the tacho's own error in that run.
+a few fans; others are placed by some minutes of their own (twin.twin_of_type). Their errors are those of another run,
+under other random stairs, as multiples of the floor, which is the tacho's own error in that run.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from fantwin.twin.evaluation.accuracy import Evaluation, sums_of_model
 from fantwin.twin.finishing import TrainedTwin
 from fantwin.twin.fitting.fans_of_a_type import TypeOfFans
 from fantwin.twin.models.physical import physical_parameters
-from fantwin.twin.placing import place_twin
 from fantwin.twin.runs import Run
+from fantwin.twin.twin_of_type import place_twin
 
 TYPES = {
     "bench fan": FanParameters(),

@@ -160,12 +160,12 @@ class RecordingsInParallel:
     def each_network(
         self, work: Callable[[Item, Progress], Result], items: Sequence[Item], doing: str, progress: Progress
     ) -> list[Result]:
-        """A twin.each_network.ForEachNetwork with processes of this host.
+        """A twin.network_training.ForEachNetwork with processes of this host.
 
         Raises:
             UserError: a process was ended from outside.
         """
-        from fantwin.twin.each_network import one_after_another  # noqa: PLC0415  loaded only when it is needed
+        from fantwin.twin.network_training import one_after_another  # noqa: PLC0415  loaded only when it is needed
 
         jobs = min(self.jobs, len(items))
         if jobs == 1:

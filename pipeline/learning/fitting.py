@@ -20,8 +20,8 @@ from fantwin.pipeline.replay.offline.kept_bins import KeptBins
 from fantwin.scoring.calibration.calibration import Calibration
 
 if TYPE_CHECKING:
-    from fantwin.twin.each_network import ForEachNetwork
     from fantwin.twin.finishing import TrainedTwin
+    from fantwin.twin.network_training import ForEachNetwork
     from fantwin.twin.progress import Progress
 
 
@@ -61,8 +61,8 @@ def fit_twin(
         TwinError: the data do not suffice.
     """
     from fantwin.twin.build import train_twin  # noqa: PLC0415  the command line loads twin only when it is needed
-    from fantwin.twin.each_network import one_after_another  # noqa: PLC0415
     from fantwin.twin.kinds import find_kind  # noqa: PLC0415
+    from fantwin.twin.network_training import one_after_another  # noqa: PLC0415
     from fantwin.twin.progress import unreported  # noqa: PLC0415
 
     can_average = find_kind(settings.model).has_ode_network and settings.trainer == DEFAULT_SETTINGS.trainer

@@ -15,7 +15,7 @@ from pydantic import ValidationError
 
 from fantwin.pipeline.errors import UsageError, UserError
 from fantwin.pipeline.recordings.checksum import sha256_of
-from fantwin.pipeline.recordings.runs import RecordedRun, RecordedTray, read_runs
+from fantwin.pipeline.recordings.training_runs import RecordedRun, RecordedTray, read_runs
 from fantwin.pipeline.replay.offline.healthy_runs import MapRecordings
 from fantwin.pipeline.sources.tables.measured_table import RAD_S_PER_TABLE_UNIT
 from fantwin.pipeline.sources.tacho_evidence import tacho_hints

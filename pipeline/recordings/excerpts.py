@@ -3,8 +3,8 @@
 The device clock is followed from CLOCK_MARGIN_S before an excerpt, not from the start of the recording. By then the
 mapping to host time rests on the same least delayed samples (a sliding window of 60 s, pipeline.timebase.device_clock),
 and its times have approached the same line: with delays of milliseconds, within 0.1 ms. The time between neighbouring
-samples stays that of the device clock. pipeline.recordings.runs reads all of a recording, and its times are exactly
-those of the pipeline.
+samples stays that of the device clock. pipeline.recordings.training_runs reads all of a recording, and its times are
+exactly those of the pipeline.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from mcap.records import ChunkIndex
 from fantwin.pipeline.recordings.indexed import IndexedRecording
 from fantwin.pipeline.recordings.reading import RecordingError, read_recording
 from fantwin.pipeline.recordings.records import CORRUPT_DATA_ERRORS
-from fantwin.pipeline.recordings.runs import RecordedTray, no_samples, only_tray, recorded_tray, segments_of
+from fantwin.pipeline.recordings.training_runs import RecordedTray, no_samples, only_tray, recorded_tray, segments_of
 from fantwin.schemas.codec import CodecError
 from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.messages import Raw

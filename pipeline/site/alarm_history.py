@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from fantwin.pipeline.errors import UserError
-from fantwin.pipeline.site.store import Store
+from fantwin.pipeline.site.sqlite_file import Store
 from fantwin.schemas.codec import CodecError, decode, encode
 from fantwin.schemas.messages import Alarm
 

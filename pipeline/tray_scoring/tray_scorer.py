@@ -2,7 +2,7 @@
 
 Samples become bins (scoring.model.bins). At the end of each, the model of a healthy fan and the evidence for its faults
 are brought up to date (scoring.model.decision), fans that stand or turn against their command are looked for
-(scoring.standing), and so is slow wear (scoring.wear). Whatever is wrong becomes one alarm of the fan, with a state
+(scoring.as_commanded), and so is slow wear (scoring.wear). Whatever is wrong becomes one alarm of the fan, with a state
 after OPC UA Part 9 (scoring.alarms) and causes (scoring.diagnosis). They are built and connected here.
 See docs/explanation/deciding.md.
 """
@@ -23,6 +23,8 @@ from fantwin.scoring.alarms.alarm_manager import AlarmManager, Measured
 from fantwin.scoring.alarms.alarm_text import AlarmText
 from fantwin.scoring.alarms.alarms_of_tray import Decided
 from fantwin.scoring.alarms.unscored_monitor import REASONS
+from fantwin.scoring.as_commanded.against_command import KINDS, AgainstCommand
+from fantwin.scoring.as_commanded.stands_still import Falls
 from fantwin.scoring.diagnosis.causes import CANNOT_TELL, CAUSES, SENSOR_DROPOUT, SLOW_CHANGE, is_of_standstill
 from fantwin.scoring.diagnosis.ranked_causes import KNOWN_SOON, CauseWords, PossibleCause, SeenSinceOnset
 from fantwin.scoring.diagnosis.standstill_causes import Standing, standstill_causes
@@ -31,8 +33,6 @@ from fantwin.scoring.model.decision import Decision
 from fantwin.scoring.samples import IDLE, among, arrived
 from fantwin.scoring.saved import Saved, part
 from fantwin.scoring.score_message import ScoreColumns, score_of
-from fantwin.scoring.standing.against_command import KINDS, AgainstCommand
-from fantwin.scoring.standing.stands_still import Falls
 from fantwin.scoring.wear.wear_monitor import WearMonitor
 
 SMALLEST_SHARE = 0.0005  # smaller ones are not named

@@ -2,7 +2,7 @@
 
 A bin is a fixed interval of time since the epoch, so how samples are cut into messages changes nothing. Within a bin of
 several samples, one far from their median is marked as wrong. It does not count unless later readings agree with it
-(scoring.model.wrong).
+(scoring.model.wrong_readings).
 """
 
 from __future__ import annotations

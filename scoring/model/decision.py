@@ -10,14 +10,14 @@ import numpy as np
 from fantwin.schemas.messages import Array
 from fantwin.schemas.units import NS_PER_S
 from fantwin.scoring.model.bins import Bin
+from fantwin.scoring.model.evidence_in_alarm import FansInAlarm
 from fantwin.scoring.model.faults import BEFORE_GROWTH, FAULTS, forces
 from fantwin.scoring.model.healthy import FAULT, SLOW, SLOWEST_RAD_S, HealthyFans
-from fantwin.scoring.model.in_alarm import FansInAlarm
-from fantwin.scoring.model.missing import MissingReadings
+from fantwin.scoring.model.missing_readings import MissingReadings
 from fantwin.scoring.model.onsets import Evidence, Hypotheses
 from fantwin.scoring.model.operation import Fans, Inputs, Operation
 from fantwin.scoring.model.population import Priors
-from fantwin.scoring.model.wrong import FAR_SIGMAS, WrongReadings
+from fantwin.scoring.model.wrong_readings import FAR_SIGMAS, WrongReadings
 from fantwin.scoring.saved import Saved
 
 AGREED_SIGMAS = 8.0

@@ -28,7 +28,7 @@ from fantwin.pipeline.runtime.stage import Context
 from fantwin.pipeline.sources.http.config import HttpConfig
 from fantwin.pipeline.sources.http.source import HttpSource
 from fantwin.pipeline.sources.mqtt.client import new_client
-from fantwin.pipeline.sources.mqtt.settings import BrokerSettings
+from fantwin.pipeline.sources.mqtt.connection import BrokerSettings
 from fantwin.pipeline.sources.source import SourceContext
 from fantwin.stages import gateway, opcua
 from tests.support.ports import free_port

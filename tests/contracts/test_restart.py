@@ -26,8 +26,8 @@ from fantwin.schemas.standstill import Standstill
 from fantwin.schemas.tacho import Tacho
 from fantwin.scoring.alarms.alarm_state import DATA_LOST_AFTER_NS
 from fantwin.scoring.alarms.alarms_of_tray import AlarmsOfTray, Decided
+from fantwin.scoring.as_commanded.against_command import AgainstCommand
 from fantwin.scoring.saved import as_json, from_json
-from fantwin.scoring.standing.against_command import AgainstCommand
 from tests.support.scored_blocks import core_of, prediction_of, request_of
 
 FANS, BLOCK = 3, 20

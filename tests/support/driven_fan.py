@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 
 from fantwin.schemas.tacho import Tacho
-from fantwin.twin.measurement import measurement_of
 from fantwin.twin.models.drive import Drive
 from fantwin.twin.models.physical import PhysicalModel
 from fantwin.twin.runs import Run
+from fantwin.twin.tacho_readings import measurement_of
 
 DRIVE = Drive(turning_command=10.0, kick_s=0.6, rest_s=2.0)
 PHYSICS = np.array([[0.35, 0.25, 5e-4, 0.0]])

@@ -12,7 +12,7 @@ import pandas as pd
 import pytest
 
 from fantwin.pipeline.recordings.reading import read_recording
-from fantwin.pipeline.recordings.runs import read_runs
+from fantwin.pipeline.recordings.training_runs import read_runs
 from fantwin.schemas.enums import InvalidReason
 from tests.support.fantwin_command import fantwin
 

@@ -3,7 +3,7 @@
 The main figures are those of the free run: it starts from the first five measured speeds, as a deployed twin does, and
 is driven by the commands alone. Runs are split at long gaps and restarted after them. The one-step error, from measured
 speeds to the next one, is given for comparison and is a weak measure. Missing samples are ignored. What the tachos are
-expected to show of the free run is compared with what they showed (twin.measurement), from when on a reading shows
+expected to show of the free run is compared with what they showed (twin.tacho_readings), from when on a reading shows
 nothing of the time before the start. RMSE, maximum error
 and R2 are equations (32) to (34) of Peng and Chen, the band of two sigma (35) and (36).
 """
@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 
 from fantwin.schemas.units import NS_PER_S
 from fantwin.twin.errors import TwinError
-from fantwin.twin.measurement import Measurement, measurement_of
 from fantwin.twin.models.model import TwinModel
 from fantwin.twin.runs import Array, Run, common_fans, starting_samples, starting_speed_rad_s
+from fantwin.twin.tacho_readings import Measurement, measurement_of
 
 Flags = NDArray[np.bool_]
 UnseenStd = Callable[[Array, Array], Array]

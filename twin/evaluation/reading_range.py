@@ -14,9 +14,9 @@ from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 from fantwin.schemas.standstill import Standstill
 from fantwin.twin.evaluation.accuracy import compared_readings, free_run_speeds
-from fantwin.twin.measurement import measurement_of
 from fantwin.twin.models.model import TwinModel
 from fantwin.twin.runs import Array, Run
+from fantwin.twin.tacho_readings import measurement_of
 
 SHORT_AGE = 1e-3
 """of a window: an age that hardly differs from none"""

@@ -13,7 +13,7 @@ twin.models.lag) and m_k the mean of w_k and w_k+1,
     f_k+1 = a f_k + (1 - a) x_k,    f_0 = 0,        balance_k = f_k / (1 - a^k)
 
 The readings of a tacho that averages take the place of the speed, and v_k is then what that tacho would show of the
-command (twin.measurement): v_k = (M v(t_k) + M v(t_k+1)) / 2.
+command (twin.tacho_readings): v_k = (M v(t_k) + M v(t_k+1)) / 2.
 
 The filter weighs the difference quotient by (1 - a) / h, which is about lambda: white tacho noise of standard deviation
 s makes a balance of about inertia lambda s, whatever the rate.
@@ -58,11 +58,11 @@ from fantwin.twin.errors import TwinError
 from fantwin.twin.evaluation.resampling import resampled
 from fantwin.twin.evaluation.residual_analysis import analyse_residual
 from fantwin.twin.fitting.identification import Identification
-from fantwin.twin.measurement import Measurement, measurement_of
 from fantwin.twin.models.lag import effective_command
 from fantwin.twin.models.physics import LAG
 from fantwin.twin.models.recursion import linear_recursion
 from fantwin.twin.runs import GAP_IN_MEDIAN_PERIODS, Array, Run
+from fantwin.twin.tacho_readings import Measurement, measurement_of
 
 FILTER_RATE_PER_S = 3.0
 COEFFICIENTS = ("inertia", "viscous", "drag", "friction")

@@ -15,10 +15,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from fantwin.twin.measurement import with_measured_command
 from fantwin.twin.models.lag import effective_command
 from fantwin.twin.models.recursion import linear_recursion
 from fantwin.twin.runs import Array, Run
+from fantwin.twin.tacho_readings import with_measured_command
 
 Basis = Callable[[Array, Array], Array]
 """Speed (n,) and command (n,) to the regressors phi (n, P)."""

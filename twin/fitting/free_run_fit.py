@@ -2,7 +2,7 @@
 
 Minimises the sum of a pseudo-Huber loss of (reading - that of the free run) / scale over every sample that is compared;
 if asked, with what is known of the errors of readings (twin.fitting.reading_errors). What the tachos are expected
-to show of a free run is linear in it (twin.measurement), and so in its sensitivities. The unknowns are
+to show of a free run is linear in it (twin.tacho_readings), and so in its sensitivities. The unknowns are
 
     the weights of a network, shared by all fans,
     each fan's own physics (twin.models.physical: ln J, two ln dampings, lag), and

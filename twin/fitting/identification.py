@@ -2,7 +2,7 @@
 
 First the filtering operator (twin.fitting.filtering): least squares for a = alpha / J, a_N = C_D / J and b = 1 / J,
 equations (11) to (20) of Peng and Chen, on the readings and on the commands as the tacho would show them
-(twin.measurement). Its one free choice, lambda, is made by the data: of a ladder of values, the
+(twin.tacho_readings). Its one free choice, lambda, is made by the data: of a ladder of values, the
 largest whose parameters give nearly the smallest free-run error. A small lambda is sensitive to slow drift; a large one
 follows the response to the command, which is what has to be learned.
 
@@ -40,7 +40,6 @@ from fantwin.twin.fitting.identifiability import (
 )
 from fantwin.twin.fitting.reading_errors import robust_scale
 from fantwin.twin.fitting.trajectories import Trajectories, cut_into_trajectories, stretch_samples
-from fantwin.twin.measurement import with_measured_command
 from fantwin.twin.models import physics
 from fantwin.twin.models.integration import free_run
 from fantwin.twin.models.physical import PhysicalModel, fitted_unknowns, physical_parameters
@@ -48,6 +47,7 @@ from fantwin.twin.models.physics import LAG, PARAMETER_NAMES
 from fantwin.twin.models.right_hand_side import FanEquation
 from fantwin.twin.progress import Progress, unreported
 from fantwin.twin.runs import Array, Run, common_fans
+from fantwin.twin.tacho_readings import with_measured_command
 
 LAMBDA_LADDER = 9
 COLUMNS_AT_ONCE = 320  # fans times rungs: fewer cost as much as these, more need more memory

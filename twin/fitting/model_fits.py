@@ -6,7 +6,6 @@ from typing import Literal
 
 import numpy as np
 
-from fantwin.twin.each_network import ForEachNetwork, one_after_another
 from fantwin.twin.errors import TwinError
 from fantwin.twin.evaluation.accuracy import evaluation_pieces
 from fantwin.twin.fitting import narx_training
@@ -19,6 +18,7 @@ from fantwin.twin.models.fan_ode import FanOde, NetworkOde
 from fantwin.twin.models.model import Model
 from fantwin.twin.models.network import TanhNetwork
 from fantwin.twin.models.physical import PhysicalModel
+from fantwin.twin.network_training import ForEachNetwork, one_after_another
 from fantwin.twin.progress import Progress, unreported
 from fantwin.twin.runs import Array, Run
 

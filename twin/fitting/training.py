@@ -25,7 +25,6 @@ from functools import partial
 
 import numpy as np
 
-from fantwin.twin.each_network import ForEachNetwork, one_after_another
 from fantwin.twin.evaluation.accuracy import evaluation_pieces
 from fantwin.twin.fitting.free_run_fit import FreeRunFit, fit_free_run
 from fantwin.twin.fitting.free_run_problem import FreeRunProblem, NetworkPrior, Point, Prior, Unknowns
@@ -47,6 +46,7 @@ from fantwin.twin.models.integration import WIDE_BATCH
 from fantwin.twin.models.network import Scaling
 from fantwin.twin.models.physical import PhysicalModel, fitted_unknowns, physical_parameters
 from fantwin.twin.models.physics import LAG
+from fantwin.twin.network_training import ForEachNetwork, one_after_another
 from fantwin.twin.progress import Progress, unreported
 from fantwin.twin.runs import Array, Run
 

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from fantwin.schemas.tacho import Tacho
 from fantwin.twin.errors import TwinError
-from fantwin.twin.measurement import Measurement
 from fantwin.twin.runs import Array, Run, common_tacho, starting_samples, starting_speed_rad_s
+from fantwin.twin.tacho_readings import Measurement
 
 MIN_SAMPLES = 200
 MAX_SAMPLES = 12_000

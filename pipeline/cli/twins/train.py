@@ -190,7 +190,7 @@ def _chosen(names: str) -> list[ModelKind]:
 def _place(
     type_twin: Path, training_data: TrainingData, held_out: TrainingData | None, name: str, progress: Progress
 ) -> TrainedTwin:
-    from fantwin.twin.placing import place_twin  # noqa: PLC0415  loads twin only when it is needed
+    from fantwin.twin.twin_of_type import place_twin  # noqa: PLC0415  loads twin only when it is needed
 
     return place_twin(
         type_twin,

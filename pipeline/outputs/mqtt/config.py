@@ -7,7 +7,7 @@ from pydantic import Field
 from fantwin.pipeline.config.settings import Name
 from fantwin.pipeline.runtime.stage import StageConfig
 from fantwin.pipeline.site.request_desk import OperatorAction
-from fantwin.pipeline.sources.mqtt.settings import BrokerSettings
+from fantwin.pipeline.sources.mqtt.connection import BrokerSettings
 
 
 class MqttConfig(StageConfig, BrokerSettings, frozen=True):  # pyright: ignore[reportGeneralTypeIssues]  both are frozen

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from fantwin.pipeline.outputs.mqtt.config import MqttConfig
 from fantwin.pipeline.outputs.mqtt.outbox import Outgoing
 from fantwin.pipeline.sources.mqtt.client import new_client, refusal
-from fantwin.pipeline.sources.mqtt.settings import KEEPALIVE_S
+from fantwin.pipeline.sources.mqtt.connection import KEEPALIVE_S
 
 if TYPE_CHECKING:
     from paho.mqtt.client import Client, MQTTMessage

@@ -7,7 +7,7 @@ import threading
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from fantwin.pipeline.sources.mqtt.settings import KEEPALIVE_S, BrokerSettings
+from fantwin.pipeline.sources.mqtt.connection import KEEPALIVE_S, BrokerSettings
 
 if TYPE_CHECKING:
     from paho.mqtt.client import Client

@@ -7,7 +7,7 @@ from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
-from fantwin.pipeline.sources.mqtt.settings import BrokerSettings
+from fantwin.pipeline.sources.mqtt.connection import BrokerSettings
 from fantwin.pipeline.sources.source import SourceConfig
 
 _FAN = re.compile(r"\{(\d+)\}")

@@ -18,7 +18,7 @@ from fantwin.pipeline.extras import require
 from fantwin.pipeline.sources.json_samples import JsonSamplesError, batches_of, parse_samples
 from fantwin.pipeline.sources.mqtt.client import NOT_REACHED, connection_problems, new_client, refusal
 from fantwin.pipeline.sources.mqtt.config import MqttConfig, is_of_each_fan, of_fan
-from fantwin.pipeline.sources.mqtt.settings import KEEPALIVE_S
+from fantwin.pipeline.sources.mqtt.connection import KEEPALIVE_S
 from fantwin.pipeline.sources.source import (
     LinkDown,
     LinkUp,

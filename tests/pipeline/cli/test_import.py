@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from fantwin.pipeline.recordings.reading import read_metadata, read_recording
-from fantwin.pipeline.recordings.runs import read_runs
+from fantwin.pipeline.recordings.training_runs import read_runs
 from fantwin.pipeline.replay.resolve_config import default_config, first_raw
 from fantwin.schemas.messages import Array
 from fantwin.schemas.tacho import Tacho

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from fantwin.pipeline.recordings.reading import read_recording
-from fantwin.pipeline.recordings.runs import read_runs
+from fantwin.pipeline.recordings.training_runs import read_runs
 from fantwin.schemas.messages import Raw
 from fantwin.schemas.tacho import Tacho
 from tests.support.fantwin_command import error_of, fantwin

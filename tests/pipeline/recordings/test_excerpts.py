@@ -9,7 +9,7 @@ import pytest
 
 from fantwin.pipeline.recordings.excerpts import ExcerptReader
 from fantwin.pipeline.recordings.reading import RecordingError
-from fantwin.pipeline.recordings.runs import read_runs
+from fantwin.pipeline.recordings.training_runs import read_runs
 from fantwin.pipeline.recordings.writing import RecordingWriter
 from fantwin.schemas import envelope
 from fantwin.schemas.header import Header

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from fantwin.pipeline.recordings.reading import RecordingError
-from fantwin.pipeline.recordings.runs import read_runs
+from fantwin.pipeline.recordings.training_runs import read_runs
 from fantwin.pipeline.recordings.writing import RecordingWriter
 from fantwin.schemas.enums import TachoKind
 from fantwin.schemas.header import Header

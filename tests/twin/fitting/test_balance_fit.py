@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from bench.training import published_fan
-from fantwin.pipeline.recordings.runs import read_runs
+from fantwin.pipeline.recordings.training_runs import read_runs
 from fantwin.schemas.tacho import Tacho
 from fantwin.schemas.twin_card import BalanceCard
 from fantwin.simulation.plant import FanParameters, advance, at_rest

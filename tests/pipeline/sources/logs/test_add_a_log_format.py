@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fantwin.pipeline.recordings.runs import read_runs
+from fantwin.pipeline.recordings.training_runs import read_runs
 from fantwin.pipeline.sources.logs import formats
 from fantwin.pipeline.sources.logs.formats import LogFormat
 from fantwin.pipeline.sources.logs.log_file import Series

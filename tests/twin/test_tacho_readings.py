@@ -11,8 +11,8 @@ from fantwin.twin.build import evaluate, train_twin
 from fantwin.twin.errors import TwinError
 from fantwin.twin.finishing import TrainedTwin
 from fantwin.twin.fitting.identification import identify
-from fantwin.twin.measurement import Measurement, measurement_of
 from fantwin.twin.runs import Run
+from fantwin.twin.tacho_readings import Measurement, measurement_of
 from tests.support.fan_data import PUBLISHED_PARAMETERS, counted_run
 from tests.support.made_once import TrainedOnce
 

@@ -16,10 +16,10 @@ from fantwin.schemas.messages import Array
 from fantwin.schemas.standstill import Standstill
 from fantwin.schemas.tacho import Tacho
 from fantwin.schemas.units import NS_PER_S
+from fantwin.scoring.as_commanded.time_limits import Durations, lapse_limit_s, start_limit_s
 from fantwin.scoring.diagnosis.standstill_causes import Fall, Standing
 from fantwin.scoring.model.operation import Fans, Inputs
 from fantwin.scoring.saved import Saved
-from fantwin.scoring.standing.time_limits import Durations, lapse_limit_s, start_limit_s
 
 STANDS, FALLS = 0.08, 0.85
 """shares of the expected speed: below, a fan stands; above, it has not begun to fall"""

@@ -20,9 +20,9 @@ from fantwin.schemas.messages import Array
 from fantwin.schemas.standstill import SLOWED_SHARE, Standstill
 from fantwin.schemas.tacho import Tacho
 from fantwin.schemas.units import NS_PER_S
+from fantwin.scoring.as_commanded.time_limits import Durations, coast_limit_s, lag_s, slowing_limit_s
 from fantwin.scoring.diagnosis.standstill_causes import Standing
 from fantwin.scoring.saved import Saved
-from fantwin.scoring.standing.time_limits import Durations, coast_limit_s, lag_s, slowing_limit_s
 
 PEAK_STEPS = 64.0  # in a rad/s: peaks are rounded, so that sums with the next are exact, however blocks are cut
 BEYOND_SPEEDS_RAD_S = 2.0**20

@@ -9,7 +9,7 @@ import numpy as np
 from fantwin.schemas.messages import Prediction
 from fantwin.schemas.standstill import Standstill
 from fantwin.schemas.tacho import Tacho
-from fantwin.scoring.standing.against_command import AgainstCommand
+from fantwin.scoring.as_commanded.against_command import AgainstCommand
 from tests.support.scored_blocks import prediction_of
 
 HOUR_NS = 3_600_000_000_000

@@ -13,8 +13,8 @@ from fantwin.twin.errors import TwinError
 from fantwin.twin.evaluation.resampling import thinned
 from fantwin.twin.export.onnx_twin import OnnxTwin
 from fantwin.twin.finishing import TrainedTwin
-from fantwin.twin.placing import place_twin
 from fantwin.twin.runs import Array, Run
+from fantwin.twin.twin_of_type import place_twin
 from tests.support import fan_data
 from tests.support.made_once import TrainedOnce
 

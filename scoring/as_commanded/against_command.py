@@ -10,14 +10,14 @@ from fantwin.schemas.messages import Array, Prediction
 from fantwin.schemas.standstill import Standstill
 from fantwin.schemas.tacho import Tacho
 from fantwin.schemas.units import NS_PER_S
+from fantwin.scoring.as_commanded import runs_on, stands_still
+from fantwin.scoring.as_commanded.runs_on import RunsOn
+from fantwin.scoring.as_commanded.stands_still import StandsStill
+from fantwin.scoring.as_commanded.time_limits import Durations
 from fantwin.scoring.column_state import NEVER_NS
 from fantwin.scoring.diagnosis.standstill_causes import Standing
 from fantwin.scoring.samples import arrived
 from fantwin.scoring.saved import Saved
-from fantwin.scoring.standing import runs_on, stands_still
-from fantwin.scoring.standing.runs_on import RunsOn
-from fantwin.scoring.standing.stands_still import StandsStill
-from fantwin.scoring.standing.time_limits import Durations
 
 CERTAIN = 2.0
 """score of a fan that does not do as commanded"""

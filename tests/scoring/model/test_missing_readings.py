@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import poisson
 
 from fantwin.schemas.messages import Array
-from fantwin.scoring.model.missing import MissingReadings
+from fantwin.scoring.model.missing_readings import MissingReadings
 
 FANS, DECLARED = 200, 2000
 SURE = 0.999
