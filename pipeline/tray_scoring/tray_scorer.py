@@ -98,12 +98,10 @@ class TrayScorer(Saved):
         """(fans,) against its command"""
         self._kind = np.zeros(fans, np.int64)
         """(fans,) what it does against its command, number in KINDS"""
-        self._seen = np.zeros((4, fans))
-        """(4, fans) lowest and highest speed, lowest and highest command since an alarm was raised"""
+        self._seen = np.full((4, fans), np.nan)
+        """(4, fans) lowest and highest speed, lowest and highest command since an alarm was raised; NaN: not known"""
         self._command = np.zeros(fans)
         """(fans,) newest command"""
-        self._is_commissioned = np.zeros(fans, np.bool_)
-        """(fans,) true where it has just been commissioned, which ends its alarm, whether there are samples or not"""
         self._now = ScoreColumns.empty(fans)
 
     def _open(self, period_ns: int) -> None:
@@ -147,7 +145,7 @@ class TrayScorer(Saved):
         """Forget what was learned of some fans, (fans,) of bool, after the sample at t_ns."""
         if fans.any():
             self._decision.begin_again(fans)
-            self._is_commissioned |= fans
+            self.alarms.state.commissioned += np.flatnonzero(fans).tolist()
             self.wear.forget(fans, t_ns)
             if self._against:
                 self._against.forget(fans)
@@ -243,8 +241,9 @@ class TrayScorer(Saved):
         active = decision.has_alarm | self._stands | is_worn
         idle = among(item.invalid_reason[row], *IDLE)
         is_silent = (decision.missing.is_active | self._stands) & arrived(item.invalid_reason[row])
-        judged = one.judged | idle | is_silent | self._is_commissioned
-        self._is_commissioned[:] = False
+        judged = one.judged | idle | is_silent
+        judged[self.alarms.state.commissioned] = True
+        self.alarms.state.commissioned = []
         self._see(one, self.alarms.active)
         self._now = self._columns(score, active, is_worn, against.score[row] if against else np.zeros(self.fans))
         is_large = self._stands | (np.abs(decision.fault[0]) >= self._alarm_share)

@@ -74,11 +74,14 @@ class AlarmsState:
     """the last message about each fan"""
     answered: dict[str, int] = field(default_factory=dict)
     """sequence of the first request that is not answered, for each producer of requests"""
+    commissioned: list[int] = field(default_factory=list)
+    """fans that were commissioned since the last bin: their alarms end with the next one, with or without samples"""
 
     def __post_init__(self) -> None:
         """Raises ValueError: it is damaged."""
         fans = range(len(self.conditions.conditions))
-        if len(self.stood) != len(fans) or not {*self.due_t_ns} <= {*self.last_emitted} <= {*fans}:
+        named = {*self.last_emitted, *self.commissioned}
+        if len(self.stood) != len(fans) or not {*self.due_t_ns} <= {*self.last_emitted} or not named <= {*fans}:
             raise ValueError("alarms of another number of fans")
         if not all(self.due_t_ns.values()) or any(fan != alarm.fan for fan, alarm in self.last_emitted.items()):
             raise ValueError("an alarm without times, or of another fan")

@@ -41,7 +41,7 @@ SMALLEST = 0.01
 FORGETS_S = 60.0
 """longest gap after which earlier evidence still counts"""
 KEPT_FROM = 0.5
-"""score above which a snapshot keeps the evidence of a fan"""
+"""score from which a snapshot keeps the evidence of a fan"""
 HIGHEST_SCORE = 99.0
 
 
@@ -188,7 +188,7 @@ class Decision(Saved):
 
     def arrays(self) -> dict[str, Array]:
         """See Saved. Evidence that is small is not kept, nor that of an alarm, which is in `alarms`."""
-        self._evidence.large = ~self.active & (self.log_statistic > KEPT_FROM * self.log_limit)
+        self._evidence.large = ~self.active & (self.log_statistic >= KEPT_FROM * self.log_limit)
         return super().arrays()
 
     def _rest(self, bins: int) -> None:

@@ -103,7 +103,7 @@ class FansInAlarm(Saved):
             self._varies[1] *= np.where(counts, math.exp(-bin_s / RECENT_S), 1.0)
             both = np.stack((np.square(found.distance_rad_s) / found.variance, squares)).clip(max=FAR)
             self._varies += np.stack((both, np.ones_like(both)), axis=1) * counts
-            self._weigh()
+        self._weigh()  # a reading may have changed that does not count
 
     def rest(self, bins: int, bin_s: float) -> None:
         """Let a gap pass."""
