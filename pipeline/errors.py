@@ -5,7 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 
 
-class UserError(Exception):
+class FantwinError(Exception):
+    """What whoever uses fantwin can correct: one line that says what is wrong, where, and what to do."""
+
+
+FantwinError.__module__ = "fantwin"  # as it is imported, and as a traceback shows it
+
+
+class UserError(FantwinError):
     """One line that says what is wrong, where, and what to do; the command line prints it and exits 1."""
 
 

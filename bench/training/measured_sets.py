@@ -19,8 +19,8 @@ from pathlib import Path
 import pandas as pd
 from scipy.io import loadmat
 
-from fantwin.pipeline.cli.recordings.import_table import write_table
 from fantwin.pipeline.learning.training_data import Part, read_training_data
+from fantwin.pipeline.recordings.raw_recordings import write_table
 from fantwin.pipeline.replay.offline.healthy_runs import in_this_process
 from fantwin.pipeline.sources.tables.measured_table import RAD_S_PER_TABLE_UNIT, read_table
 from fantwin.twin.runs import Run

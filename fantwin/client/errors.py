@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from fantwin.pipeline.errors import FantwinError
 
-class ClientError(Exception):
+
+class ClientError(FantwinError):
     """Base of all errors of this package; the bus itself raises `fantwin.client.BusError`."""
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,8 @@ import numpy as np
 from fantwin.pipeline.recordings.reading import TACHO_KEY
 from fantwin.pipeline.recordings.writing import RecordingWriter
 from fantwin.pipeline.sources.simulated.device import Device, PlaybackCounts
+from fantwin.pipeline.sources.tables.measured_table import Table
+from fantwin.schemas.blocks import cut
 from fantwin.schemas.device_sample import DeviceSample
 from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Raw
@@ -20,6 +23,8 @@ from fantwin.schemas.topics import tray_key
 from fantwin.schemas.units import NS_PER_S
 
 SITE, TRAY, PRODUCER = "simulated", "tray1", "simulate"
+IMPORTED = "imported"
+"""site of a table"""
 SAMPLES_PER_MESSAGE = 100
 
 
@@ -87,6 +92,27 @@ def write_raw(
         for sequence, raw in enumerate(raws):
             numbered = replace(raw, header=Header(producer, sequence, tray))
             writer.add_message(tray_key(site, tray, "raw"), numbered, int(raw.host_receive_t_ns[-1]))
+
+
+def write_table(table: Table, output: Path, tray: str, tachos: tuple[Tacho, ...] = INSTANTANEOUS) -> None:
+    """Write the samples of a table as raw messages; the time of receipt is the time in the table.
+
+    Raises:
+        RecordingError: it cannot be written.
+    """
+    auxiliary: dict[str, Any] = dict(table.auxiliary)
+    whole = Raw(
+        fans=table.fans,
+        host_receive_t_ns=table.t_ns,
+        command=table.command,
+        speed_rad_s=table.speed_rad_s,
+        **auxiliary,
+    )
+    # The first message has one sample only, so that the recording begins at the time of its first sample.
+    starts = [0, *range(1, len(table.t_ns), SAMPLES_PER_MESSAGE), len(table.t_ns)]
+    raws = (cut(whole, first, end) for first, end in pairwise(starts))
+    about = {"source": table.path.name, "site": IMPORTED, "tray": tray, "speed_unit": table.speed_unit}
+    write_raw(output, raws, int(table.t_ns[0]), "import", **about, tachos=tachos)
 
 
 def _blocks(device: Device, played: PlaybackCounts) -> Iterator[list[DeviceSample]]:

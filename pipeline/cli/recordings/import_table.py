@@ -5,31 +5,26 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import asdict
-from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 import typer
-from pydantic import ValidationError
 
 from fantwin.pipeline.cli.options import JsonOption
 from fantwin.pipeline.cli.printing import show
 from fantwin.pipeline.config.settings import NAME_PATTERN
 from fantwin.pipeline.errors import UsageError, UserError
-from fantwin.pipeline.recordings.raw_recordings import SAMPLES_PER_MESSAGE, write_raw
+from fantwin.pipeline.recordings.raw_recordings import write_table
 from fantwin.pipeline.sources.logs.formats import LogFormat, log_format, open_log
 from fantwin.pipeline.sources.logs.samples_of_log import read_samples
 from fantwin.pipeline.sources.tables.measured_table import Table, read_table
+from fantwin.pipeline.sources.tables.tachos import parse_tachos
 from fantwin.pipeline.sources.tacho_evidence import tacho_hints
-from fantwin.schemas.blocks import cut
 from fantwin.schemas.channels import CHANNELS
-from fantwin.schemas.messages import Array, Raw
-from fantwin.schemas.tacho import INSTANTANEOUS, Tacho, tacho_of_each_fan
+from fantwin.schemas.messages import Array
 from fantwin.schemas.topics import RESERVED_TRAY_NAMES
 from fantwin.schemas.units import NS_PER_S
-
-SITE = "imported"
 
 
 def import_table(
@@ -111,14 +106,14 @@ def import_table(
         raise UserError(f"{output}: exists; name another file with -o, or replace it with --force")
     auxiliary = _channels(channel or ())
     if kind is None:
-        tachos = _tachos(tacho or (), len(speed))
+        tachos = parse_tachos(tacho or (), len(speed))
         table, of_log = read_table(file, time, command, speed, period=period, auxiliary=auxiliary), ()
     else:
         if time or period:
             raise UsageError(f"--time and --period are for tables: a {kind.title} has its own times")
         log = open_log(file, kind)
         table, of_log = read_samples(file, log, command, speed, poles, auxiliary=auxiliary)
-        tachos = _tachos(tacho or (), table.fans)
+        tachos = parse_tachos(tacho or (), table.fans)
     notes = list(filter(None, (table.assumed, *of_log)))
     write_table(table, output, tray, tachos)
     hints = tacho_hints(table.t_ns / NS_PER_S, table.speed_rad_s, tachos, range(table.fans))
@@ -166,47 +161,6 @@ def _channels(given: Sequence[str]) -> dict[str, list[str]]:
             raise UsageError(f"--channel {text}: give NAME=COLUMN; known are {', '.join(known)}")
         columns.setdefault(name, []).append(column)
     return columns
-
-
-def _tachos(given: Sequence[str], fans: int) -> tuple[Tacho, ...]:
-    """The tachos that options such as `count:window_s=1,pulses=2` describe."""
-    tachos: list[Tacho] = []
-    for text in given:
-        kind, _, settings = text.partition(":")
-        pairs = [setting.partition("=") for setting in settings.split(",") if setting]
-        try:
-            tachos.append(Tacho.model_validate({"kind": kind, **{key: value for key, _, value in pairs}}))
-        except ValidationError as error:
-            first = error.errors()[0]
-            where = "".join(f"{part}: " for part in first["loc"])
-            raise UsageError(f"--tacho {text}: {where}{first['msg'].removeprefix('Value error, ')}") from error
-    found = tuple(tachos) or INSTANTANEOUS
-    try:
-        tacho_of_each_fan(found, fans)
-    except ValueError as error:
-        raise UsageError(f"--tacho: {error}") from error
-    return found
-
-
-def write_table(table: Table, output: Path, tray: str, tachos: tuple[Tacho, ...] = INSTANTANEOUS) -> None:
-    """Write the samples of a table as raw messages; the time of receipt is the time in the table.
-
-    Raises:
-        RecordingError: it cannot be written.
-    """
-    auxiliary: dict[str, Any] = dict(table.auxiliary)
-    whole = Raw(
-        fans=table.fans,
-        host_receive_t_ns=table.t_ns,
-        command=table.command,
-        speed_rad_s=table.speed_rad_s,
-        **auxiliary,
-    )
-    # The first message has one sample only, so that the recording begins at the time of its first sample.
-    starts = [0, *range(1, len(table.t_ns), SAMPLES_PER_MESSAGE), len(table.t_ns)]
-    raws = (cut(whole, first, end) for first, end in pairwise(starts))
-    about = {"source": table.path.name, "site": SITE, "tray": tray, "speed_unit": table.speed_unit}
-    write_raw(output, raws, int(table.t_ns[0]), "import", **about, tachos=tachos)
 
 
 def import_summary(table: Table, output: Path) -> dict[str, object]:
