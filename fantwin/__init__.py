@@ -1,13 +1,14 @@
-"""Digital twins of fans, from Python: push samples, and read recordings into arrays.
+"""Digital twins of fans, from Python.
 
     import fantwin
 
-    scores = fantwin.read_arrays(Path("runs/demo/recording.mcap"), "score")
-    with fantwin.connect("tcp/127.0.0.1:7447", site="plant") as client:
-        ...
+    twin = fantwin.load("fan.onnx")
+    scored = twin.score(table)            # pandas, pyarrow or a dict of arrays
+    twin = fantwin.train(healthy_table)
 
-`fantwin.client` has the errors of a connection, `fantwin.pipeline.recordings` what else reads recordings. The folders
-of the repository are its packages, by links: `scoring/` is `fantwin.scoring`.
+`docs/how-to/python.md` is the guide. `connect` pushes samples to a site (`fantwin.client`), `read_arrays` and its like
+read recordings (`fantwin.pipeline.recordings`). The folders of the repository are its packages, by links: `scoring/` is
+`fantwin.scoring`.
 """
 
 from __future__ import annotations
@@ -17,9 +18,36 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from fantwin.client import connect
+    from fantwin.interface.columns import Columns
+    from fantwin.interface.making import calibrate, train
+    from fantwin.interface.twin import Twin, load
+    from fantwin.interface.words import FantwinWarning
+    from fantwin.pipeline.errors import FantwinError
     from fantwin.pipeline.recordings import read_arrays, read_metadata, read_recording
 
-__all__ = ["connect", "read_arrays", "read_metadata", "read_recording"]
+__all__ = [
+    "Columns",
+    "FantwinError",
+    "FantwinWarning",
+    "Twin",
+    "calibrate",
+    "connect",
+    "load",
+    "read_arrays",
+    "read_metadata",
+    "read_recording",
+    "train",
+]
+_MODULES = {
+    "Columns": "interface.columns",
+    "FantwinError": "pipeline.errors",
+    "FantwinWarning": "interface.words",
+    "Twin": "interface.twin",
+    "calibrate": "interface.making",
+    "connect": "client",
+    "load": "interface.twin",
+    "train": "interface.making",
+}
 
 
 def __getattr__(name: str) -> Any:
@@ -30,4 +58,4 @@ def __getattr__(name: str) -> Any:
     """
     if name not in __all__:
         raise AttributeError(f"module 'fantwin' has no attribute {name!r}")
-    return getattr(import_module("fantwin.client" if name == "connect" else "fantwin.pipeline.recordings"), name)
+    return getattr(import_module(f"fantwin.{_MODULES.get(name, 'pipeline.recordings')}"), name)

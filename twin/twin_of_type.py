@@ -9,7 +9,7 @@ import numpy as np
 
 from fantwin.schemas.twin_card import DataCard, TrainingCard, TwinCard
 from fantwin.twin.errors import TwinError
-from fantwin.twin.export.onnx_twin import OnnxTwin, stored_hybrid
+from fantwin.twin.export.onnx_twin import OnnxTwin, stored_ode
 from fantwin.twin.finishing import TrainedTwin, finish_twin
 from fantwin.twin.fitting.drive_fit import FoundDrive
 from fantwin.twin.fitting.fans_of_a_type import place_fans
@@ -41,7 +41,9 @@ def place_twin(
     Raises TwinError when the twin is no hybrid, the tachos differ, or a fan has hardly any readings.
     """
     card = OnnxTwin(type_twin).card
-    model = stored_hybrid(type_twin, card)
+    model = stored_ode(type_twin, type_twin.read_bytes(), card)
+    if not isinstance(model, Hybrid):
+        raise TwinError(f"{type_twin}: a {card.kind} twin has no physics beside a network; give a hybrid")
     tacho = common_tacho([*runs, *validation_runs])
     strange = [fan for fan, each in enumerate(tacho) if each not in card.tacho]
     if strange:

@@ -71,7 +71,7 @@ def default_config(
         StageError: the twin cannot be used.
         ConfigError: `overrides` are not valid, or a tray is not.
     """
-    rate_hz = float(f"{load_tray_twin(twin, next(iter(first.values()))[0].fans).card.rate_hz:.3g}")
+    rate_hz = rounded_rate_hz(load_tray_twin(twin, next(iter(first.values()))[0].fans).card.rate_hz)
     gap_limit_s = max(0.1, GAP_PERIODS * max(_period_s(messages) for messages in first.values()))
     text = (
         f"# defaults: there was no configuration\nsite = {json.dumps(metadata.metadata.get('site', 'site'))}\n\n"
@@ -83,6 +83,11 @@ def default_config(
         if (tacho := metadata.tacho(tray, messages[0].tachos)) != INSTANTANEOUS:
             text += f"tacho = [{', '.join(_toml_table(its) for its in tacho)}]\n"
     return parse_config(text, path, overrides, stages)
+
+
+def rounded_rate_hz(rate_hz: float) -> float:
+    """The rate of a grid for a twin that was trained at this one."""
+    return float(f"{rate_hz:.3g}")
 
 
 def _toml_table(tacho: Tacho) -> str:

@@ -1,6 +1,7 @@
 """An exported twin, run by onnxruntime like a model in memory, so that the file itself is evaluated."""
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,34 +12,47 @@ from onnx import numpy_helper
 from fantwin.schemas.twin_card import CARD_PROPERTY, GRAPH_INPUTS, GRAPH_OUTPUTS, CardError, StateLayout, TwinCard
 from fantwin.twin.errors import TwinError
 from fantwin.twin.models.drive import Drive
+from fantwin.twin.models.fan_ode import FanOde
 from fantwin.twin.models.hybrid import Hybrid
 from fantwin.twin.models.network import Scaling, TanhNetwork
+from fantwin.twin.models.neural_ode import NeuralOde
+from fantwin.twin.models.physical import PhysicalModel
 from fantwin.twin.runs import Array
 
 UNSCALED = Scaling(0.0, 1.0, 0.0, 1.0, 1.0)
 
 
-def stored_hybrid(path: Path, card: TwinCard) -> Hybrid:
-    """The hybrid that a twin file holds: the inverse of the export. card: that of the file.
+def stored_ode(path: Path, content: bytes, card: TwinCard) -> FanOde:
+    """The model, continuous in time, that the content of a twin file holds: the inverse of the export. card: that of
+    the file.
 
     The graph holds the weights of the network for rad/s and command units, so the network that is read has no scaling.
 
     Raises:
         TwinError: the twin is of another kind.
     """
-    if card.kind != Hybrid.kind:
-        raise TwinError(f"{path}: a {card.kind} twin has no physics beside a network; give a hybrid")
-    weights = _constants(onnx.load(path).graph)
+    makes: dict[str, Callable[[TanhNetwork], FanOde]] = {Hybrid.kind: Hybrid, NeuralOde.kind: NeuralOde}
+    if card.kind == PhysicalModel.kind:
+        model: FanOde = PhysicalModel()
+    elif card.kind in makes:
+        model = makes[card.kind](_stored_network(path, content, card))
+    else:
+        raise TwinError(
+            f"{path}: a {card.kind} twin is not continuous in time; give a hybrid, neural ODE or physical one"
+        )
+    drive = card.drive
+    return model if drive is None else model.with_drive(Drive(drive.turning_command, drive.kick_s, drive.rest_s))
+
+
+def _stored_network(path: Path, content: bytes, card: TwinCard) -> TanhNetwork:
+    weights = _constants(onnx.load_from_string(content).graph)
     try:
         by_input = [weights[name] for name in ("step/speed_weights", "step/command_weights") if name in weights]
         rows = [*by_input, weights["step/hidden_bias"], weights["step/output_weights"], weights["step/output_bias"]]
     except KeyError as error:
         raise TwinError(f"{path}: its graph has no {error.args[0]}; train it again") from error
     theta = np.concatenate([each.ravel() for each in rows])
-    network = TanhNetwork(card.network.units, card.network.inputs, UNSCALED, theta)
-    drive = card.drive
-    model = Hybrid(network)
-    return model if drive is None else model.with_drive(Drive(drive.turning_command, drive.kick_s, drive.rest_s))
+    return TanhNetwork(card.network.units, card.network.inputs, UNSCALED, theta)
 
 
 def _constants(graph: onnx.GraphProto) -> dict[str, Array]:

@@ -13,7 +13,7 @@ from fantwin.twin.evaluation.accuracy import evaluation_pieces
 from fantwin.twin.fitting.identification import Identification
 from fantwin.twin.fitting.training import SHORT_STRETCH_TIME_CONSTANTS
 from fantwin.twin.fitting.trajectories import cut_into_trajectories, stretch_samples
-from fantwin.twin.models.fan_ode import NetworkOde
+from fantwin.twin.models.fan_ode import FanOde, NetworkOde
 from fantwin.twin.models.lag import effective_command
 from fantwin.twin.models.physics import LAG
 from fantwin.twin.progress import Progress, unreported
@@ -22,8 +22,27 @@ from fantwin.twin.runs import Array, Run
 LEARNING_RATE, MAX_ITERATIONS = 1e-3, 400
 
 
+def torch_acceleration(
+    model: FanOde, theta: torch.Tensor, parameters: torch.Tensor, speed: torch.Tensor, held: torch.Tensor
+) -> torch.Tensor:
+    """(..., batch) acceleration in rad/s^2 at speeds and effective commands (..., batch); the others as of
+    torch_free_run. right_hand_side.FanEquation once more."""
+    known, learned = torch.zeros_like(speed), torch.zeros_like(speed)
+    if model.network is not None:
+        network, scale = model.network, model.network.scaling
+        rows = theta[:-1].reshape(len(network.inputs) + 2, network.units)
+        pre = rows[-2] + ((speed - scale.speed_offset_rad_s) / scale.speed_scale_rad_s)[..., None] * rows[0]
+        if len(network.inputs) > 1:
+            pre = pre + ((held - scale.command_offset) / scale.command_scale)[..., None] * rows[1]
+        learned = scale.acceleration_scale_rad_s2 * (torch.tanh(pre) @ rows[-1] + theta[-1])
+    if model.has_physics:
+        inertia, viscous, drag = parameters.T[:LAG]
+        known = (held - viscous * speed - drag * speed * speed.abs()) / inertia
+    return known + learned
+
+
 def torch_free_run(
-    model: NetworkOde,
+    model: FanOde,
     theta: torch.Tensor,
     parameters: torch.Tensor,
     initial_speed_rad_s: torch.Tensor,
@@ -35,18 +54,9 @@ def torch_free_run(
     theta: (P,). parameters: (batch, 4). initial_speed_rad_s: (batch,). command: (n, batch), the effective one: after
     the lag (lag.effective_command). step_s: (n,) or (n, batch).
     """
-    network, scale = model.network, model.network.scaling
-    rows = theta[:-1].reshape(len(network.inputs) + 2, network.units)
-    inertia, viscous, drag = parameters.T[:LAG]
 
     def acceleration(speed: torch.Tensor, held: torch.Tensor) -> torch.Tensor:
-        pre = rows[-2] + ((speed - scale.speed_offset_rad_s) / scale.speed_scale_rad_s)[:, None] * rows[0]
-        if len(network.inputs) > 1:
-            pre = pre + ((held - scale.command_offset) / scale.command_scale)[:, None] * rows[1]
-        learned = scale.acceleration_scale_rad_s2 * (torch.tanh(pre) @ rows[-1] + theta[-1])
-        if not model.has_physics:
-            return learned
-        return (held - viscous * speed - drag * speed * speed.abs()) / inertia + learned
+        return torch_acceleration(model, theta, parameters, speed, held)
 
     speeds, speed = [], initial_speed_rad_s
     for held, step in zip(command, step_s, strict=True):

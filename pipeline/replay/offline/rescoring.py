@@ -88,6 +88,8 @@ class TrayOutput:
 
 Progress = Callable[[str, int], None]
 """Called with the tray, and the time of the newest scored sample in ns since the epoch."""
+Observe = Callable[[str, Message], None]
+"""Called with the tray, and each message that is read or made; samples that a session repeats come again."""
 
 
 @dataclass
@@ -156,7 +158,11 @@ class RescoredTray:
 
 
 def rescore(
-    replay_input: ReplayInput, output: Path | None, verify: bool, progress: Progress = lambda _tray, _t_ns: None
+    replay_input: ReplayInput,
+    output: Path | None,
+    verify: bool,
+    progress: Progress = lambda _tray, _t_ns: None,
+    observe: Observe = lambda _tray, _message: None,
 ) -> list[RescoredTray]:
     """Score every tray again.
 
@@ -176,7 +182,9 @@ def rescore(
     if verify and all(found.why_not_verified for found in plans.values()):
         raise _cannot_compare(replay_input, [f"{tray}: {found.why_not_verified}" for tray, found in plans.items()])
     with output_writer(replay_input, output) if output else nullcontext() as writer:
-        trays = [_rescore_tray(replay_input, tray, found, verify, writer, progress) for tray, found in plans.items()]
+        trays = [
+            _rescore_tray(replay_input, tray, found, verify, writer, progress, observe) for tray, found in plans.items()
+        ]
     compared = [tray.comparison for tray in trays if tray.comparison]
     if verify and not any(found.has_content for found in compared):
         raise _cannot_compare(replay_input, [reason for found in compared for reason in found.reasons])
@@ -194,12 +202,14 @@ def _rescore_tray(
     verify: bool,
     writer: RecordingWriter | None,
     progress: Progress,
+    observe_all: Observe,
 ) -> RescoredTray:
     rescored = RescoredTray(tray, found.plan, recorded_alarms=found.alarms)
     output = TrayOutput(writer, replay_input.config.site, tray) if writer else None
     verifier: TrayVerifier | None = None
 
     def observe(message: Message) -> None:
+        observe_all(tray, message)
         if output:
             output.add(message)
         if verifier and isinstance(message, Grid | Prediction):

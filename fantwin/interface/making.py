@@ -1,0 +1,124 @@
+"""Twins made and calibrated from tables or recordings of healthy fans: `fantwin train` and `calibrate` in Python."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from itertools import count
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from fantwin.interface.columns import Columns
+from fantwin.interface.tables import fan_table
+from fantwin.interface.twin import USUAL, Twin
+from fantwin.interface.words import in_python, warn
+from fantwin.pipeline.learning.fitting import TrainingSettings, calibrated_on, fit_twin, with_calibration
+from fantwin.pipeline.learning.healthy_evidence import marked_running, outlier_warnings
+from fantwin.pipeline.learning.training_data import Part, read_held_out, read_training_data
+from fantwin.pipeline.recordings.raw_recordings import write_table
+from fantwin.pipeline.replay.offline.healthy_runs import HealthyPart, in_this_process
+from fantwin.pipeline.sources.tables.tachos import parse_tachos
+
+
+def train(
+    tables: Any,
+    columns: Columns = USUAL,
+    *,
+    validate: Any = None,
+    tacho: str | Sequence[str] = (),
+    name: str = "fan",
+    model: str = "hybrid",
+    seed: int = 0,
+    iterations: int | None = None,
+    networks: int | None = None,
+    command_unit: str = "",
+) -> Twin:
+    """A twin of healthy fans, as by `fantwin train`; the same tables and seed give the same twin.
+
+    Args:
+        tables: a table or the path of a recording, or a list of them. The fans have run at many commands.
+        columns: of all tables.
+        validate: others of the same kind. The band is as wide as the free-run error over them; without them it is that
+            over the training data, which is too optimistic.
+        tacho: how the speeds of tables were measured, such as `count:window_s=1,pulses=2`: one for all fans, or one for
+            each; instantaneous without it. Recordings say it themselves.
+        name: of the twin.
+        model: physical, narx, neural-ode, hybrid or hybrid-w (docs/explanation/training.md).
+        seed: of the initial weights.
+        iterations: the most of each network; None: it depends on the model.
+        networks: that are trained and averaged; None: four, or one where they cannot be averaged.
+        command_unit: of the commands, for the card.
+
+    Raises:
+        FantwinError: a table cannot be used, or the data do not suffice.
+
+    Warns:
+        FantwinWarning: of what the data do not show, of outliers, and of what was repaired in a table.
+    """
+    settings = TrainingSettings(model, seed, "levenberg-marquardt", iterations, networks, command_unit)
+    with _recordings(columns) as recording:
+        healthy = [recording(table, tacho) for table in _each(tables)]
+        others = [recording(table, tacho) for table in _each(validate)] if validate is not None else []
+        data = read_training_data(healthy, Part(), in_this_process)
+        held_out = read_held_out(data, others, Part(), in_this_process) if others else None
+        warn(line for each in (data, held_out) if each for line in (*each.damage, *each.hints))
+        trained = fit_twin(data, held_out, name, settings)
+        warn(data.with_fan_numbers(trained.identification.warnings))
+        return Twin(trained.onnx())
+
+
+def calibrate(
+    twin: Twin, tables: Any, columns: Columns = USUAL, *, false_alarms_per_day: float, extrapolate: bool = False
+) -> Twin:
+    """The same twin with the spread of its fans, and a declared rate of false alarms, in its card; as by
+    `fantwin calibrate`.
+
+    Args:
+        twin: not changed.
+        tables: a table or the path of a recording, or a list of them: healthy fans, preferably other running than the
+            twin was trained on.
+        columns: of all tables.
+        false_alarms_per_day: the rate to declare, of each fan. To show one false alarm a day takes 72 fan-hours.
+        extrapolate: also with less running than shows the rate, which is then only a target.
+
+    Raises:
+        FantwinError: a table cannot be used, or there is too little running to show the rate.
+
+    Warns:
+        FantwinWarning: of fans that were perhaps not healthy, and of what was repaired in a table.
+    """
+    with _recordings(columns) as recording, twin.file() as file:
+        healthy = [recording(table, twin) for table in _each(tables)]
+        marked = marked_running(healthy, [], None, in_this_process)
+        warn(marked.lines)
+        part = HealthyPart(file, left_out=marked.left_out)
+        found = calibrated_on(healthy, part, false_alarms_per_day, in_this_process, extrapolate=extrapolate)
+        warn(outlier_warnings(found))
+        return Twin(with_calibration(file, found.calibration))
+
+
+@contextmanager
+def _recordings(columns: Columns) -> Iterator[Callable[[Any, Twin | str | Sequence[str]], Path]]:
+    """Yields what makes a temporary recording of a table, and leaves a recording as it is. Its second argument: how the
+    speeds of the table were measured, or the twin that the table must fit."""
+    with TemporaryDirectory(prefix="fantwin-") as folder, in_python(Path(folder)):
+        numbers = count(1)
+
+        def recording(table: Any, measured: Twin | str | Sequence[str]) -> Path:
+            if isinstance(table, Path | str):
+                return Path(table)
+            given = fan_table(table, columns)
+            if isinstance(measured, Twin):
+                given, tachos = measured.checked(given), measured.card.tacho
+            else:
+                tachos = parse_tachos([measured] if isinstance(measured, str) else measured, len(given.fans))
+            path = Path(folder) / f"table-{next(numbers)}.mcap"
+            write_table(given.samples, path, "table", tachos)
+            return path
+
+        yield recording
+
+
+def _each(tables: Any) -> Sequence[Any]:
+    return tables if isinstance(tables, Sequence) and not isinstance(tables, str) else [tables]

@@ -1,0 +1,219 @@
+"""A twin in Python: predict, score, save, and a module of PyTorch."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any, TypeVar, overload
+
+from fantwin.interface.columns import Columns
+from fantwin.interface.suspicions import refuse_commands, refuse_high_speeds, refuse_times
+from fantwin.interface.tables import NAME, FanTable, fan_table
+from fantwin.interface.words import in_python, warn
+from fantwin.pipeline.errors import FantwinError
+from fantwin.pipeline.extras import require_torch
+from fantwin.pipeline.files import write_whole
+from fantwin.pipeline.prediction.tray_twin import read_file, tray_twin
+from fantwin.schemas.twin_card import TwinCard
+
+if TYPE_CHECKING:
+    from fantwin.interface.answers import Answer
+    from fantwin.twin.fitting.torch_twin import TorchTwin
+
+AnyTable = TypeVar("AnyTable")
+USUAL = Columns()
+DEMO = Path(__file__).parents[1] / "pipeline" / "demo" / "twin.onnx"
+HIGHEST_RATE = 8640
+"""false alarms of a fan a day: one each ten seconds"""
+POPULATION = "the priors of a population of fans, 0.03 false alarms per fan and day"
+
+
+class Twin:
+    """The model of healthy fans, from `load`, `train` or `calibrate`. It does not change.
+
+    Tables: a pandas DataFrame, a pyarrow Table or a dict of arrays gives a table of the same library; `Columns` says
+    what columns it must have. The path of a recording gives a DataFrame, and a dict of arrays where pandas is missing.
+    A result has a row for each sample of a fan (*long*), at the rate of the twin: a table is resampled as a running
+    site resamples it, and each decision is that of `fantwin replay --offline --twin` on the same samples.
+
+    Times are seconds or dates as in the table, speeds in its unit, which their names end in, commands in its unit.
+
+        >>> import fantwin
+        >>> twin = fantwin.load()
+        >>> twin
+        Twin('demo tray', hybrid, 8 fans, 100 Hz, calibrated)
+    """
+
+    def __init__(self, content: bytes) -> None:
+        """Use `fantwin.load`. content: of an ONNX file."""
+        self.content = content
+        self._known = tray_twin(Path("the twin"), content, None)
+
+    @property
+    def card(self) -> TwinCard:
+        """All that is known of the twin: data, figures, parameters, ranges, band; speeds in rad/s."""
+        return self._known.card
+
+    @property
+    def fans(self) -> int:
+        """Number of fans. A twin of one fan serves tables of any number."""
+        return self._known.fans
+
+    def __repr__(self) -> str:
+        calibrated = "calibrated" if self.card.calibration else "not calibrated"
+        fans = f"{self.fans} fan{'s' * (self.fans != 1)}"
+        return f"Twin({self.card.name!r}, {self.card.kind}, {fans}, {self.card.rate_hz:.3g} Hz, {calibrated})"
+
+    def save(self, path: Path | str) -> Path:
+        """Write the twin as an ONNX file, which `fantwin` commands and `load` take; returns its path.
+
+        Raises:
+            FantwinError: it cannot be written.
+        """
+        write_whole(Path(path), self.content, advice="")
+        return Path(path)
+
+    @overload
+    def predict(self, table: Path | str, columns: Columns = ...) -> Any: ...
+    @overload
+    def predict(self, table: AnyTable, columns: Columns = ..., *, initial_speed_rpm: Any = ...) -> AnyTable: ...
+
+    def predict(self, table: Any, columns: Columns = USUAL, *, initial_speed_rpm: Any = None) -> Any:
+        """The speeds that healthy fans would have by these commands, and the band in which they are expected.
+
+        Columns of the result: `time`, `fan`, `command`, and, with the unit at their ends, `speed` (measured),
+        `predicted`, `sigma`, `lower` and `upper` (the band of two sigma, wider by what a tacho cannot resolve),
+        `residual` (measured minus predicted), `deviation` (what it has more than is usual for this fan); then `valid`
+        and `reason` (why not; empty if valid). The free run starts from the first measured speeds, and is never
+        corrected by others. What is not known is NaN.
+
+        initial_speed_rpm: in place of measured speeds, for a table of commands alone: one for all fans or one for each,
+        at its first time. The result is in rpm, without measured speed, residual and deviation.
+
+        Raises:
+            FantwinError: the table does not fit the twin.
+
+        Warns:
+            FantwinWarning: of what was repaired, left out or taken for granted.
+
+            >>> import fantwin
+            >>> commands = {"time": [0.00, 0.01, 0.02, 0.03], "command": [0.5, 0.5, 0.8, 0.8]}
+            >>> predicted = fantwin.load().predict(commands, initial_speed_rpm=3000.0)
+            >>> predicted["time"][-1], predicted["fan"][-1], round(predicted["predicted_rpm"][-1])
+        """
+        if initial_speed_rpm is None:
+            return self._answer(table, columns, "prediction", ())
+        from fantwin.interface.free_run import free_run_columns  # noqa: PLC0415  `load` needs none of the pipeline
+
+        with in_python():
+            given = fan_table(table, columns, needs_speed=False)
+            given = self.checked(given if len(given.fans) > 1 else given.of_each(self.card.fan_numbers))
+            return given.form.make(free_run_columns(self.content, given, initial_speed_rpm), given.form.zone)
+
+    @overload
+    def score(self, table: Path | str, columns: Columns = ..., *, false_alarms_per_day: float | None = ...) -> Any: ...
+    @overload
+    def score(
+        self, table: AnyTable, columns: Columns = ..., *, false_alarms_per_day: float | None = ...
+    ) -> AnyTable: ...
+
+    def score(self, table: Any, columns: Columns = USUAL, *, false_alarms_per_day: float | None = None) -> Any:
+        """What a scorer decides on each sample: the columns of `predict`, and
+
+        `score` (evidence for a fault, relative to its limit: an alarm is raised at 1), `limit` (1), `state` (normal,
+        suspect, alarm, returning, stopped, starting, unknown), `alarm` (whether the fan has one), `severity` (warning,
+        alarm; empty without), `cause` (the most probable one, as in docs/explanation/diagnosis.md) and `probability`.
+
+        false_alarms_per_day: of each fan, in place of the calibrated rate.
+
+        Raises:
+            FantwinError: the table does not fit the twin.
+
+        Warns:
+            FantwinWarning: as of `predict`, and of a twin that is not calibrated.
+        """
+        return self._answer(table, columns, "scores", _overrides(false_alarms_per_day))
+
+    @overload
+    def alarms(self, table: Path | str, columns: Columns = ..., *, false_alarms_per_day: float | None = ...) -> Any: ...
+    @overload
+    def alarms(
+        self, table: AnyTable, columns: Columns = ..., *, false_alarms_per_day: float | None = ...
+    ) -> AnyTable: ...
+
+    def alarms(self, table: Any, columns: Columns = USUAL, *, false_alarms_per_day: float | None = None) -> Any:
+        """The alarms that `score` finds, a row for each.
+
+        Columns: `fan`, `raised`, `cleared` (unknown if it lasts to the end), `onset` (when the fault probably began),
+        `severity` (the highest), `cause` and `probability` of the last diagnosis, `causes` (all of it: the probability
+        by cause). Arguments, errors and warnings are those of `score`.
+        """
+        return self._answer(table, columns, "alarms", _overrides(false_alarms_per_day))
+
+    def as_torch(self) -> TorchTwin:
+        """The twin as a differentiable module of PyTorch, for control and for fits of one's own.
+
+        Raises:
+            FantwinError: PyTorch is not installed, or the twin is not continuous in time (NARX).
+        """
+        require_torch("as_torch()")
+        from fantwin.twin.fitting.torch_twin import torch_twin  # noqa: PLC0415  torch takes seconds to import
+
+        with in_python():
+            return torch_twin(self.content, self.card)
+
+    def _answer(self, table: Any, columns: Columns, answer: Answer, overrides: Sequence[str]) -> Any:
+        if not self.card.calibration and answer != "prediction":
+            warn([f"{self.card.name!r} is not calibrated: its alarms are by {POPULATION}; see fantwin.calibrate"])
+        from fantwin.interface import answers  # noqa: PLC0415  `load` needs none of the pipeline
+
+        with self.file() as file, in_python(file.parent):
+            if isinstance(table, Path | str):
+                return answers.of_recording(Path(table), file, overrides, answer)
+            given = self.checked(fan_table(table, columns))
+            return answers.of_table(given, self.card.tacho, file, overrides, answer)
+
+    @contextmanager
+    def file(self) -> Iterator[Path]:
+        """A temporary file of the twin, in a folder of its own."""
+        with TemporaryDirectory(prefix="fantwin-") as folder:
+            path = Path(folder) / "twin.onnx"
+            path.write_bytes(self.content)
+            yield path
+
+    def checked(self, given: FanTable) -> FanTable:
+        """The same samples. Raises FantwinError where they cannot be of the fans of this twin."""
+        if self.fans > 1 and len(given.fans) != self.fans:
+            raise FantwinError(
+                f"{NAME} has {len(given.fans)} fan(s), and the twin is of {self.fans}: give a "
+                "table of all of them, or use a twin of one fan"
+            )
+        refuse_times(given.samples, self.card)
+        refuse_commands(given.samples, self.card)
+        refuse_high_speeds(given.samples, self.card)
+        needed = self.card.conditions.needed if self.card.conditions else ()
+        if lacking := [name for name in needed if name not in given.samples.auxiliary]:
+            raise FantwinError(f"{NAME} has no column {lacking[0]!r}, which the twin needs")
+        return given
+
+
+def _overrides(false_alarms_per_day: float | None) -> tuple[str, ...]:
+    if false_alarms_per_day is not None and not 0.0 < false_alarms_per_day <= HIGHEST_RATE:
+        raise FantwinError(f"false_alarms_per_day = {false_alarms_per_day}: give a rate above 0, up to {HIGHEST_RATE}")
+    return () if false_alarms_per_day is None else (f"scorer.false_alarms_per_day={false_alarms_per_day}",)
+
+
+def load(path: Path | str | None = None) -> Twin:
+    """The twin in an ONNX file; without a path, that of the eight simulated fans of `fantwin demo`.
+
+    Raises:
+        FantwinError: it cannot be read, or is not a twin.
+    """
+    file = Path(path) if path is not None else DEMO
+    if not file.is_file():
+        raise FantwinError(f"{file}: there is no such file: give the .onnx file of a twin")
+    with in_python():
+        tray_twin(file, content := read_file(file), None)
+    return Twin(content)
