@@ -50,7 +50,8 @@ def free_run_columns(content: bytes, table: FanTable, initial_speed_rpm: Any) ->
         reading, half_range, _ = run.advance(command[done:])
         parts.append((reading, half_range))
     predicted, half_range = (np.concatenate(each) for each in zip(*parts, strict=True))
-    unseen = twin.unseen_error.table.unseen_std_at(predicted, command) if twin.unseen_error else 0.0
+    raised = twin.drive.raised(command) if twin.drive else command
+    unseen = twin.unseen_error.table.unseen_std_at(predicted, raised) if twin.unseen_error else 0.0
     band = BAND_SIGMAS * np.hypot(twin.sigma_rad_s, np.nan_to_num(unseen)) + np.nan_to_num(half_range)
     low, high = twin.usable_commands
     valid = (command >= np.maximum(low, twin.off_below)) & (command <= high) & np.isfinite(predicted)
