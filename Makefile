@@ -8,6 +8,9 @@
 # make reference  write the pages and tables of docs/reference that come from the code again
 # make twin   train the demo's twin again
 # make lock   pin the dependencies again
+# make licences  write LICENSES.md from the locks and what is installed
+# make site   the documentation site, in build/site/
+# make dist   the source distribution and the wheel, in dist/
 # make rerun-bump VERSION=0.42  pin Rerun to this release, and run all tests that draw with it
 # make clean  remove what was built (and nothing that was recorded)
 
@@ -24,7 +27,7 @@ BENCHES := $(addprefix bench.training.,published_table interval_coverage rough_t
 unexport PYTHONDONTWRITEBYTECODE
 SOURCES := fantwin schemas scoring pipeline simulation stages twin tests bench
 
-.PHONY: demo test check selftest compose-test bench schema reference twin lock rerun-bump clean
+.PHONY: demo test check selftest compose-test bench schema reference twin lock licences site dist rerun-bump clean
 .DEFAULT_GOAL := demo
 
 demo: $(VENV)/.runtime
@@ -69,6 +72,17 @@ lock: $(VENV)/.development
 	@echo "torch; sys_platform == 'none'" > $(VENV)/without-torch.txt
 	$(COMPILE) --extra bench --constraint requirements-dev.lock --override $(VENV)/without-torch.txt \
 		--output-file requirements-bench.lock
+	@echo "install the new versions (make check), then: make licences"
+
+licences: $(VENV)/.development
+	$(BIN)/python -m tests.support.licences
+
+# without the variable, mkdocs-material announces MkDocs 2 at each build
+site: $(VENV)/.development
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --site-dir build/site
+
+dist: $(VENV)/.development
+	$(BIN)/uv build
 
 # what depends on a release of Rerun: its calls, its files, and the viewer itself, which must report nothing
 RERUN_TESTS := tests/pipeline/outputs/rerun tests/stages/test_viewer.py \

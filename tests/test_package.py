@@ -14,7 +14,7 @@ from tests.support.built_wheel import unpacked_wheel
 
 ROOT = Path(__file__).parents[1]
 FOLDERS = ("fantwin", "pipeline", "schemas", "scoring", "simulation", "stages", "twin")
-FILES = ("pyproject.toml", "README.md", "LICENSE")
+FILES = ("pyproject.toml", "MANIFEST.in", "README.md", "LICENSE")
 DATA = ("*.toml", "*.onnx", "*.sh", "*.proto", "*.pyi", "*.html", "*.js", "*.css", "*.svg", "py.typed")
 
 

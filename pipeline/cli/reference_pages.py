@@ -7,6 +7,7 @@ in here.
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
@@ -30,11 +31,17 @@ went wrong as one line on standard error.
 
 {fill(app.info.epilog or "", 120)}
 
-This page is made from the commands in the code: `make reference`.
+This page is made from the commands in the code: `make reference`. Options of many commands are listed here alone:
+
 """
 _EXAMPLE = re.compile(r"^Example: ((?:.+\n)+)", re.MULTILINE)
-_OF_ALL = re.compile(r"^\* `--(help|json)`.*\n|^\*\*(Usage|Options)\*\*:\n\n(```console\n.*\n```\n\n)?", re.MULTILINE)
+_OF_ALL = re.compile(
+    r"^\* `--(help|json)`.*\n|^\*\*(Usage|Options|Arguments)\*\*:\n\n(```console\n.*\n```\n\n)?", re.MULTILINE
+)
 """what each command has alike"""
+_OPTION = re.compile(r"^\* `(-[\w-]+(?:, --[\w-]+)?).*\n?", re.MULTILINE)
+MANY_COMMANDS = 3
+"""an option that as many have alike is said once"""
 
 
 def page() -> str:
@@ -42,17 +49,32 @@ def page() -> str:
     group = typer.Typer()
     for name in COMMANDS:
         group.command(name)(function_of(name))
-    click: Any = get_command(group)
-    parts = [_INTRODUCTION]
+    abouts = {name: _about(get_command(group), name) for name in COMMANDS}
+    options = Counter(found[0].strip() for about in abouts.values() for found in _OPTION.finditer(about))
+    shared = {line for line, commands in options.items() if commands >= MANY_COMMANDS}
+    parts = [_INTRODUCTION + "".join(f"{line}\n" for line in sorted(shared))]
     for folder, heading in PANELS.items():
         parts.append(f"## {heading}\n")
-        for name in (name for name, module in COMMANDS.items() if module.startswith(f"{folder}.")):
-            about = get_docs_for_click(
-                obj=click.commands[name], ctx=typer.Context(click), indent=2, name=name, call_prefix="fantwin"
-            )
-            examples = _EXAMPLE.sub(lambda found: f"    {' '.join(found[1].split())}\n", about)
-            parts.append(f"{_OF_ALL.sub('', examples).strip()}\n")
+        parts += [
+            _without(shared, abouts[name]) for name, module in COMMANDS.items() if module.startswith(f"{folder}.")
+        ]
     return "\n".join(parts)
+
+
+def _about(click: Any, name: str) -> str:
+    """Heading, help, example and options of a command."""
+    about = get_docs_for_click(
+        obj=click.commands[name], ctx=typer.Context(click), indent=2, name=name, call_prefix="fantwin"
+    )
+    examples = _EXAMPLE.sub(lambda found: f"    {' '.join(found[1].split())}\n", about)
+    return f"{_OF_ALL.sub('', examples).strip()}\n"
+
+
+def _without(shared: set[str], about: str) -> str:
+    """The same, with the names alone of options that many commands share."""
+    has = [f"`{found[1]}`" for found in _OPTION.finditer(about) if found[0].strip() in shared]
+    own = _OPTION.sub(lambda found: "" if found[0].strip() in shared else found[0], about)
+    return f"{own.rstrip()}\n" + (f"* and {', '.join(has)}\n" if has else "")
 
 
 PAGES = Path("docs", "reference")

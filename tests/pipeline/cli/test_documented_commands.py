@@ -13,7 +13,8 @@ from fantwin.pipeline.cli import main as command_line
 from fantwin.pipeline.cli.main import COMMANDS
 
 ROOT = Path(__file__).parents[3]
-PAGES = sorted((*(ROOT / "docs").rglob("*.md"), ROOT / "README.md"))
+FOLDERS = {"docs": "**/*.md", "examples": "**/*.md", ".": "*.md"}
+PAGES = sorted(path for folder, pages in FOLDERS.items() for path in (ROOT / folder).glob(pages))
 OF_THE_PROGRAM = ("--help", "--version")
 
 
