@@ -25,7 +25,7 @@ BENCHES := $(addprefix bench.training.,published_table interval_coverage rough_t
 	$(addprefix bench.runtime.,restart recorder_throughput recorder_kills replay_bus replay_speed stage_memory)
 # compiled modules are kept: hundreds of processes of the tests would each compile them again
 unexport PYTHONDONTWRITEBYTECODE
-SOURCES := fantwin schemas scoring pipeline simulation stages twin tests bench
+SOURCES := fantwin schemas scoring pipeline simulation stages twin tests bench examples
 
 .PHONY: demo test check selftest compose-test bench schema reference twin lock licences site dist rerun-bump clean
 .DEFAULT_GOAL := demo
