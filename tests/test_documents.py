@@ -58,3 +58,14 @@ def test_every_file_of_the_repository_that_a_page_names_is_there(page: Path) -> 
 def test_no_paragraph_is_longer_than_can_be_read_at_once(page: Path) -> None:
     long = [text[:60] for text in paragraphs(page) if len(text.split()) > MOST_WORDS_OF_A_PARAGRAPH]
     assert not long
+
+
+def test_what_a_symptom_quotes_is_said_by_the_product() -> None:
+    """Troubleshooting: words in the first column, which a reader searches for."""
+    quoted = re.findall(
+        r"^\| [^|]*?`([^`]*)`[^|]* \|", (DOCS / "how-to/troubleshooting.md").read_text("utf-8"), re.MULTILINE
+    )
+    folders = ("pipeline", "schemas", "scoring", "stages", "twin")
+    product = " ".join(path.read_text("utf-8") for name in folders for path in (ROOT / name).rglob("*.py"))
+    said = re.sub(r'"\s+f?"', "", product)  # a sentence goes on in the next line
+    assert len(quoted) > 15 and [words for words in quoted if words not in said] == []
