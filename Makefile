@@ -43,7 +43,7 @@ check: $(VENV)/.development
 	$(BIN)/lint-imports
 
 selftest: $(VENV)/.runtime
-	$(BIN)/fantwin selftest
+	$(BIN)/fantwin doctor selftest
 
 # exit code 77 of the first script: it cannot be done here, and it has said why
 compose-test: $(VENV)/.development

@@ -1,7 +1,8 @@
 """A site in wall time with one fault after another: does anything hang, get lost without a count, or alarm falsely?
 
-The faults are those of `fantwin selftest` that need not lose recorded data, in random order. After each, all fans must
-be judged again and no alarm may have been raised. At the end the site stops in order, and its recording is verified.
+The faults are those of `fantwin doctor selftest` that need not lose recorded data, in random order. After each, all
+fans must be judged again and no alarm may have been raised. At the end the site stops in order, and its recording is
+verified.
 
     python -m bench.runtime.soak --minutes 30 --seeds 1 2 3
 """

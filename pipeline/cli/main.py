@@ -23,14 +23,13 @@ PANELS = {
 """folder -> heading of its commands in `fantwin --help`"""
 COMMANDS = {
     "demo": "watch.demo",
+    "init": "watch.init",
     "commission": "watch.commission",
     "up": "watch.up",
     "status": "watch.status",
     "alarms": "watch.alarms",
-    "wear": "watch.wear",
     "command": "watch.command",
     "doctor": "watch.doctor",
-    "selftest": "watch.selftest",
     "router": "watch.router",
     "certs": "watch.certs",
     "users": "watch.users",

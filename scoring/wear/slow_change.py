@@ -10,7 +10,7 @@ from fantwin.scoring.wear.trend import LimitForecast, Trend
 
 LIMIT_SHARE = 0.1
 """share of the speed; an alarm is raised where a change has surely reached it"""
-WEAR_HINT = "see fantwin wear"
+WEAR_HINT = "see fantwin status --wear"
 """each notice about one fan ends with it"""
 MOST_FANS = "most fans turn"
 """a notice about what the fans of a tray share begins with it"""

@@ -37,9 +37,9 @@ def as_typed(*words: object) -> subprocess.CompletedProcess[str]:
     return subprocess.CompletedProcess(line, code, shown.getvalue(), said.getvalue())
 
 
-def error_of(name: str, *arguments: object) -> str:
-    """The one-line error of a command that must fail."""
-    return _one_line_of(UserError, name, *arguments)
+def error_of(name: str, *arguments: object, typed: str | None = None) -> str:
+    """The one-line error of a command that must fail. typed: what it reads."""
+    return _one_line_of(UserError, name, *arguments, typed=typed)
 
 
 def usage_error_of(name: str, *arguments: object) -> str:
@@ -47,8 +47,8 @@ def usage_error_of(name: str, *arguments: object) -> str:
     return _one_line_of(UsageError, name, *arguments)
 
 
-def _one_line_of(kind: type[UserError], name: str, *arguments: object) -> str:
-    error = fantwin(name, *arguments).exception
+def _one_line_of(kind: type[UserError], name: str, *arguments: object, typed: str | None = None) -> str:
+    error = fantwin(name, *arguments, typed=typed).exception
     assert isinstance(error, kind), error
     assert "\n" not in str(error)
     return str(error)

@@ -17,6 +17,7 @@ from rich.table import Table
 from fantwin.pipeline.cli.options import JsonOption
 from fantwin.pipeline.cli.printing import table_of
 from fantwin.pipeline.cli.progress import working
+from fantwin.pipeline.cli.watch.wear import show_recorded_wear
 from fantwin.pipeline.config.registry import RECORDER
 from fantwin.pipeline.errors import UsageError
 from fantwin.pipeline.recordings.clips.clip import clip_lines
@@ -51,6 +52,9 @@ def info(
         Path | None,
         typer.Option("-o", "--output", metavar="NEW.mcap", help="With --repair: write here, and leave FILE alone."),
     ] = None,
+    wear: Annotated[
+        bool, typer.Option("--wear", help="Only how each fan had changed by the end, and how fast.")
+    ] = False,
     json_output: JsonOption = False,
 ) -> None:
     """Show what a recording contains: time, trays, twins, messages and losses of each topic, problems of stages.
@@ -71,6 +75,9 @@ def info(
         if len(files) > 1:
             raise UsageError("--repair repairs one recording: name one")
         repair(files[0], output, json_output=json_output)
+        return
+    if wear:
+        show_recorded_wear(files, json_output=json_output)
         return
     if output:
         raise UsageError("-o is for --repair: nothing else is written")

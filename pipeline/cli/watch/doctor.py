@@ -27,19 +27,18 @@ from fantwin.pipeline.cli.exposure import exposure_problem, is_exposed
 from fantwin.pipeline.cli.options import DEFAULT_CONFIG, JsonOption, SetOption
 from fantwin.pipeline.cli.printing import show
 from fantwin.pipeline.cli.watch.line_check import check_line
-from fantwin.pipeline.cli.watch.other_checks import find_fans, send_test_messages
+from fantwin.pipeline.cli.watch.message_check import send_test_messages
 from fantwin.pipeline.config.registry import RECORDER, STAGES
 from fantwin.pipeline.config.roles import READERS, role_names
 from fantwin.pipeline.config.settings import Config, ConfigError
 from fantwin.pipeline.config.shards import process_list
-from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.errors import UsageError, UserError
 from fantwin.pipeline.extras import how_to_install
 from fantwin.pipeline.launch.this_host import load_for_this_host
 from fantwin.pipeline.recordings.disk_room import usage_of
 from fantwin.pipeline.runtime.second_owner import GOSSIP_S
 from fantwin.pipeline.runtime.sessions import Session
 from fantwin.pipeline.runtime.stage import Context, load_stage
-from fantwin.pipeline.sources.hwmon.config import ROOT
 from fantwin.schemas.topics import sessions_key
 
 _NOT_LISTED = {"all", "dev", "bench"}  # a sum of others, or for tests and benches only
@@ -54,19 +53,20 @@ class Task(StrEnum):
     """What the doctor can do."""
 
     CHECK = "check"
-    FIND = "find"
     NOTIFY = "notify"
+    SELFTEST = "selftest"
 
 
 def doctor(
     task: Annotated[
         Task,
         typer.Argument(
-            help="Check installation and configuration, find the fans of this computer, or notify by test messages."
+            help="Check installation and configuration, notify by test messages, or selftest fantwin itself."
         ),
     ] = Task.CHECK,
     targets: Annotated[
-        list[str] | None, typer.Argument(metavar="[TARGET]...", help="notify: names of targets; all if omitted.")
+        list[str] | None,
+        typer.Argument(metavar="[NAME]...", help="notify: targets; selftest: scenarios; all if omitted."),
     ] = None,
     config: Annotated[
         Path | None,
@@ -84,29 +84,30 @@ def doctor(
         list[str] | None,
         typer.Option("--tray", metavar="NAME", help="check: only the source and line of this tray. Repeatable."),
     ] = None,
-    root: Annotated[Path, typer.Option(help="find: folder of the hwmon chips.")] = ROOT,
-    write: Annotated[
+    output: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="find: write a configuration of all hwmon chips with fans to this new file."),
+        typer.Option("-o", "--output", metavar="FOLDER", help="selftest: keep its files in this new folder."),
     ] = None,
-    writable: Annotated[
-        bool, typer.Option("--writable", help="find: let fantwin command the fans found, as `command` needs it.")
-    ] = False,
 ) -> None:
-    """Check the installation and a configuration, find the fans of this computer, or send test messages.
+    """Check the installation and a configuration, send test messages, or test fantwin itself on this computer.
 
     check listens to the line of each tray and names what does not fit: rate, commands, speeds, fans, unit, tachos.
-    find lists fans and serial ports, with a configuration to paste for each, and what is missing. notify sends a
-    message to the targets of the notifier, and says which ones accepted it.
+    notify sends a message to the targets of the notifier, and says which ones accepted it. selftest kills, freezes and
+    floods the stages of a simulated site with its own port and folder, in about three minutes, and leaves running sites
+    alone.
 
-    Exit code 1 if there is a problem to fix, no fan to watch, or a message that was not accepted.
+    Exit code 1 if there is a problem to fix, a message that was not accepted, or a promise that was not kept.
 
     Example: fantwin doctor -c fantwin.toml
 
-    Example: fantwin doctor find --write fantwin.toml
+    Example: fantwin doctor selftest kill hang
     """
-    if task is Task.FIND:
-        find_fans(root, write, writable=writable, json_output=json_output)
+    if output and task is not Task.SELFTEST:
+        raise UsageError(f"-o is for selftest: leave it out with {task}")
+    if task is Task.SELFTEST:
+        from fantwin.pipeline.cli.watch.selftest import run_selftest  # noqa: PLC0415  loads the simulation
+
+        run_selftest(targets or (), output, json_output=json_output)
     elif task is Task.NOTIFY:
         send_test_messages(config or DEFAULT_CONFIG, overrides or (), targets or (), json_output=json_output)
     else:

@@ -1,17 +1,17 @@
-"""`fantwin selftest`: causes common faults on a site of its own; prints each promise and what it saw."""
+"""`fantwin doctor selftest`: causes common faults on a site of its own; prints each promise and what it saw."""
 
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import typer
 from rich.console import Console
 from rich.text import Text
 
-from fantwin.pipeline.cli.options import JsonOption
 from fantwin.pipeline.cli.printing import show, table_of
 from fantwin.pipeline.cli.progress import working
 from fantwin.pipeline.cli.simulation.scenario import Scenario as Simulated
@@ -29,28 +29,16 @@ _STATES = {True: "kept", False: "NOT KEPT", None: "not run"}
 _STYLES = {True: "green", False: "red", None: "yellow"}
 
 
-def selftest(
-    names: Annotated[
-        list[str] | None,
-        typer.Argument(
-            metavar="[SCENARIO]...", help=f"Default: all of {', '.join(scenario.name for scenario in SCENARIOS)}."
-        ),
-    ] = None,
-    out: Annotated[
-        Path | None, typer.Option("-o", "--out", help="Folder for the files; default: a temporary one.")
-    ] = None,
-    json_output: JsonOption = False,
-) -> None:
+def run_selftest(names: Sequence[str], out: Path | None, *, json_output: bool) -> None:
     """Kill, freeze and flood the stages of a simulated site, and check that fantwin keeps its promises.
 
-    It leaves running sites alone: it uses its own port and folder on this computer. It takes about three minutes.
-    Exit code 1 if a promise was not kept.
+    names: of scenarios; empty for all. out: folder for the files; None: a temporary one.
 
-    Example: fantwin selftest
-
-    Example: fantwin selftest kill hang
+    Raises:
+        UserError: there is no such scenario, or the folder is not empty.
+        typer.Exit: a promise was not kept.
     """
-    chosen = _chosen(names or ())
+    chosen = _chosen(names)
     console = Console(stderr=json_output, highlight=False, soft_wrap=True)
     with tempfile.TemporaryDirectory(prefix="fantwin-selftest-") as temporary:
         folder = out.resolve() if out else Path(temporary)
@@ -75,9 +63,10 @@ def simulated_tray() -> SimulatedTray:
     return Simulated(fans=FANS).tray(INSTANTANEOUS, rate_hz=100.0)
 
 
-def _chosen(names: list[str] | tuple[str, ...]) -> list[Scenario]:
+def _chosen(names: Sequence[str]) -> list[Scenario]:
     by_name = {scenario.name: scenario for scenario in SCENARIOS}
     for name in names:
         if name not in by_name:
-            raise UsageError(f"no scenario {name!r}{nearest(name, by_name)}")
+            known = nearest(name, by_name) or f"; known: {', '.join(by_name)}"
+            raise UsageError(f"no scenario {name!r}{known}")
     return [by_name[name] for name in names] or list(SCENARIOS)

@@ -16,6 +16,7 @@ from rich.text import Text
 from fantwin.pipeline.bus.session import Bus, join_bus
 from fantwin.pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
 from fantwin.pipeline.cli.printing import STYLES, duration_text, show, table_of
+from fantwin.pipeline.cli.watch.wear import show_wear_of_site
 from fantwin.pipeline.config.registry import STAGES
 from fantwin.pipeline.config.roles import READERS, role_names, roles_of
 from fantwin.pipeline.config.settings import Config
@@ -50,6 +51,9 @@ def status(
     ] = None,
     trays: Annotated[str | None, typer.Option(metavar="A,B", help="With --stage: the trays of the process.")] = None,
     shard: Annotated[str | None, typer.Option(metavar="K/N", help="With --stage: the shard of the process.")] = None,
+    wear: Annotated[
+        bool, typer.Option("--wear", help="Only how each fan has changed since commissioning, and how fast.")
+    ] = False,
     overrides: SetOption = None,
     json_output: JsonOption = False,
 ) -> None:
@@ -67,11 +71,16 @@ def status(
 
     With --stage: 0 if that process is heard and has caught up, 1 if not, whatever the others do.
 
+    With --wear: 0 if shown, 1 if nothing is known yet (docs/explanation/wear.md).
+
     Example: fantwin status -c fantwin.toml --once
 
     Example: fantwin status -c fantwin.toml --stage scorer --shard 2/8
     """
     settings = load_for_any_host(config, overrides or (), stages=())
+    if wear:
+        show_wear_of_site(settings, json_output=json_output)
+        return
     stop = stop_on_signals()
     if stage is not None:
         if stage not in STAGES:

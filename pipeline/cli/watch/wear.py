@@ -1,24 +1,23 @@
-"""`fantwin wear`: how fast each fan wears, and when that will raise an alarm."""
+"""`fantwin status --wear`, `fantwin info --wear`: how fast each fan wears, and when that will raise an alarm."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from datetime import datetime
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import typer
 from rich.markup import escape
 from rich.table import Table
 
 from fantwin.pipeline.bus.session import join_bus
-from fantwin.pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
 from fantwin.pipeline.cli.printing import show, table_of
 from fantwin.pipeline.cli.progress import working
 from fantwin.pipeline.cli.watch.scorers import wait_for_stages
-from fantwin.pipeline.config.loading import load_config
 from fantwin.pipeline.config.roles import roles_of
+from fantwin.pipeline.config.settings import Config
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.recordings.dates import format_local, has_date
 from fantwin.pipeline.recordings.reading import read_recording
@@ -35,38 +34,42 @@ NS_PER_DAY = 86_400 * NS_PER_S
 _NEEDED = "a fan has its first point about an hour after commissioning, while it turns without an alarm"
 
 
-def wear(
-    recordings: Annotated[
-        list[Path] | None, typer.Argument(metavar="REC.mcap", help="Recordings; without them, the running site.")
-    ] = None,
-    config: ConfigOption = DEFAULT_CONFIG,
-    overrides: SetOption = None,
-    json_output: JsonOption = False,
-) -> None:
+def show_wear_of_site(settings: Config, *, json_output: bool) -> None:
     """Show how the speed of each fan has changed since commissioning, how fast, and when its limit will be reached
-    (docs/explanation/wear.md).
+    (docs/explanation/wear.md), by the last snapshot that each scorer has sent: at most a minute or 3,000 samples ago,
+    for a tray of more than 64 fans three times as long.
 
-    Each value holds at the time beside it. They come from the last snapshot that the scorer has sent, which is at most
-    a minute or 3,000 samples old, of a tray of more than 64 fans three times as old. Exit code 0: shown; 1: nothing is
-    known; 3: a recording could not be read in full.
-
-    Example: fantwin wear
-
-    Example: fantwin wear runs/recording.mcap
+    Raises:
+        UserError: nothing is known.
     """
-    if recordings:
-        snapshots, damage = _recorded(recordings)
-        nothing = f"no wear in {', '.join(map(str, recordings))}: a scorer records it regularly and when it stops"
-    else:
-        settings, damage = load_config(config, overrides or (), stages=()), []
-        stop = stop_on_signals()
-        with join_bus(settings, listens=False) as bus:
-            watcher = SiteWatcher(bus, settings.site, roles_of(settings))
-            wait_for_stages(bus, watcher, settings, stop, what="wear")
-            answers = bus.recover(tray_key(settings.site, "*", "snapshot"))
-            heard = [(key, snapshot) for key, payload in answers for snapshot in _decoded(payload)]
-            snapshots = [snapshot for key, snapshot in heard if watcher.counts(key, snapshot.header.producer)]
-        nothing = "no scorer has recorded wear so far: it does so regularly; try again later"
+    stop = stop_on_signals()
+    with join_bus(settings, listens=False) as bus:
+        watcher = SiteWatcher(bus, settings.site, roles_of(settings))
+        wait_for_stages(bus, watcher, settings, stop, what="wear")
+        answers = bus.recover(tray_key(settings.site, "*", "snapshot"))
+        heard = [(key, snapshot) for key, payload in answers for snapshot in _decoded(payload)]
+        snapshots = [snapshot for key, snapshot in heard if watcher.counts(key, snapshot.header.producer)]
+    nothing = "no scorer has recorded wear so far: it does so regularly; try again later"
+    _show(snapshots, nothing, json_output=json_output)
+
+
+def show_recorded_wear(recordings: Sequence[Path], *, json_output: bool) -> None:
+    """The same up to the end of the recordings; of several, the last of each tray.
+
+    Raises:
+        UserError: nothing is known.
+        typer.Exit: 3, a recording could not be read in full.
+    """
+    snapshots, damage = _recorded(recordings)
+    nothing = f"no wear in {', '.join(map(str, recordings))}: a scorer records it regularly and when it stops"
+    _show(snapshots, nothing, json_output=json_output)
+    for line in damage:
+        typer.echo(line, err=True)
+    if damage:
+        raise typer.Exit(3)
+
+
+def _show(snapshots: Sequence[ScorerSnapshot], nothing: str, *, json_output: bool) -> None:
     latest = {each.header.tray: each for each in sorted(snapshots, key=lambda each: (each.t_ns, each.header.sequence))}
     last = [(tray, snapshot.t_ns, wear_in(snapshot)) for tray, snapshot in sorted(latest.items())]
     found = [(tray, t_ns, wear) for tray, t_ns, wear in last if wear is not None]
@@ -77,10 +80,6 @@ def wear(
         trays = ", ".join(tray for tray, *_ in found)
         raise UserError(f"no data yet for any fan of {trays}: {_NEEDED}; try again later")
     show({"wear": rows}, *(_table(*each) for each in found), json_output=json_output)
-    for line in damage:
-        typer.echo(line, err=True)
-    if damage:
-        raise typer.Exit(3)
 
 
 def _recorded(recordings: Iterable[Path]) -> tuple[list[ScorerSnapshot], list[str]]:

@@ -248,7 +248,9 @@ def view_of_site(
     fleet = None
     if is_fleet(trays):
         if options.layout == "wear":
-            raise StageError(f"--layout wear: not with more than {FLEET_ABOVE} fans; fantwin wear lists the changes")
+            raise StageError(
+                f"--layout wear: not with more than {FLEET_ABOVE} fans; fantwin status --wear lists the changes"
+            )
         hold_ns, window_ns = round(fleet_view.HOLD_S * NS_PER_S), round(options.window_s * NS_PER_S)
         fleet = FleetView(trays, options.show, fleet_view.ALARM_PLOTS, hold_ns, window_ns)
     return ViewerCore(site, trays, RerunSink(site, trays, started_t_ns, file, options), fleet)

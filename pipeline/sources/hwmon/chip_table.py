@@ -23,7 +23,7 @@ class Chip:
         pattern: of `name` in the folder of the chip, a regular expression.
         source: the file of the kernel that says it (Documentation/hwmon, or the driver).
         tacho: what a reading is; None where the source does not say.
-        note: what else to know, for `fantwin doctor find`.
+        note: what else to know, for `fantwin init`.
         pwm_is_known_after_write: `pwmN` reads 0 until a program has set it.
         automatic: what is written to `pwmN_enable` to give the fan back, where that file cannot be read.
     """

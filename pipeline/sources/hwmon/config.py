@@ -23,7 +23,7 @@ class HwmonConfig(PolledConfig, frozen=True):
     chip: str = Field(
         min_length=1,
         description="`name` of the chip, for example nct6798; where several have the same name, with the end of the "
-        "path of its device: emc2305@1-002f. `fantwin doctor find` lists them",
+        "path of its device: emc2305@1-002f. `fantwin init --hwmon` finds them",
     )
     fans: tuple[Number, ...] = Field(
         default=(),

@@ -1,49 +1,18 @@
-"""Discovery of what this computer could watch: hwmon chips with fans, and serial ports, each as a [[tray]] to paste."""
+"""Discovery of the hwmon chips of this computer that have fans, each as a [[tray]]."""
 
 from __future__ import annotations
 
-import json
 import os
-import re
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from fantwin.pipeline.sources.found import Found, free_name
 from fantwin.pipeline.sources.hwmon.chip_folder import ChipFolder, chip_folders, chip_words
 from fantwin.pipeline.sources.hwmon.chip_table import chip_of
 from fantwin.pipeline.sources.hwmon.config import ROOT
 
 HIGHEST_RPM = 20_000
-_UNKNOWN = "n/a"
-"""description by pyserial of a port of which the system knows no device"""
-
-
-@dataclass(frozen=True)
-class Found:
-    """Possible tray: a chip with fans, or a serial port.
-
-    Attributes:
-        kind: of its source.
-        title: one line.
-        tray: the keys of its [[tray]]; empty if it cannot be one.
-        notes: what to know of it.
-        missing: what keeps it from being watched, or commanded, and what to do.
-    """
-
-    kind: str
-    title: str
-    tray: Mapping[str, Any]
-    notes: tuple[str, ...] = ()
-    missing: tuple[str, ...] = ()
-
-    @property
-    def toml(self) -> str:
-        """The [[tray]], with what to know as comments; empty if it cannot be one."""
-        if not self.tray:
-            return ""
-        lines = [f"# {line}" for line in (self.title, *self.notes, *self.missing)]
-        return "\n".join(["[[tray]]", *lines, *(f"{key} = {_toml(value)}" for key, value in self.tray.items()), ""])
 
 
 def discover_hwmon(root: Path = ROOT, *, writable: bool = False) -> Iterator[Found]:
@@ -65,30 +34,6 @@ def discover_hwmon(root: Path = ROOT, *, writable: bool = False) -> Iterator[Fou
         there = ", ".join(dict.fromkeys(chip.name for chip in chips)) or "none"
         hint = "load the driver of the board's chip (sensors-detect of lm-sensors finds it)"
         yield Found("hwmon", f"{root}", {}, missing=(f"no chip with a fan; chips: {there}; {hint}",))
-
-
-def discover_serial() -> Iterator[Found]:
-    """The serial ports with a known device, each with a guessed [[tray]]; then all other ports as one entry."""
-    from serial.tools import list_ports  # noqa: PLC0415  slow to import, and needed here only
-
-    listed = sorted(list_ports.comports())
-    ports = [port for port in listed if (port.description, port.hwid) != (_UNKNOWN, _UNKNOWN)]
-    for number, port in enumerate(ports):
-        readable = os.access(port.device, os.R_OK | os.W_OK)
-        missing = () if readable else ("this user may not open it: join its group (often dialout)",)
-        keys = {
-            "name": f"tray{number + 1}",
-            "fans": 1,
-            "speed_unit": "rpm",
-            "source": {"kind": "serial", "port": port.device, "protocol": "text"},
-        }
-        note = "fans, protocol and unit are a guess: `fantwin doctor` listens and says what does not fit"
-        yield Found("serial", f"{port.device}: {port.description}", keys, (note,), missing)
-    if unknown := [port.device for port in listed if port not in ports]:
-        lacks = "no device is known there; if one is connected, name its port in a [[tray]] yourself"
-        yield Found("serial", ", ".join(unknown), {}, missing=(lacks,))
-    if not listed:
-        yield Found("serial", "serial ports", {}, missing=("none is there: connect the device",))
 
 
 def _of_chip(chip: ChipFolder, chips: Sequence[ChipFolder], root: Path, names: set[str], *, writable: bool) -> Found:
@@ -124,7 +69,7 @@ def _of_chip(chip: ChipFolder, chips: Sequence[ChipFolder], root: Path, names: s
     if root != ROOT:
         source["root"] = str(root)
     keys = {
-        "name": _free_name(chip.name, names),
+        "name": free_name(chip.name, names),
         "fans": len(fans),
         "speed_unit": "rpm",
         "speed_max": HIGHEST_RPM,
@@ -149,19 +94,3 @@ def _number(chip: ChipFolder, file: str) -> int | None:
 def _label(chip: ChipFolder, fan: int) -> str:
     label = chip.label("fan", fan)
     return f" ({label})" if label else ""
-
-
-def _free_name(chip: str, names: set[str]) -> str:
-    base = re.sub(r"[^A-Za-z0-9_-]", "-", chip) or "chip"
-    name, number = base, 1
-    while name in names:
-        number += 1
-        name = f"{base}-{number}"
-    names.add(name)
-    return name
-
-
-def _toml(value: object) -> str:
-    if isinstance(value, Mapping):
-        return f"{{ {', '.join(f'{key} = {_toml(each)}' for key, each in value.items())} }}"
-    return json.dumps(value)  # texts, numbers, booleans and lists of numbers are alike in both

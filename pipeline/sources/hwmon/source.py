@@ -193,7 +193,7 @@ class HwmonSource(PollingSource):
             there = ", ".join(dict.fromkeys(chip.name for chip in chips)) or "none"
             raise DeviceError(
                 f"no chip is called {config.chip} in {self._root}; there are: {there}; load its driver, or "
-                "see `fantwin doctor find`"
+                "see `fantwin init --hwmon -c NEW.toml`"
             )
         return found[0]
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from fantwin.pipeline.errors import refusals
 from fantwin.pipeline.extras import require
@@ -26,6 +26,17 @@ PERIOD_S = 1.0
 """time between two readings: controllers are slow"""
 TIMEOUT_S = 5.0
 """longest wait for the answer to a request"""
+
+
+_NAMES = ("Name", "FanName", "MemberId", "Id")
+
+
+class FanThere(NamedTuple):
+    """A fan of the controller and what it reads now; NaN where it gives none."""
+
+    name: str
+    rpm: float
+    command: float
 
 
 class RedfishSource(PollingSource):
@@ -96,6 +107,11 @@ class RedfishSource(PollingSource):
         speed = tuple(_rpm(fan) * self._units_per_rpm for fan in fans)
         return Reading(command=command, speed=speed, measured=measured)
 
+    def fans_there(self) -> list[FanThere]:
+        """The fans of the controller, in its order; `connect` comes first."""
+        found = [(next((str(fan[key]) for key in _NAMES if fan.get(key)), ""), fan) for fan in self._fan_objects()]
+        return [FanThere(name, _rpm(fan), _number(fan, self._config.command)) for name, fan in found]
+
     def disconnect(self) -> None:
         """Log out."""
         root, self._root = self._root, None
@@ -162,7 +178,7 @@ class RedfishSource(PollingSource):
         wanted = self._config.fans
         by_name: dict[str, Json] = {}
         for fan in fans:
-            for key in ("Name", "FanName", "MemberId", "Id"):
+            for key in _NAMES:
                 if name := fan.get(key):
                     by_name.setdefault(str(name), fan)
         if lacking := [name for name in wanted if name not in by_name]:

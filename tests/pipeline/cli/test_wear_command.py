@@ -1,4 +1,4 @@
-"""`fantwin wear`: from recordings, and from a running site over a real bus."""
+"""`fantwin info --wear` and `fantwin status --wear`: from recordings, and from a running site over a real bus."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def recording(path: Path, notes: Sequence[ScorerSnapshot]) -> Path:
 
 
 def rows(*words: object) -> dict[int, dict[str, Any]]:
-    done = fantwin("wear", *words, "--json")
+    done = fantwin("status" if "-c" in words else "info", "--wear", *words, "--json")
     assert done.exit_code == 0, done.exception
     return {row["fan"]: row for row in json.loads(done.stdout)["wear"]}
 
@@ -64,7 +64,7 @@ def test_a_recording_reports_what_wears_and_when_its_limit_is_reached(tmp_path, 
 
 
 def test_people_are_shown_a_table_that_says_when_its_values_hold(tmp_path, notes):
-    done = fantwin("wear", recording(tmp_path / "r.mcap", notes))
+    done = fantwin("info", "--wear", recording(tmp_path / "r.mcap", notes))
     assert done.exit_code == 0
     lines = done.stdout.splitlines()
     assert lines[0].startswith(f"wear of {TRAY} up to ")
@@ -88,15 +88,15 @@ def test_a_fan_without_points_is_named_below_the_table_and_a_tray_without_is_one
     path = recording(tmp_path / "r.mcap", [without_points(notes[0], HEALTHY)])
     assert set(rows(path)) == set(range(FANS)) - {HEALTHY}
     later = "a fan has its first point about an hour after commissioning"
-    assert f"no data yet for fan {HEALTHY}: {later}" in fantwin("wear", path).stdout
+    assert f"no data yet for fan {HEALTHY}: {later}" in fantwin("info", "--wear", path).stdout
     path = recording(tmp_path / "none.mcap", [without_points(notes[0], *range(FANS))])
-    assert error_of("wear", path, "--json").startswith(f"no data yet for any fan of {TRAY}: {later}")
+    assert error_of("info", "--wear", path, "--json").startswith(f"no data yet for any fan of {TRAY}: {later}")
 
 
 @pytest.mark.parametrize("state", ["no json", '{"wear": {"fans": [{}]}}'])
 def test_a_recording_without_wear_is_one_line(tmp_path, notes, state):
     path = recording(tmp_path / "r.mcap", [replace(notes[0], state_json=state)])
-    assert error_of("wear", path) == f"no wear in {path}: a scorer records it regularly and when it stops"
+    assert error_of("info", "--wear", path) == f"no wear in {path}: a scorer records it regularly and when it stops"
 
 
 class SnapshotSender(Core):
@@ -129,6 +129,6 @@ def test_a_running_site_reports_the_same_and_one_whose_scorer_has_noted_nothing_
                 assert rows(*scorer.words) == rows(recording(tmp_path / "r.mcap", notes))
             else:
                 expected = "no scorer has recorded wear so far: it does so regularly; try again later"
-                assert error_of("wear", *scorer.words) == expected
+                assert error_of("status", "--wear", *scorer.words) == expected
         finally:
             scorer.end()

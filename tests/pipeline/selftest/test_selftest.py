@@ -1,4 +1,4 @@
-"""`fantwin selftest`: a promise that is not kept is a row and exit code 1; a scenario on a real site is kept."""
+"""`fantwin doctor selftest`: a promise that is not kept is a row and exit code 1; a scenario on a real site is kept."""
 
 from __future__ import annotations
 
@@ -123,7 +123,7 @@ def test_the_exit_code_says_whether_all_promises_were_kept(monkeypatch, tmp_path
     codes = {}
     for name, scenario in (("kept", FINE), ("not-kept", Scenario("bad", "promised", refuses))):
         monkeypatch.setattr("fantwin.pipeline.cli.watch.selftest.SCENARIOS", [scenario])
-        done = fantwin("selftest", "--json", "-o", tmp_path / name)
+        done = fantwin("doctor", "selftest", "--json", "-o", tmp_path / name)
         codes[name] = (done.exit_code, json.loads(done.stdout)["kept"])
     assert codes == {"kept": (0, True), "not-kept": (1, False)}
 
@@ -164,7 +164,7 @@ def test_a_line_loses_what_is_sent_while_it_is_cut_and_delivers_what_it_held_in_
 
 @pytest.mark.real_time
 def test_on_a_real_site_noise_is_skipped_and_its_recording_verifies():
-    done = fantwin("selftest", "noise", "--json")
+    done = fantwin("doctor", "selftest", "noise", "--json")
     assert done.exit_code == 0, done.output
     rows = json.loads(done.stdout)["rows"]
     assert [row["name"] for row in rows] == ["noise", "shutdown after noise"]

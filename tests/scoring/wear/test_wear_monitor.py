@@ -176,9 +176,9 @@ def test_what_is_no_number_is_no_point() -> None:
 
 def test_the_notices_are_told_from_other_notes() -> None:
     alone = own_change(2, -0.0512, 30 * 3600 * 10**9, None)
-    assert alone == "fan 2: speed -5.1 % in 30 h: see fantwin wear"
+    assert alone == "fan 2: speed -5.1 % in 30 h: see fantwin status --wear"
     beside = own_change(0, 0.04, 12 * 24 * 3600 * 10**9, -0.002)
-    assert beside == "fan 0: speed +4.0 % in 12 days, the fans beside it -0.2 %: see fantwin wear"
+    assert beside == "fan 0: speed +4.0 % in 12 days, the fans beside it -0.2 %: see fantwin status --wear"
     shared = shared_change(-0.042)
     assert shared == (
         "most fans turn 4 % slower than when they were commissioned: the air, the supply, or a filter in front of them "

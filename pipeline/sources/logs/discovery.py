@@ -1,0 +1,56 @@
+"""Discovery of logs and tables in a folder, and the command that reads the first of them."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.sources.logs.formats import log_format
+from fantwin.pipeline.sources.logs.log_file import LogError
+
+_TABLES = (".csv", ".tsv", ".txt")
+
+
+@dataclass(frozen=True)
+class FoundLogs:
+    """Files of one format; next_command: how the first of them is read."""
+
+    format: str
+    files: tuple[str, ...]
+    next_command: str
+
+
+def discover_logs(folder: Path) -> list[FoundLogs]:
+    """The logs and tables in a folder and the folders in it, by format.
+
+    Raises:
+        UserError: it cannot be read, or has none.
+    """
+    try:
+        found = sorted(_formats(folder))
+    except OSError as error:
+        raise UserError(f"{folder}: {error.strerror}; name a folder of logs") from error
+    if not found:
+        raise UserError(f"{folder}: no ULog, ROS 2 bag or table ({', '.join(_TABLES)}) in it")
+    titles = dict.fromkeys(title for title, _ in found)
+    grouped = {title: [path for each, path in found if each == title] for title in titles}
+    return [FoundLogs(title, tuple(map(str, paths)), _import_of(title, paths[0])) for title, paths in grouped.items()]
+
+
+def _formats(folder: Path) -> Iterator[tuple[str, Path]]:
+    for path in folder.iterdir():
+        try:
+            kind = log_format(path)
+        except LogError:
+            yield from _formats(path) if path.is_dir() else ()
+            continue
+        if kind or path.suffix.lower() in _TABLES:
+            yield kind.title if kind else "table", path
+
+
+def _import_of(title: str, path: Path) -> str:
+    named = f"fantwin import {shlex.quote(str(path))}"
+    return f"{named} --time t:s --command u --speed y:rpm -o REC.mcap" if title == "table" else f"{named} --list"

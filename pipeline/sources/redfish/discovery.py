@@ -1,0 +1,59 @@
+"""Discovery of the fans behind a baseboard controller."""
+
+from __future__ import annotations
+
+import math
+import re
+from pathlib import Path
+
+from pydantic import ValidationError
+
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.sources.found import Found
+from fantwin.pipeline.sources.polling import DeviceError
+from fantwin.pipeline.sources.redfish.config import RedfishConfig
+from fantwin.pipeline.sources.redfish.source import RedfishSource
+from fantwin.pipeline.sources.source import SourceContext
+
+HIGHEST_RPM = 50_000
+
+
+def discover_controller(url: str, password_file: Path | None, folder: Path) -> Found:
+    """The [[tray]] of a controller with its fans. Nothing is written to it. folder: relative paths start here.
+
+    Raises:
+        UserError: the address is none, the controller cannot be asked, or it has no fans.
+    """
+    try:
+        config = RedfishConfig(url=url, password_file=password_file)
+    except ValidationError as error:
+        raise UserError(f"--redfish {url}: {error.errors()[0]['msg'].removeprefix('Value error, ')}") from error
+    source = RedfishSource(config, SourceContext(0, "rpm", folder))
+    try:
+        source.connect()
+        fans = source.fans_there()
+    except DeviceError as error:
+        raise UserError(f"{url}: {error}") from error
+    finally:
+        source.disconnect()
+    if not fans:
+        raise UserError(f"{url}: it has no fans")
+    notes = [f"fan {number} is {fan.name}: {fan.rpm:.0f} rpm" for number, fan in enumerate(fans)]
+    missing = []
+    if lacking := [fan.name for fan in fans if math.isnan(fan.command)]:
+        where = f"no command at {config.command} of {', '.join(lacking)}"
+        missing = [f"{where}: say with source.command where it is; without commands no twin can be learned"]
+    keys = {
+        "name": config.host if re.fullmatch(r"[0-9a-f.:]+", config.host) else config.host.partition(".")[0],
+        "fans": len(fans),
+        "speed_unit": "rpm",
+        "speed_max": HIGHEST_RPM,
+        "command_max": 100,
+        "source": {
+            "kind": "redfish",
+            "url": url,
+            **({"password_file": str(password_file)} if password_file else {}),
+            "fans": [fan.name for fan in fans],
+        },
+    }
+    return Found("redfish", f"controller {config.address}{config.chassis}", keys, tuple(notes), tuple(missing))
