@@ -58,7 +58,6 @@ app = typer.Typer(
     epilog="Exit codes: 0 success; 1 failed, and one line says why; 2 wrong usage; 3 finished with a bad result: data "
     "were lost or could not be read in full, or a declared rate was not kept; 4 bad recordings were skipped; 130 "
     "interrupted by Ctrl-C.",
-    no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
@@ -79,7 +78,10 @@ def _group(
         bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version and exit.")
     ] = False,
 ) -> None:
-    """Digital twins of fans: run a healthy twin beside each fan, raise an alarm when the two diverge."""
+    """Digital twins of fans: run a healthy twin beside each fan, raise an alarm when the two diverge.
+
+    Without a command: what to do next on this computer.
+    """
 
 
 def function_of(name: str) -> Callable[..., Any]:
@@ -139,7 +141,12 @@ def main() -> None:
     if signal.getsignal(signal.SIGINT) is signal.SIG_DFL:  # commands clean up when they are interrupted
         signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
-        app(words)
+        if words:
+            app(words)
+        else:
+            from fantwin.pipeline.cli.watch.next_step import show_next_step  # noqa: PLC0415
+
+            show_next_step()
     except UserError as error:
         from rich.console import Console  # noqa: PLC0415  a stage's process needs no rich
         from rich.markup import escape  # noqa: PLC0415
