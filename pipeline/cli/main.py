@@ -26,6 +26,7 @@ COMMANDS = {
     "init": "watch.init",
     "commission": "watch.commission",
     "up": "watch.up",
+    "service": "watch.service",
     "status": "watch.status",
     "alarms": "watch.alarms",
     "command": "watch.command",

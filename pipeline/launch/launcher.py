@@ -22,6 +22,7 @@ from fantwin.pipeline.launch.processes import EXIT_CANNOT_START, Child, HangDete
 from fantwin.pipeline.launch.site_report import RunningProcess, SiteReport
 from fantwin.pipeline.prediction.tray_twin import load_tray_twin, twin_path
 from fantwin.pipeline.recordings.parts import part_files, part_path
+from fantwin.pipeline.runtime.service_manager import SignsOfLife
 from fantwin.pipeline.runtime.stage import load_stage
 from fantwin.pipeline.site.loss_accounting import Launched
 from fantwin.pipeline.site.site_watcher import SiteWatcher
@@ -141,16 +142,20 @@ class Launcher:
                 self._say(problem)
             before = set(self._parts())
             self._watcher = SiteWatcher(bus, self._config.site, roles_of(self._config), self._config.trays)
+            signs = SignsOfLife.from_environment()
             try:
                 self._start_all(stop)
                 for line in self._when_started if self._is_started else ():
                     self._say(line)
                 self._report = SiteReport(self._config.bus.endpoint, self._say, HOST_CLOCK.now_ns())
+                signs.ready()
                 while not stop.wait(_POLL_S):
+                    signs.at_work(f"site {self._config.site}: {len(self._slots)} processes")
                     self._check_processes()
                     self._report_changes()
                 self._restart_those_down()
             finally:
+                signs.stopping()
                 self._stop_all()
                 self.outcome.recordings = [str(path) for part, path in self._parts().items() if part not in before]
                 ready = [slot for slot in self._slots if slot.was_ready]  # one that was never ready has lost nothing

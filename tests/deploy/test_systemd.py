@@ -1,100 +1,117 @@
-"""The systemd units: complete, in the order of the data flow, and accepted by systemd itself."""
+"""The units that `fantwin service` and `fantwin deploy systemd` make: systemd accepts them, and they may do little."""
 
 from __future__ import annotations
 
 import configparser
 import os
-import re
+import pwd
 import shlex
 import shutil
 import subprocess
-from itertools import product
+import sys
 from pathlib import Path
 
 import pytest
 
-from fantwin.pipeline.config.registry import STAGES
-from fantwin.pipeline.runtime.stage import load_stage
+from fantwin.pipeline.cli.watch.service_files import RULES, UNITS, USERS, Service, written_below
+from fantwin.pipeline.config.loading import parse_config
 from tests.support.fantwin_words import parsed
 
-UNITS = Path(__file__).parents[2] / "deploy" / "systemd"
-FANTWIN = "/opt/fantwin/bin/fantwin"
-SERVICES = [*(f"fantwin-{stage}@2-8.service" for stage in STAGES), "fantwin-router.service"]
 HIGHEST_EXPOSURE = 20
 """of 100, as systemd rates what a service may do"""
+HWMON = """[[tray]]
+name = "board"
+fans = 2
+source = { kind = "hwmon", chip = "nct6798", writable = true }
+"""
+SERIAL = """[[tray]]
+name = "line"
+fans = 1
+port = "/dev/ttyACM7"
+"""
+WATCHED = HWMON.replace("writable = true", "writable = false")
 
 
-def section(unit: str, name: str) -> configparser.SectionProxy:
+def service(text: str, folder: Path = Path("/etc/fantwin"), user: str = "fantwin") -> Service:
+    return Service.of(parse_config(f'run_folder = "/var/lib/fantwin"\n{text}', folder / "fantwin.toml"), user)
+
+
+def settings(made: Service, unit: str = "fantwin.service") -> configparser.SectionProxy:
     parser = configparser.ConfigParser(strict=False, interpolation=None, delimiters=("=",))
     parser.optionxform = str  # type: ignore[assignment]
-    parser.read(UNITS / unit)
-    return parser[name]
-
-
-def command_of(unit: str, stage: str) -> list[str]:
-    """The words after the program, for shard 2/8 of a stage."""
-    words = shlex.split(section(unit, "Service")["ExecStart"].replace("%j", stage).replace("%I", "2/8"))
-    assert words[0] == FANTWIN
-    return words[1:]
-
-
-@pytest.fixture
-def installed(tmp_path: Path) -> Path:
-    """A folder with the units, and an instance of each template, as it would be on a host where fantwin is."""
-    if shutil.which("systemd-analyze") is None:
-        pytest.skip("systemd-analyze is not installed: the units are not checked by systemd")
-    shutil.copytree(UNITS, tmp_path, dirs_exist_ok=True)
-    program = tmp_path / "fantwin"
-    program.write_text("#!/bin/sh\n")
-    program.chmod(0o755)
-    for unit in tmp_path.glob("*.service"):
-        unit.write_text(unit.read_text().replace(FANTWIN, str(program)))
-    for service in SERVICES:
-        if "@" in service:
-            (tmp_path / service).symlink_to(f"{service.partition('@')[0]}@.service")
-    return tmp_path
+    parser.read_string((made.files() | made.router())[UNITS / unit])
+    return parser["Service"]
 
 
 def analyze(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
+    if shutil.which("systemd-analyze") is None:
+        pytest.skip("systemd-analyze is not installed: the units are not checked by systemd")
+    environment = {**os.environ, "SYSTEMD_UNIT_PATH": f"{folder / UNITS}:"}
     return subprocess.run(
-        ["systemd-analyze", *words],
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        check=False,
-        env={**os.environ, "SYSTEMD_UNIT_PATH": f"{folder}:"},
+        ["systemd-analyze", *words], capture_output=True, text=True, check=False, env=environment, cwd=folder / UNITS
     )
 
 
-def test_a_unit_runs_the_shard_that_its_instance_names_and_the_router_listens():
-    configuration = Path("/etc/fantwin/fantwin.toml")
-    for stage in STAGES:
-        found = parsed(command_of(f"fantwin-{stage}@.service", stage))
-        assert (found["only"], found["shard"], found["config"]) == (stage, "2/8", configuration)
-    found = parsed(command_of("fantwin-router.service", ""))
-    assert (found["listen"], found["config"]) == ("tls/0.0.0.0:7447", configuration)
-
-
-def test_a_stage_stops_before_those_that_read_from_it():
-    def after(stage: str) -> set[str]:
-        found = section(f"fantwin-{stage}@.service", "Unit").get("After", "").split()
-        return {match[1] for each in found if (match := re.fullmatch(r"fantwin@(\w+)\.target", each))}
-
-    for writer, reader in product(STAGES, STAGES):
-        flows = set(load_stage(writer).writes) & set(load_stage(reader).reads) - {"new_twin", "score"}
-        if flows and list(STAGES).index(writer) < list(STAGES).index(reader):
-            assert reader in after(writer), f"{writer} is read by {reader}"
-    for stage in STAGES:
-        assert after(stage) == set(list(STAGES)[list(STAGES).index(stage) + 1 :]), "the order of the registry"
-        assert section(f"fantwin-{stage}@.service", "Unit")["Before"] == "fantwin@%j.target"
-
-
-def test_systemd_accepts_the_units_which_may_do_little_and_only_acquisition_reaches_devices(installed):
-    done = analyze(installed, "verify", "--man=no", *SERVICES, "fantwin.target")
+@pytest.mark.parametrize("text", [HWMON, SERIAL, WATCHED, HWMON + SERIAL], ids=["hwmon", "serial", "watched", "both"])
+@pytest.mark.parametrize("folder", ["/etc/fantwin", "/home/ann/the fans"])
+def test_systemd_accepts_the_units_which_may_do_little(text: str, folder: str, tmp_path: Path) -> None:
+    made = service(text, Path(folder))
+    written_below(tmp_path, made.files() | made.router())
+    done = analyze(tmp_path, "verify", "--man=no", "fantwin.service", "fantwin-router.service")
     assert (done.returncode, done.stderr) == (0, "")
-    for service in SERVICES:
-        words = ("security", "--offline=yes", "--no-pager", f"--threshold={HIGHEST_EXPOSURE}", str(installed / service))
-        done = analyze(installed, *words)
+    for unit in ("fantwin.service", "fantwin-router.service"):
+        done = analyze(tmp_path, "security", "--offline=yes", "--no-pager", f"--threshold={HIGHEST_EXPOSURE}", unit)
+        print(done.stdout.splitlines()[-1])
         assert done.returncode == 0, done.stdout + done.stderr
-        (devices,) = (line for line in done.stdout.splitlines() if "PrivateDevices=" in line)
-        assert ("✓" in devices) == ("acquisition" not in service)
+
+
+def test_the_commands_of_the_units_are_those_of_fantwin() -> None:
+    for unit, name in (("fantwin.service", "up"), ("fantwin-router.service", "router")):
+        words = shlex.split(settings(service(HWMON), unit)["ExecStart"])
+        assert words[:3] == [sys.executable, "-m", "fantwin"] and words[3] == name
+        assert parsed(words[3:])["config"] == Path("/etc/fantwin/fantwin.toml")
+
+
+def test_only_what_a_source_needs_is_open() -> None:
+    found = {
+        "hwmon": settings(service(HWMON)),
+        "serial": settings(service(SERIAL)),
+        "watched": settings(service(WATCHED)),
+    }
+    assert {name: each["ProtectKernelTunables"] for name, each in found.items()} == {
+        "hwmon": "no", "serial": "yes", "watched": "yes"
+    }  # fmt: skip
+    assert {name: each["PrivateDevices"] for name, each in found.items()} == {
+        "hwmon": "yes", "serial": "no", "watched": "yes"
+    }  # fmt: skip
+    assert found["serial"]["DeviceAllow"] == "char-ttyACM rw" and found["serial"]["SupplementaryGroups"] == "dialout"
+    assert RULES not in service(SERIAL + WATCHED).files()
+    rule = service(HWMON).files()[RULES]
+    assert 'ATTR{name}=="nct6798"' in rule and "chgrp -f fantwin /sys%p/pwm[0-9]" in rule
+
+
+def test_of_a_home_only_the_folders_of_fantwin_are_seen_and_the_user_is_the_one_of_the_configuration(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    ann = next(each for each in pwd.getpwall() if each.pw_uid)
+    made = service(HWMON.replace("/var", "/home/ann"), Path("/home/ann/fans"), ann.pw_name)
+    found = settings(made)
+    assert (found["User"], found["ProtectHome"]) == (ann.pw_name, "tmpfs")
+    assert "/home/ann/fans" in found["BindReadOnlyPaths"].split()
+    assert found["SupplementaryGroups"] == "fantwin", "by which it may command the fans"
+    assert made.files()[USERS / "fantwin.conf"] == "g fantwin -\n"
+    outside = settings(Service())
+    assert outside["ProtectHome"] == "yes" and outside["StateDirectory"] == "fantwin"
+
+
+def test_the_rule_lets_the_group_write_the_commands_of_a_chip(tmp_path: Path) -> None:
+    """By the shell that udev would start, on files like those of the kernel."""
+    for name in ("pwm1", "pwm1_enable", "fan1_input"):
+        (tmp_path / name).touch(mode=0o644)
+    script = service(HWMON).files()[RULES].split("-c '")[1].split("'")[0]
+    subprocess.run(
+        ["sh", "-c", script.replace("/sys%p", str(tmp_path)).replace("fantwin", str(os.getegid()))], check=False
+    )
+    assert {path.name: path.stat().st_mode & 0o020 for path in tmp_path.iterdir()} == {
+        "pwm1": 0o020, "pwm1_enable": 0o020, "fan1_input": 0
+    }  # fmt: skip

@@ -20,7 +20,7 @@ from fantwin.pipeline.config.loading import load_config
 from fantwin.pipeline.config.shards import Shard, StageProcess, process_list
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.launch.launcher import Launcher, Outcome, _Slot
-from fantwin.pipeline.launch.processes import Child
+from fantwin.pipeline.launch.processes import Child, Notices
 from fantwin.pipeline.site.site_watcher import SiteWatcher
 from fantwin.pipeline.timebase.host_clock import VARIABLE as CLOCK_VARIABLE
 from fantwin.schemas.enums import StageStatus
@@ -338,6 +338,30 @@ def test_it_says_which_files_a_run_recorded_also_one_that_failed(tmp_path, monke
     with pytest.raises(UserError, match="a stage cannot start"):
         launcher.run(threading.Event())
     assert launcher.outcome.recorded == (f"{tmp_path}/{recorded.format(f'{tmp_path}/')}" if files else recorded)
+
+
+def test_a_service_manager_hears_that_the_site_has_started_and_that_its_launcher_is_at_work(tmp_path, monkeypatch):
+    notices, stop = Notices(), threading.Event()
+    monkeypatch.setenv("NOTIFY_SOCKET", notices.address)
+    here = LateBus("elsewhere", 0.0)
+    monkeypatch.setattr("fantwin.pipeline.launch.launcher.join_bus", lambda *_, **__: nullcontext(here))
+    heard_nothing = SimpleNamespace(stages=list, losses=lambda *_: {}, refused=dict, unusable=lambda _: [])
+    monkeypatch.setattr("fantwin.pipeline.launch.launcher.SiteWatcher", lambda *_: heard_nothing)
+    settings = [f"run_folder='{tmp_path}'", "launcher.stages=['recorder']"]
+    launcher = Launcher(load_config(DEMO / "demo.toml", settings), (), lambda _line: None)
+    said: list[tuple[bool, bool]] = []
+
+    def start(_stop: object) -> None:
+        said.append((notices.read(), notices.is_ready))
+
+    for name in ("_refuse_second_launcher", "_report_changes", "_restart_those_down", "_stop_all"):
+        monkeypatch.setattr(launcher, name, lambda *_: None)
+    monkeypatch.setattr(launcher, "_start_all", start)
+    monkeypatch.setattr(launcher, "_check_processes", stop.set)
+    launcher.run(stop)
+    assert said == [(False, False)], "not before all stages have started"
+    assert (notices.read(), notices.is_ready, notices.status) == (True, True, "site demo: 1 processes")
+    notices.close()
 
 
 @pytest.mark.parametrize(

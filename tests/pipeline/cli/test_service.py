@@ -1,0 +1,115 @@
+"""`fantwin service` installs, shows and removes; the programs of the system are stand-ins that note what was asked."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import pytest
+
+from fantwin.pipeline.cli.watch import service as module
+from tests.support.fantwin_command import error_of, fantwin
+from tests.support.ports import free_port
+
+PROGRAMS = ("systemctl", "systemd-sysusers", "udevadm", "chown")
+TRAY = '[[tray]]\nname = "board"\nfans = 2\nsource = { kind = "hwmon", chip = "nct6798", writable = true }\n'
+
+
+class Host:
+    """A host that runs systemd: `calls` are what its programs were asked; `active`: the service runs."""
+
+    def __init__(self, folder: Path) -> None:
+        self.root, self._log, self._active = folder / "root", folder / "log", folder / "active"
+        (self.root / "run/systemd/system").mkdir(parents=True)
+        (folder / "bin").mkdir()
+        for name in PROGRAMS:
+            program = folder / "bin" / name
+            program.write_text(
+                f'#!/bin/sh\nif [ "$1" = is-active ]; then test -e {self._active}; exit; fi\n'
+                f'echo {name} "$@" >> {self._log}\n[ "$1" != restart ] || touch {self._active}\n'
+                f'[ "$1" != disable ] || rm {self._active}\n'
+            )
+            program.chmod(0o755)
+
+    @property
+    def calls(self) -> list[str]:
+        return self._log.read_text().splitlines()
+
+
+@pytest.fixture
+def host(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Host:
+    host = Host(tmp_path)
+    monkeypatch.setattr(module, "SYSTEM", host.root)
+    monkeypatch.setattr(os, "geteuid", lambda: 0)
+    monkeypatch.setattr(module, "may_be_read", lambda _: "")
+    monkeypatch.setenv("PATH", f"{tmp_path / 'bin'}:{os.environ['PATH']}")
+    monkeypatch.chdir(tmp_path)
+    bus = f'[bus]\nendpoint = "tcp/127.0.0.1:{free_port()}"\n'
+    (tmp_path / "fantwin.toml").write_text(f"{bus}[gateway]\nport = 8123\n{TRAY}")
+    return host
+
+
+def test_it_is_installed_started_shown_and_removed(host: Host, tmp_path: Path) -> None:
+    shown = fantwin("service", "status", "--json")
+    assert (shown.exit_code, json.loads(shown.stdout)) == (1, {"installed": False, "active": False})
+    done = fantwin("service", "install", "--json")
+    assert done.exit_code == 0, done.exception
+    found = json.loads(done.stdout)
+    assert (found["user"], found["pages"]) == ("fantwin", ["http://127.0.0.1:8123/"])
+    there = {str(path.relative_to(host.root)) for path in host.root.rglob("*") if path.is_file()}
+    files = {"etc/systemd/system/fantwin.service", "etc/udev/rules.d/60-fantwin.rules", "etc/sysusers.d/fantwin.conf"}
+    assert there == files == {str(Path(path).relative_to(host.root)) for path in found["files"]}
+    order = [call.split()[0] + " " + call.split()[1] for call in host.calls]
+    assert order[0].startswith("systemd-sysusers"), "the user is there before files are given to it"
+    assert host.calls[-3:] == [
+        "systemctl daemon-reload",
+        "systemctl enable fantwin.service",
+        "systemctl restart fantwin.service",
+    ]
+    assert f"chown -R fantwin:fantwin {tmp_path / 'runs'}" in host.calls
+    assert fantwin("service").exit_code == 0
+    removed = fantwin("service", "uninstall")
+    assert removed.exit_code == 0 and removed.stdout.count("removed: ") == 3
+    assert not [path for path in host.root.rglob("*") if path.is_file()]
+    assert (tmp_path / "runs").is_dir(), "data are kept"
+    assert error_of("service", "uninstall") == "the service is not installed"
+
+
+def test_a_dry_run_prints_the_files_and_commands_and_changes_nothing(host: Host) -> None:
+    done = fantwin("service", "install", "--dry-run")
+    assert done.exit_code == 0 and "ProtectKernelTunables=no" in done.stdout
+    assert done.stdout.splitlines()[-1] == "systemctl restart fantwin.service"
+    assert not [path for path in host.root.rglob("*") if path.is_file()]
+
+
+def test_what_keeps_it_from_being_installed_is_one_line(host: Host, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(*_: object) -> bool:
+        return True
+
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "accepts_connections", fails)
+        assert "something runs there: end `fantwin up` first (Ctrl-C)" in error_of("service", "install")
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "geteuid", lambda: 1000)
+        said = error_of("service", "install")
+        assert said.startswith("service install needs root: sudo ")
+        assert said.endswith("-m fantwin service install -c fantwin.toml")
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "may_be_read", lambda _: "/srv/fans")
+        closed = "/srv/fans is closed to the user fantwin: chmod o+x /srv/fans, or name another user with --user"
+        assert error_of("service", "install") == closed
+    (host.root / "run/systemd/system").rmdir()
+    assert "this system is not run by systemd" in error_of("service", "install")
+    assert not [path for path in host.root.rglob("*") if path.is_file()]
+
+
+def test_a_service_that_does_not_start_is_one_line(host: Host, tmp_path: Path) -> None:
+    (tmp_path / "bin" / "systemctl").write_text(
+        '#!/bin/sh\nif [ "$1" = restart ]; then echo "Job for fantwin.service failed." >&2; exit 1; fi\n'
+        '[ "$1" != is-active ]\n'
+    )
+    said = error_of("service", "install")
+    assert said == (
+        "systemctl restart fantwin.service: Job for fantwin.service failed.; journalctl -u fantwin says more"
+    )
