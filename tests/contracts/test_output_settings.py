@@ -20,6 +20,7 @@ from fantwin.pipeline.outputs.web.config import GatewayConfig
     [
         (GatewayConfig, {"host": "0.0.0.0"}, "needs certificate and key"),
         (GatewayConfig, {"host": "0.0.0.0", "certificate": "c.pem", "key": "k.pem"}, "needs users"),
+        (GatewayConfig, {"host": "0.0.0.0", "in_front": "tls"}, "needs users"),
         (GatewayConfig, {"certificate": "c.pem"}, "belong together"),
         (GatewayConfig, {"operators": ("ann",)}, "user_header"),
         (OpcuaConfig, {"host": "0.0.0.0"}, "needs users"),

@@ -167,6 +167,20 @@ def test_through_a_proxy_that_knows_no_users_nobody_reads_without_a_login(opened
     assert logged_in(gateway).ask("GET", "/api/v1/site")[0] == 200
 
 
+def test_behind_a_published_port_of_loopback_all_on_the_host_read_and_behind_a_proxy_that_ends_tls_users_alone(
+    opened, tmp_path, users
+):
+    published = Client(opened(tmp_path / "published", host="0.0.0.0", in_front="loopback"))
+    assert published.ask("GET", "/api/v1/site")[0] == 200
+    assert published.ask("GET", "/api/v1/site", None, {"Host": "evil.example"})[0] == 400, "a name bound to loopback"
+    behind = Client(opened(tmp_path / "behind", granted, host="0.0.0.0", in_front="tls", users=users))
+    named = {"Host": "fans.plant.example"}
+    status, _, headers = behind.ask("GET", "/api/v1/site", None, named)
+    assert (status, "strict-transport-security" in headers) == (401, True)
+    _, _, headers = behind.ask("POST", "/api/v1/login", {"name": "ann", "password": PASSWORD}, named)
+    assert headers["set-cookie"].startswith("__Host-fantwin=") and "Secure" in headers["set-cookie"]
+
+
 def test_what_fails_in_the_gateway_is_logged_and_says_nothing_to_whoever_asks(gateway, capfd, monkeypatch):
     assert Client(gateway).ask("POST", "/api/v1/login", {}, {"Origin": "http://["})[0] == 403
     said(capfd)

@@ -138,12 +138,12 @@ class Access:
     @property
     def cookie_name(self) -> str:
         """Over https, browsers accept the cookie from this host only, and send it by https only."""
-        return SECURE_COOKIE if self._config.certificate else COOKIE
+        return SECURE_COOKIE if self._config.is_https else COOKIE
 
     @property
     def cookie(self) -> dict[str, Any]:
         """How the cookie is set and deleted: no script reads it, no other site sends it."""
-        is_secure = self._config.certificate is not None
+        is_secure = self._config.is_https
         return {"key": self.cookie_name, "httponly": True, "samesite": "strict", "secure": is_secure}
 
     def visitor(self, request: Request) -> Visitor:

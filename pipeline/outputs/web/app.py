@@ -64,7 +64,7 @@ def application(api: Api, config: GatewayConfig) -> ASGIApp:
     for path, answer in (("/healthz", _health), ("/", _page)):
         app.add_api_route(path, answer, methods=["GET", "HEAD"], include_in_schema=False)
     app.mount("/page", StaticFiles(directory=PAGE))
-    return _WithHeaders(app, _HEADERS | (_BY_HTTPS_ONLY if config.certificate else {}))
+    return _WithHeaders(app, _HEADERS | (_BY_HTTPS_ONLY if config.is_https else {}))
 
 
 async def _page() -> FileResponse:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ipaddress
 from pathlib import Path
+from typing import Literal
 
 from pydantic import Field, field_validator, model_validator
 
@@ -49,10 +50,21 @@ class GatewayConfig(StageConfig):
         'loopback, such as the name of a proxy; "*": any',
     )
 
+    in_front: Literal["", "loopback", "tls"] = Field(
+        default="",
+        description='what is between people and a host beyond loopback. "loopback": its port is published on the '
+        'loopback of a host alone, as from a container; "tls": a proxy ends TLS, such as an Ingress',
+    )
+
     @property
     def is_loopback(self) -> bool:
         """Whether only this host reaches it."""
-        return is_of_this_host_only(self.host)
+        return is_of_this_host_only(self.host) or self.in_front == "loopback"
+
+    @property
+    def is_https(self) -> bool:
+        """Whether browsers reach it by https."""
+        return self.certificate is not None or self.in_front == "tls"
 
     @property
     def known_hosts(self) -> frozenset[str]:
@@ -81,7 +93,7 @@ class GatewayConfig(StageConfig):
         if self.operators and not self.user_header:
             raise ValueError("operators are users of a proxy: they need user_header")
         if not self.is_loopback:
-            if self.certificate is None:
+            if not self.is_https:
                 raise ValueError(f"host {self.host} is beyond loopback: that needs certificate and key")
             if not (self.users or self.user_header):
                 raise ValueError(
