@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import subprocess
@@ -19,19 +20,40 @@ helm: Any = pytest.importorskip("helm_python", reason=why)
 schemas: Any = pytest.importorskip("kubernetes_validate", reason=why)
 yaml: Any = pytest.importorskip("yaml", reason=why)
 
-CHART = Path(__file__).parents[2] / "deploy" / "kubernetes" / "fantwin"
+DEPLOY = Path(__file__).parents[2] / "deploy"
+CHART = DEPLOY / "kubernetes" / "fantwin"
 CONFIGURATION = 'site = "plant"\n[[tray]]\nname = "a"\nfans = 8\n'
 OLDEST, NEWEST = "1.28", "1.37"
 """versions of Kubernetes: the first of which schemas have the fields that the chart needs, and the newest known"""
 SECURED = {"config": CONFIGURATION, "certificates": {"secret": "plant-certs"}}
+ONE_PAGE = {"stages": {"gateway": {"shards": 1, "storage": "1Gi"}}}
+INGRESS = {"enabled": True, "className": "nginx", "host": "fans.example", "tlsSecret": "tls", "annotations": {"a": "b"}}
+WATCHED = {
+    **ONE_PAGE,
+    "page": {"ingress": INGRESS},
+    "metrics": {
+        "labels": {"release": "prometheus"},
+        "serviceMonitor": {"enabled": True, "userSecret": "scraper"},
+        "rules": {"enabled": True},
+        "dashboards": {"enabled": True},
+    },
+    "serviceAccount": {"create": True, "name": "fans"},
+    "tolerations": [{"key": "plant", "operator": "Exists"}],
+    "nodeSelector": {"disk": "fast"},
+    "storageClassName": "ssd",
+}
 OPEN = {"certificates": {"secret": ""}, "insecure": True}
 MANY = {stage: {"shards": 3, "storage": "1Gi" if stage in ("recorder", "learner") else ""} for stage in STAGES}
 
 
-def rendered(name: str = "plant", **values: Any) -> list[dict[str, Any]]:
+def files(name: str = "plant", **values: Any) -> dict[str, str]:
     with helm.Chart.load(str(CHART)) as chart:
-        files = chart.render({**SECURED, **values}, name=name, namespace="fans")
-    return [document for text in files.values() for document in yaml.safe_load_all(text) if document]
+        return chart.render({**SECURED, **values}, name=name, namespace="fans")
+
+
+def rendered(name: str = "plant", **values: Any) -> list[dict[str, Any]]:
+    texts = [text for path, text in files(name, **values).items() if not path.endswith("NOTES.txt")]
+    return [document for text in texts for document in yaml.safe_load_all(text) if document]
 
 
 def of_kind(kind: str, documents: list[dict[str, Any]]) -> dict[str, dict[str, Any]]:
@@ -56,6 +78,7 @@ def container(stateful_set: dict[str, Any]) -> dict[str, Any]:
         {},
         {"stages": MANY, "files": {"configMap": {"name": "twins"}}, "image": {"pullSecrets": [{"name": "registry"}]}},
         OPEN,
+        WATCHED,
     ],
     ids=str,
 )
@@ -63,6 +86,8 @@ def test_what_is_rendered_fits_the_schemas_of_kubernetes(values):
     documents = rendered(**values)
     assert {"ConfigMap", "Service", "StatefulSet"} <= {each["kind"] for each in documents}
     for document in documents:
+        if document["apiVersion"].startswith("monitoring.coreos.com/"):
+            continue  # of the Prometheus operator, whose schemas are not those of Kubernetes
         for version in (OLDEST, NEWEST):
             schemas.validate(document, version, strict=True)
 
@@ -74,6 +99,9 @@ def test_what_is_rendered_fits_the_schemas_of_kubernetes(values):
         {"image": {"pullSecrets": ["registry"]}},
         {"stage": {}},
         {"config": ""},
+        {"page": {"ingress": {"enabled": True, "host": "fans.example", "tlsSecret": "tls"}}},
+        {**ONE_PAGE, "page": {"ingress": {"enabled": True, "host": "fans.example"}}},
+        {"page": {"port": "http"}},
         {"certificates": {"secret": ""}},
     ],
     ids=str,
@@ -168,3 +196,61 @@ def test_without_certificates_every_command_says_that_it_is_insecure():
         words = container(pods)["args"]
         assert "--insecure" in words
         assert not any("certs" in word or "tls" in word for word in words)
+
+
+def test_the_page_is_reached_by_its_service_and_the_ingress_and_is_scraped_there():
+    documents = rendered(**WATCHED)
+    (service,) = (each for name, each in of_kind("Service", documents).items() if name == "plant-page")
+    (gateway,) = (each for name, each in of_kind("StatefulSet", documents).items() if "gateway" in name)
+    assert service["spec"]["selector"].items() <= gateway["spec"]["template"]["metadata"]["labels"].items()
+    (port,) = service["spec"]["ports"]
+    assert {"name": port["targetPort"], "containerPort": 8080} in container(gateway)["ports"]
+    (ingress,) = of_kind("Ingress", documents).values()
+    (rule,) = ingress["spec"]["rules"]
+    (path,) = rule["http"]["paths"]
+    assert path["backend"]["service"] == {"name": "plant-page", "port": {"name": port["name"]}}
+    assert ingress["spec"]["tls"] == [{"hosts": [rule["host"]], "secretName": "tls"}]
+    (monitor,) = of_kind("ServiceMonitor", documents).values()
+    assert monitor["spec"]["selector"]["matchLabels"].items() <= service["metadata"]["labels"].items()
+    assert monitor["spec"]["endpoints"][0]["port"] == port["name"]
+    assert monitor["metadata"]["labels"]["release"] == "prometheus"
+    users = f'{CONFIGURATION}[gateway]\nusers = "files/users.toml"\n'
+    words = [word.replace("$(SHARD)", "1") for word in container(gateway)["args"]]
+    settings = parse_config(users, Path("fantwin.toml"), parsed(words)["overrides"], stages=("gateway",))
+    section: Any = settings.sections["gateway"]
+    assert (section.host, section.port, section.is_https) == ("0.0.0.0", 8080, True)
+
+
+def test_rules_and_dashboard_are_those_of_the_other_deployments():
+    documents = rendered(**WATCHED)
+    (rules,) = of_kind("PrometheusRule", documents).values()
+    assert rules["spec"] == yaml.safe_load((DEPLOY / "prometheus" / "fantwin.rules.yml").read_text())
+    board = of_kind("ConfigMap", documents)["plant-dashboards"]
+    assert json.loads(board["data"]["fantwin.json"]) == json.loads((DEPLOY / "grafana" / "fantwin.json").read_text())
+    assert board["metadata"]["labels"]["grafana_dashboard"] == "1"
+
+
+def test_pods_are_placed_and_named_as_the_values_say():
+    documents = rendered(**WATCHED, fullnameOverride="cooling")
+    pods = [*of_kind("StatefulSet", documents).values(), *of_kind("Deployment", documents).values()]
+    assert all(
+        each["metadata"]["name"].startswith("cooling-") for each in documents if each["kind"] != "ServiceAccount"
+    )
+    for each in pods:
+        spec = each["spec"]["template"]["spec"]
+        assert spec["tolerations"] == WATCHED["tolerations"] and spec["nodeSelector"] == {"disk": "fast"}
+        assert (spec["serviceAccountName"], spec["automountServiceAccountToken"]) == ("fans", False)
+    claims = [claim for each in pods for claim in each["spec"].get("volumeClaimTemplates", ())]
+    assert claims and all(claim["spec"]["storageClassName"] == "ssd" for claim in claims)
+    (router,) = of_kind("Deployment", rendered(nameOverride="fans")).values()
+    assert router["metadata"]["name"] == "plant-fans-router"
+
+
+def test_the_notes_say_where_the_page_is():
+    def notes(**values: Any) -> str:
+        (found,) = (text for path, text in files(**values).items() if path.endswith("NOTES.txt"))
+        return found
+
+    assert "Operators' page: https://fans.example/" in notes(**WATCHED)
+    assert "port-forward svc/plant-page 8080:80" in notes(**ONE_PAGE)
+    assert "There is no operators' page" in notes() and "tls/plant-router:7447" in notes()

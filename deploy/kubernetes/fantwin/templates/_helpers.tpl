@@ -1,5 +1,12 @@
+{{- /* What the names of all objects begin with. */}}
+{{- define "fantwin.fullname" -}}
+{{- $name := empty .Values.nameOverride | ternary .Release.Name (printf "%s-%s" .Release.Name .Values.nameOverride) }}
+{{- .Values.fullnameOverride | default $name }}
+{{- end }}
+
 {{- define "fantwin.labels" -}}
-app.kubernetes.io/name: fantwin
+app.kubernetes.io/name: {{ default .Chart.Name .Values.nameOverride }}
+app.kubernetes.io/part-of: fantwin
 app.kubernetes.io/instance: {{ .Release.Name }}
 app.kubernetes.io/version: {{ .Chart.AppVersion | quote }}
 app.kubernetes.io/managed-by: {{ .Release.Service }}
@@ -8,20 +15,20 @@ helm.sh/chart: {{ printf "%s-%s" .Chart.Name .Chart.Version }}
 
 {{- /* What selects the pods of one part: (dict "root" $ "part" "scorer") */}}
 {{- define "fantwin.selector" -}}
-app.kubernetes.io/name: fantwin
+app.kubernetes.io/name: {{ default .root.Chart.Name .root.Values.nameOverride }}
 app.kubernetes.io/instance: {{ .root.Release.Name }}
 app.kubernetes.io/component: {{ .part }}
 {{- end }}
 
 {{- /* The name of one part; names in Kubernetes have no underscores. */}}
 {{- define "fantwin.name" -}}
-{{ printf "%s-%s" .root.Release.Name (.part | replace "_" "-") | trunc 52 | trimSuffix "-" }}
+{{ printf "%s-%s" (include "fantwin.fullname" .root) (.part | replace "_" "-") | trunc 52 | trimSuffix "-" }}
 {{- end }}
 
 {{- /* The name of the set of a stage. The number of shards is in it: where that changes, every pod gets other trays. So a
 new set takes the place of the old one; a rolling update would wait for pods that the old ones keep from starting. */}}
 {{- define "fantwin.set" -}}
-{{ printf "%s-%s" .root.Release.Name (.part | replace "_" "-") | trunc 44 | trimSuffix "-" }}-of-{{ .shards }}
+{{ printf "%s-%s" (include "fantwin.fullname" .root) (.part | replace "_" "-") | trunc 44 | trimSuffix "-" }}-of-{{ .shards }}
 {{- end }}
 
 {{- define "fantwin.image" -}}
@@ -54,6 +61,15 @@ new set takes the place of the old one; a rolling update would wait for pods tha
 
 {{- define "fantwin.podSecurity" -}}
 automountServiceAccountToken: false
+{{- with .Values.serviceAccount.name }}
+serviceAccountName: {{ . }}
+{{- end }}
+{{- with .Values.tolerations }}
+tolerations: {{- toYaml . | nindent 2 }}
+{{- end }}
+{{- with .Values.affinity }}
+affinity: {{- toYaml . | nindent 2 }}
+{{- end }}
 {{- with .Values.image.pullSecrets }}
 imagePullSecrets: {{- toYaml . | nindent 2 }}
 {{- end }}
