@@ -66,7 +66,7 @@ twin: $(VENV)/.development
 
 lock: $(VENV)/.development
 	$(COMPILE) --output-file requirements.lock
-	$(COMPILE) --extra view --extra devices --extra outputs --constraint requirements.lock \
+	$(COMPILE) --extra devices --extra outputs --constraint requirements.lock \
 		--output-file requirements-image.lock
 	$(COMPILE) --extra dev --constraint requirements-image.lock --output-file requirements-dev.lock
 	@echo "torch; sys_platform == 'none'" > $(VENV)/without-torch.txt

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -10,11 +9,8 @@ from pathlib import Path
 import pytest
 
 import fantwin
-from tests.support.built_wheel import unpacked_wheel
+from tests.support.built_wheel import FOLDERS, ROOT, copied_source, unpacked_wheel
 
-ROOT = Path(__file__).parents[1]
-FOLDERS = ("fantwin", "pipeline", "schemas", "scoring", "simulation", "stages", "twin")
-FILES = ("pyproject.toml", "MANIFEST.in", "README.md", "LICENSE")
 DATA = ("*.toml", "*.onnx", "*.sh", "*.proto", "*.pyi", "*.html", "*.js", "*.css", "*.svg", "py.typed")
 
 
@@ -22,11 +18,7 @@ DATA = ("*.toml", "*.onnx", "*.sh", "*.proto", "*.pyi", "*.html", "*.js", "*.css
 def unpacked(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of an unpacked wheel, as site-packages would be."""
     source, built = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("built")
-    for name in FILES:  # a copy: a build leaves its traces in the source
-        shutil.copy(ROOT / name, source)
-    for name in FOLDERS:
-        shutil.copytree(ROOT / name, source / name, symlinks=True, ignore=shutil.ignore_patterns("__pycache__"))
-    return unpacked_wheel(source, built)
+    return unpacked_wheel(copied_source(source), built)
 
 
 def test_the_wheel_holds_one_package_with_every_file_of_the_product(unpacked):
@@ -37,6 +29,17 @@ def test_the_wheel_holds_one_package_with_every_file_of_the_product(unpacked):
     expected = {path if path.parts[0] == "fantwin" else Path("fantwin") / path for path in ours}
     found = {path.relative_to(unpacked) for path in (unpacked / "fantwin").rglob("*") if path.is_file()}
     assert expected - found == set()
+
+
+def test_the_wheel_has_every_file_of_deploy_with_its_content(unpacked):
+    """Also those that are links, as pip makes none."""
+    files = [path for path in (ROOT / "deploy").rglob("*") if path.is_file()]
+    there = unpacked / "fantwin" / "deploy"
+    assert {path for path in there.rglob("*") if path.is_file()} == {
+        there / path.relative_to(ROOT / "deploy") for path in files
+    }
+    for path in files:
+        assert (there / path.relative_to(ROOT / "deploy")).read_bytes() == path.read_bytes()
 
 
 def test_folders_and_files_of_a_user_with_our_names_do_no_harm(unpacked, tmp_path):

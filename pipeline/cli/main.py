@@ -33,6 +33,7 @@ COMMANDS = {
     "doctor": "watch.doctor",
     "router": "watch.router",
     "certs": "watch.certs",
+    "deploy": "watch.deploy",
     "users": "watch.users",
     "replay": "recordings.replay",
     "info": "recordings.info",

@@ -131,7 +131,7 @@ class RunningPrometheus:
 
 
 RULES = DEPLOY / "prometheus" / "fantwin.rules.yml"
-RULE_TESTS = RULES.with_name("fantwin.rules.test.yml")
+RULE_TESTS = Path(__file__).with_name("fantwin.rules.test.yml")
 BOARD = DEPLOY / "grafana" / "fantwin.json"
 VARIABLES = {"$site": SITE, "$tray": TRAY, "$fan": "2", "$__rate_interval": "5m"}
 ALL_FANS = 2 * FANS

@@ -1,21 +1,27 @@
-"""The site of compose.yaml in containers, for tests that run inside `tests/deploy/compose/in_namespaces.sh`."""
+"""The site of `fantwin deploy compose` in containers, for tests inside `tests/deploy/compose/in_namespaces.sh`."""
 
 from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import time
 from collections.abc import Callable
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
-ROOT = Path(__file__).parents[2]
+import yaml
+
+from tests.support.built_wheel import copied_source, wheel_of
+from tests.support.fantwin_command import fantwin as fantwin_here
+
 PROJECT = "fantwin"
 NETWORK = f"{PROJECT}_bus"
 BASE_IMAGE = "docker.io/library/python:3.11-slim-bookworm"
-CONFIG = "/demo/compose.toml"
+CONFIG = "/site/fantwin.toml"
 AT_WORK = ("ok", "waiting")
 _POLL_S = 0.1
 
@@ -28,10 +34,23 @@ def folder() -> Path | None:
     return Path(given) if given else None
 
 
+def deployed() -> Path:
+    """The folder that `fantwin deploy compose` has written, with the wheel."""
+    inside = folder()
+    assert inside is not None
+    return inside / "deployed"
+
+
 def run(*words: str, timeout_s: float = 60.0, **environment: str) -> subprocess.CompletedProcess[str]:
     """A command in the folder of compose.yaml; whether it has succeeded is for the caller to see."""
     return subprocess.run(
-        words, cwd=ROOT, env=os.environ | environment, text=True, capture_output=True, timeout=timeout_s, check=False
+        words,
+        cwd=deployed(),
+        env=os.environ | environment,
+        text=True,
+        capture_output=True,
+        timeout=timeout_s,
+        check=False,
     )
 
 
@@ -53,12 +72,29 @@ def container(service: str) -> str:
 
 
 def build(wheels: Path, pip_settings: Path, base: Path) -> None:
-    """The image, from the product's Dockerfile and wheels alone: no network."""
+    """The site as a user would deploy it, and its image, from wheels alone: no network."""
+    shutil.rmtree(deployed(), ignore_errors=True)
+    assert fantwin_here("deploy", "compose", "-o", deployed()).exit_code == 0
+    with TemporaryDirectory() as source:
+        wheel_of(copied_source(Path(source)), deployed())
     if run("podman", "image", "exists", BASE_IMAGE).returncode:
         succeed("podman", "import", str(base), BASE_IMAGE)
     mounts = ("-v", f"{wheels}:/wheels:ro", "-v", f"{pip_settings}:/etc/pip.conf:ro")
-    succeed("podman", "build", "-q", "--pull=never", "--network=none", *mounts, "-t", "fantwin", ".", timeout_s=240.0)
+    alone = ("--format", "docker", "--pull=never", "--network=none")  # the form of OCI has no health check
+    succeed("podman", "build", "-q", *alone, *mounts, "-t", "fantwin", ".", timeout_s=600.0)
     succeed("podman", "image", "prune", "-f")
+
+
+def prometheus_from(program: str | None) -> None:
+    """A stand-in for the image of Prometheus that compose.yaml names, with this machine's program."""
+    assert program
+    image = yaml.safe_load((deployed() / "compose.yaml").read_text())["services"]["prometheus"]["image"]
+    context = deployed() / "stand-in"
+    context.mkdir(exist_ok=True)
+    shutil.copy(program, context / "prometheus")
+    lines = f'FROM {BASE_IMAGE}\nCOPY prometheus /bin/\nRUN mkdir /prometheus\nENTRYPOINT ["/bin/prometheus"]\n'
+    (context / "Dockerfile").write_text(lines)
+    succeed("podman", "build", "-q", "--pull=never", "--network=none", "-t", image, str(context))
 
 
 def process_id(service: str) -> int:
@@ -82,8 +118,8 @@ def cut_off(service: str, seconds: float) -> None:
 
 
 def fantwin(*words: str) -> subprocess.CompletedProcess[str]:
-    """A command in the container of the viewer, which has the certificate of the viewer only."""
-    return run("podman", "exec", container("viewer"), "fantwin", *words)
+    """A command in the container of the gateway, which has the certificate of the gateway only."""
+    return run("podman", "exec", container("gateway"), "fantwin", *words)
 
 
 def status() -> Status:

@@ -73,8 +73,7 @@ def init(
 ) -> None:
     """Find fans, write a configuration that watches them, and say the next command.
 
-    On a terminal it asks, unless options say what to watch. Nothing is written to a device; a serial port is listened
-    to for some seconds. What cannot be watched is listed with what is missing.
+    On a terminal it asks, unless options say what to watch. It writes nothing to a device; it listens to a serial port.
 
     Exit code 1 if there is no fan to watch, or the file exists.
 

@@ -58,9 +58,8 @@ def service(
 ) -> None:
     """Let systemd start `fantwin up` at boot; end that; or say whether it runs.
 
-    install writes a unit with few rights, the udev rule that its hwmon chips need where they are commanded, and the
-    user or group `fantwin`; it starts the service and prints the address of the operators' page. It runs this
-    installation with the configuration where it is. uninstall removes these files, and keeps data and user.
+    install starts this installation with the configuration where it is, with few rights, and prints the address of the
+    operators' page. uninstall removes the files that install wrote, and keeps data and user.
 
     Exit code 1 if it could not be done; status: if it does not run.
 

@@ -109,6 +109,7 @@ class Service:
     def _access(self) -> Iterator[str]:
         """Where it writes, which devices it opens, what of the homes it sees."""
         if self.run_folder == STATE_FOLDER:
+            yield f'# the configuration says run_folder = "{STATE_FOLDER}"'
             yield "StateDirectory=fantwin"
         else:
             yield f"ReadWritePaths={' '.join(_escaped(str(path)) for path in (self.run_folder, *self.written))}"

@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import shutil
 import time
+import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -19,7 +20,7 @@ from tests.support.fantwin_command import fantwin
 
 FOLDER = site.folder()
 pytestmark = pytest.mark.skipif(FOLDER is None, reason="containers: `make compose-test` brings compose.yaml up")
-ENABLED = load_config(Path(__file__).parents[3] / "pipeline/demo/compose.toml").stages
+ENABLED = load_config(Path(__file__).parents[3] / "deploy/compose/site/fantwin.toml").stages
 FAULT = "--fault inlet:fan=2,start=3,size=1.8"
 OWN_CERTIFICATES = """cd /tmp
 cat > own.toml <<END
@@ -70,10 +71,36 @@ def test_all_is_well_without_losses():
     assert not seen["alarms"]
 
 
+def test_the_image_is_small_has_no_rerun_and_says_whether_it_is_healthy():
+    size = int(site.succeed("podman", "image", "inspect", "-f", "{{.Size}}", "fantwin"))
+    base = int(site.succeed("podman", "image", "inspect", "-f", "{{.Size}}", site.BASE_IMAGE))
+    print(f"image: {(size - base) / 1e6:.0f} MB on top of its base")
+    assert size - base < 600e6
+    assert site.run("podman", "exec", site.container("gateway"), "python", "-c", "import rerun").returncode
+    for service in ("router", *ENABLED):
+        site.succeed("podman", "healthcheck", "run", site.container(service))
+
+
+def test_the_page_is_at_the_published_port_and_prometheus_scrapes_it():
+    with urllib.request.urlopen("http://127.0.0.1:8080/api/v1/site", timeout=10) as answer:
+        assert json.load(answer)["site"] == "demo"
+    site.prometheus_from(shutil.which("prometheus"))
+    site.compose("--profile", "metrics", "up", "-d", "--no-build", "--no-deps", "prometheus")
+    query = "http://127.0.0.1:9090/api/v1/query?query=fantwin_fan_scored"
+    ask = ("python", "-c", f"import urllib.request as r; print(r.urlopen('{query}').read().decode())")
+
+    def has_fans() -> bool:
+        done = site.run("podman", "exec", site.container("gateway"), *ask)
+        return done.returncode == 0 and len(json.loads(done.stdout)["data"]["result"]) == 8
+
+    site.wait_until(has_fans, WITHIN_S, "Prometheus has no fans")
+
+
 @pytest.mark.parametrize("service", ["router", *ENABLED])
 def test_a_container_has_its_own_key_only(service: str):
     seen = site.succeed("podman", "exec", site.container(service), "find", "/certs", "/authority", "-name", "*.*")
-    assert sorted(seen.split()) == sorted(f"/certs/{name}" for name in ("ca.pem", f"{service}.pem", f"{service}.key"))
+    roles = (service, "viewer") if service == "gateway" else (service,)
+    assert {*seen.split()} == {"/certs/ca.pem", *(f"/certs/{role}.{kind}" for role in roles for kind in ("pem", "key"))}
 
 
 def test_fantwin_without_the_certificates_of_the_site_cannot_join():
