@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Protocol, TypeVar
 
 from fantwin.pipeline.config.shards import StageProcess
+from fantwin.pipeline.runtime.service_manager import FILE_VARIABLE
 from fantwin.pipeline.runtime.service_manager import VARIABLE as NOTIFY_VARIABLE
 from fantwin.pipeline.site.stage_states import START_LIMIT_S
 from fantwin.pipeline.timebase.host_clock import VARIABLE as CLOCK_VARIABLE
@@ -158,7 +159,12 @@ class Child:
                 text=True,
                 errors="replace",
                 start_new_session=True,
-                env={**os.environ, NOTIFY_VARIABLE: self.notices.address, CLOCK_VARIABLE: str(clock_offset_ns)},
+                env={
+                    **os.environ,
+                    NOTIFY_VARIABLE: self.notices.address,
+                    FILE_VARIABLE: "",  # it is of the launcher: a child's sign of life is none of its own
+                    CLOCK_VARIABLE: str(clock_offset_ns),
+                },
             )
             undo.callback(self._process.wait)
             undo.callback(self._process.kill)

@@ -68,8 +68,8 @@ def test_systemd_accepts_the_units_which_may_do_little(text: str, folder: str, t
 def test_the_commands_of_the_units_are_those_of_fantwin() -> None:
     for unit, name in (("fantwin.service", "up"), ("fantwin-router.service", "router")):
         words = shlex.split(settings(service(HWMON), unit)["ExecStart"])
-        assert words[:3] == [sys.executable, "-m", "fantwin"] and words[3] == name
-        assert parsed(words[3:])["config"] == Path("/etc/fantwin/fantwin.toml")
+        assert words[:5] == [sys.executable, "-P", "-m", "fantwin", name]
+        assert parsed(words[4:])["config"] == Path("/etc/fantwin/fantwin.toml")
 
 
 def test_only_what_a_source_needs_is_open() -> None:

@@ -66,7 +66,7 @@ class Service:
         return cls(
             config=config.path.resolve(),
             run_folder=config.run_folder.resolve(),
-            program=(sys.executable, "-m", "fantwin"),
+            program=(sys.executable, "-P", "-m", "fantwin"),  # what is beside the configuration is not imported
             installation=tuple({Path(sys.prefix), Path(sys.base_prefix), Path(__file__).resolve().parents[3]}),
             user=user,
             group=group,
