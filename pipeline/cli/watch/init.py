@@ -152,7 +152,11 @@ def _asked(root: Path) -> Chosen:
         typer.echo(f"May fantwin command them? {why}")
         writable = typer.confirm("Command them?", default=False)
     serial = [port for port, device in ports.items() if typer.confirm(f"Watch {port} ({device})?", default=True)]
-    if others and not serial and (port := typer.prompt(f"Serial port ({', '.join(others)}), or Enter", default="")):
+    if (
+        others
+        and not serial
+        and (port := typer.prompt(f"Serial port ({', '.join(others)}), or Enter", default="", show_default=False))
+    ):
         serial.append(port)
     url = typer.prompt("Controller of a server (Redfish), https://USER@HOST, or Enter", default="", show_default=False)
     asks_password = "@" in url
