@@ -379,7 +379,7 @@ class Diagnosis(_message.Message):
     def __init__(self, cause: _Optional[str] = ..., probability: _Optional[float] = ..., parameter: _Optional[str] = ..., change: _Optional[float] = ..., unit: _Optional[str] = ..., evidence: _Optional[str] = ...) -> None: ...
 
 class Alarm(_message.Message):
-    __slots__ = ("header", "fan", "active", "severity", "t_ns", "onset_t_ns", "residual_rad_s", "residual_std_rad_s", "message", "transition", "statistic", "score", "torque_balance_command", "torque_balance_std_command", "acknowledged", "shelved_until_t_ns", "out_of_service", "causes", "request", "operator_name", "comment", "stale", "feedback", "feedback_by", "feedback_reason", "marked_onset_t_ns")
+    __slots__ = ("header", "fan", "active", "severity", "t_ns", "onset_t_ns", "residual_rad_s", "residual_std_rad_s", "message", "transition", "statistic", "score", "torque_balance_command", "torque_balance_std_command", "acknowledged", "shelved_until_t_ns", "out_of_service", "causes", "request", "operator_name", "comment", "stale", "feedback", "feedback_by", "feedback_reason", "marked_onset_t_ns", "fan_name")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     FAN_FIELD_NUMBER: _ClassVar[int]
     ACTIVE_FIELD_NUMBER: _ClassVar[int]
@@ -406,6 +406,7 @@ class Alarm(_message.Message):
     FEEDBACK_BY_FIELD_NUMBER: _ClassVar[int]
     FEEDBACK_REASON_FIELD_NUMBER: _ClassVar[int]
     MARKED_ONSET_T_NS_FIELD_NUMBER: _ClassVar[int]
+    FAN_NAME_FIELD_NUMBER: _ClassVar[int]
     header: Header
     fan: int
     active: bool
@@ -432,7 +433,8 @@ class Alarm(_message.Message):
     feedback_by: str
     feedback_reason: str
     marked_onset_t_ns: int
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fan: _Optional[int] = ..., active: _Optional[bool] = ..., severity: _Optional[_Union[Severity, str]] = ..., t_ns: _Optional[int] = ..., onset_t_ns: _Optional[int] = ..., residual_rad_s: _Optional[float] = ..., residual_std_rad_s: _Optional[float] = ..., message: _Optional[str] = ..., transition: _Optional[_Union[Transition, str]] = ..., statistic: _Optional[_Union[Statistic, str]] = ..., score: _Optional[float] = ..., torque_balance_command: _Optional[float] = ..., torque_balance_std_command: _Optional[float] = ..., acknowledged: _Optional[bool] = ..., shelved_until_t_ns: _Optional[int] = ..., out_of_service: _Optional[bool] = ..., causes: _Optional[_Iterable[_Union[Diagnosis, _Mapping]]] = ..., request: _Optional[str] = ..., operator_name: _Optional[str] = ..., comment: _Optional[str] = ..., stale: _Optional[bool] = ..., feedback: _Optional[_Union[Feedback, str]] = ..., feedback_by: _Optional[str] = ..., feedback_reason: _Optional[str] = ..., marked_onset_t_ns: _Optional[int] = ...) -> None: ...
+    fan_name: str
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fan: _Optional[int] = ..., active: _Optional[bool] = ..., severity: _Optional[_Union[Severity, str]] = ..., t_ns: _Optional[int] = ..., onset_t_ns: _Optional[int] = ..., residual_rad_s: _Optional[float] = ..., residual_std_rad_s: _Optional[float] = ..., message: _Optional[str] = ..., transition: _Optional[_Union[Transition, str]] = ..., statistic: _Optional[_Union[Statistic, str]] = ..., score: _Optional[float] = ..., torque_balance_command: _Optional[float] = ..., torque_balance_std_command: _Optional[float] = ..., acknowledged: _Optional[bool] = ..., shelved_until_t_ns: _Optional[int] = ..., out_of_service: _Optional[bool] = ..., causes: _Optional[_Iterable[_Union[Diagnosis, _Mapping]]] = ..., request: _Optional[str] = ..., operator_name: _Optional[str] = ..., comment: _Optional[str] = ..., stale: _Optional[bool] = ..., feedback: _Optional[_Union[Feedback, str]] = ..., feedback_by: _Optional[str] = ..., feedback_reason: _Optional[str] = ..., marked_onset_t_ns: _Optional[int] = ..., fan_name: _Optional[str] = ...) -> None: ...
 
 class Request(_message.Message):
     __slots__ = ("header", "t_ns", "action", "fan", "duration_s", "operator_name", "comment", "onset_t_ns")

@@ -14,6 +14,7 @@ import numpy as np
 
 from fantwin.schemas.channels import Measured
 from fantwin.schemas.enums import Action, FanState, Feedback, InvalidReason, Severity, Statistic, TachoKind, Transition
+from fantwin.schemas.fan_names import fan_label
 from fantwin.schemas.fields import Array, column, derived, time_column
 from fantwin.schemas.formats import SNAPSHOT
 from fantwin.schemas.header import Header
@@ -225,6 +226,17 @@ class Alarm:
     feedback_by: str = ""
     feedback_reason: str = ""
     marked_onset_t_ns: int = 0
+    fan_name: str = ""
+
+    @property
+    def label(self) -> str:
+        """The fan for people: `CPU (fan 0)`, or `fan 0` without a name."""
+        return fan_label(self.fan, self.fan_name)
+
+    @property
+    def about(self) -> str:
+        """The message without the fan, with which it begins."""
+        return self.message.removeprefix(f"{self.label}: ")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -84,7 +84,9 @@ class GatewayCore(SiteCore):
         fan = Fan(alarm.header.tray, alarm.fan)
         current = self._model.current_alarm(fan)
         if is_new and current is not None and self._feed.readers:
-            self._feed.publish("alarm", alarm_json(current) | {"now": self._model.words_now([fan])[0]})
+            self._feed.publish(
+                "alarm", alarm_json(current, self._model.about(fan)) | {"now": self._model.words_now([fan])[0]}
+            )
 
     def tick(self, now_ns: int) -> Sequence[Message]:
         """Send the pages samples and the state of the fleet, and the scorers what operators ask."""

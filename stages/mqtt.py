@@ -145,7 +145,9 @@ class MqttCore(SiteCore):
             self._has_news = True
         for fan in self._changed_alarms:
             current = self._model.current_alarm(fan)
-            text = text_of(alarm_json(current) if current and is_listed(current.newest) else None)
+            text = text_of(
+                alarm_json(current, self._model.about(fan)) if current and is_listed(current.newest) else None
+            )
             self._outbox.retain(self._topics.alarm(fan), text, is_urgent=True)
         is_full = abs(now_ns - self._full_ns) >= PERIOD_S * NS_PER_S
         if is_full:

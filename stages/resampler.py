@@ -42,6 +42,7 @@ from fantwin.pipeline.timebase.grid_timing import (
 )
 from fantwin.pipeline.timebase.line_rate import ENOUGH_SAMPLES, LONGEST_WAIT_US, MIN_SAMPLES, LineRate, SampleTimes
 from fantwin.pipeline.timebase.sample_grid import SampleGrid
+from fantwin.schemas.fan_names import NO_NAMES, FanNames
 from fantwin.schemas.messages import Grid, Raw, StatedTacho
 from fantwin.schemas.tacho import INSTANTANEOUS, Tacho, tacho_of_each_fan
 from fantwin.schemas.units import NS_PER_S
@@ -94,9 +95,10 @@ class ResamplerCore(Core):
         config: ResamplerConfig,
         *,
         tachos: Sequence[Tacho] = INSTANTANEOUS,
+        names: FanNames = NO_NAMES,
     ) -> None:
         """tachos: how the speed is measured, one for all fans or one for each."""
-        self._fans = fans
+        self._fans, self._names = fans, names
         self._tachos = tacho_of_each_fan(tachos, fans)
         self._stated: tuple[StatedTacho, ...] = ()
         """tachos stated by the newest message"""
@@ -188,8 +190,9 @@ class ResamplerCore(Core):
             return ""
         fan, more = others[0], f" (and {len(others) - 1} more)" if len(others) > 1 else ""
         return (
-            f"raw messages state another tacho than this configuration, for fan {fan}{more} {tachos[fan]} instead of "
-            f"{self._tachos[fan]}: set tacho = {tachos[fan].as_toml} in [[tray]], or correct the source"
+            f"raw messages state another tacho than this configuration, for {self._names.label(fan)}{more} "
+            f"{tachos[fan]} instead of {self._tachos[fan]}: set tacho = {tachos[fan].as_toml} in [[tray]], or correct "
+            "the source"
         )
 
     def _problem_of_times(self) -> str:
@@ -242,7 +245,8 @@ def _received_earlier(message: Raw, lateness_ns: int) -> Raw:
 
 def build(context: Context) -> BuiltStage:
     """The core of one tray."""
-    return BuiltStage(ResamplerCore(context.tray.fans, context.config, tachos=context.tray.tachos))
+    tray = context.tray
+    return BuiltStage(ResamplerCore(tray.fans, context.config, tachos=tray.tachos, names=tray.names))
 
 
 STAGE = Stage(

@@ -52,6 +52,7 @@ def build(context: Context) -> BuiltStage:
             continues=continues,
             is_learned=tray.twin is None,
             is_replayed=context.is_replayed,
+            names=tray.names,
         )
 
     twin = load_tray_twin(twin_path(tray, context.folder), tray.fans) if tray.twin else None

@@ -39,6 +39,7 @@ from fantwin.pipeline.prediction.new_samples import NewSamples
 from fantwin.pipeline.prediction.tray_integrator import TrayIntegrator, TwinIntegratorConfig
 from fantwin.pipeline.prediction.twin_file import TwinFile, load_twin
 from fantwin.pipeline.runtime.stage import Admitted, BuiltStage, Context, Core, Stage
+from fantwin.schemas.fan_names import NO_NAMES, FanNames
 from fantwin.schemas.messages import Grid, Message, ModelCard, NewTwin
 from fantwin.schemas.units import NS_PER_S
 
@@ -55,10 +56,11 @@ class TwinIntegratorCore(Core):
         started_t_ns: int,
         *,
         content: bytes = b"",
+        names: FanNames = NO_NAMES,
     ) -> None:
         """content: of the file of a learned twin, published with its card."""
         self._twin = twin
-        self.tray = TrayIntegrator(twin, config)
+        self.tray = TrayIntegrator(twin, config, names)
         self._producer: str | None = None  # of the newest grid
         self._card = [
             ModelCard(
@@ -138,13 +140,14 @@ def build(context: Context) -> BuiltStage:
     Raises:
         StageError: the twin cannot be used.
     """
+    names = context.tray.names
     if context.tray.twin is None:
 
         def core_of(twin: TwinFile, first_t_ns: int, content: bytes) -> TwinIntegratorCore:
-            return TwinIntegratorCore(twin, context.config, first_t_ns, content=content)
+            return TwinIntegratorCore(twin, context.config, first_t_ns, content=content, names=names)
 
         return BuiltStage(LearnedTwinIntegrator(context.tray, core_of))
-    return BuiltStage(TwinIntegratorCore(load_twin(context), context.config, context.started_t_ns))
+    return BuiltStage(TwinIntegratorCore(load_twin(context), context.config, context.started_t_ns, names=names))
 
 
 def check(context: Context) -> list[str]:

@@ -20,7 +20,7 @@ from pathlib import Path
 from pydantic import Field
 
 from fantwin.pipeline.config.registry import STAGES
-from fantwin.pipeline.config.settings import TrayConfig, nearest
+from fantwin.pipeline.config.settings import ConfigUsageError, TrayConfig, nearest
 from fantwin.pipeline.errors import refusals
 from fantwin.pipeline.extras import missing_extra, require
 from fantwin.pipeline.outputs.rerun.fleet_view import is_fleet
@@ -51,7 +51,9 @@ class ViewerConfig(StageConfig):
         "the latter has the port 100 above it, 9976; shard K uses the K-th ports from there on; 0: no live viewers",
     )
     show: tuple[str, ...] = Field(
-        default=(), max_length=64, description='fans of a fleet that always have a plot: ["tray1/3", "tray2/0"]'
+        default=(),
+        max_length=64,
+        description='fans of a fleet that always have a plot, by number or name: ["tray1/3", "tray2/CPU"]',
     )
 
     @property
@@ -66,17 +68,18 @@ def shown_fans(names: Iterable[str], trays: Sequence[TrayConfig]) -> list[Fan]:
     Raises:
         StageError: a name is not `tray/fan`, or there is no such fan.
     """
-    fans = {tray.name: tray.fans for tray in trays}
+    by_name = {tray.name: tray for tray in trays}
     found: list[Fan] = []
     for name in names:
         tray, _, number = name.rpartition("/")
-        if not (tray and number.isascii() and number.isdigit()):
-            raise StageError(f'viewer.show: {name!r} is no fan; write "tray/number", for example "{trays[0].name}/0"')
-        if tray not in fans:
-            raise StageError(f"viewer.show: {name!r}: no tray called {tray!r}{nearest(tray, fans)}")
-        if int(number) >= fans[tray]:
-            raise StageError(f"viewer.show: {name!r}: {tray} has fans 0 to {fans[tray] - 1}")
-        found.append(Fan(tray, int(number)))
+        if not (tray and number):
+            raise StageError(f'viewer.show: {name!r} is no fan; write "tray/fan", for example "{trays[0].name}/0"')
+        if tray not in by_name:
+            raise StageError(f"viewer.show: {name!r}: no tray called {tray!r}{nearest(tray, by_name)}")
+        try:
+            found.append(Fan(tray, by_name[tray].fan_called(number)))
+        except ConfigUsageError as error:
+            raise StageError(f"viewer.show: {name!r}: {error}") from error
     return list(dict.fromkeys(found))
 
 

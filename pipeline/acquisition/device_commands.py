@@ -81,5 +81,5 @@ class DeviceCommands:
         ):
             for fan, value in enumerate(values):
                 if not (math.isnan(value) or within(value, low, high)):
-                    return f"the {what} of fan {fan} is {value:g}{unit}, outside {low:g} to {high:g}{unit}"
+                    return f"the {what} of {tray.label(fan)} is {value:g}{unit}, outside {low:g} to {high:g}{unit}"
         return ""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, TypeAlias
@@ -9,6 +10,7 @@ from typing import Annotated, TypeAlias
 import typer
 
 from fantwin.pipeline.errors import UsageError
+from fantwin.schemas.fan_names import NO_NAMES, FanNames
 
 ConfigOption: TypeAlias = Annotated[Path, typer.Option("-c", "--config", help="Configuration file (TOML).")]
 SetOption: TypeAlias = Annotated[
@@ -43,18 +45,31 @@ class ViewLayout(StrEnum):
     WEAR = "wear"
 
 
-def fan_numbers(text: str | None) -> list[int] | None:
-    """The fans of an option such as `--fans 2,5`.
+def fan_numbers(text: str | None, names: Callable[[], FanNames]) -> list[int] | None:
+    """The fans of an option such as `--fans 2,5` or `--fans CPU`. names: asked for where one is not a number.
 
     Raises:
-        UsageError: it is not an ascending list of fan numbers.
+        UsageError: it is not an ascending list of fans.
     """
     if text is None:
         return None
+    parts = text.split(",")
     try:
-        numbers = [int(part) for part in text.split(",")]
-        if numbers != sorted(set(numbers)):
-            raise UsageError(f"--fans {text}: give each fan once, in ascending order")
-        return numbers
+        known = NO_NAMES if all(part.strip().removeprefix("-").isdecimal() for part in parts) else names()
+        numbers = [known.number(part) for part in parts]
     except ValueError as error:
-        raise UsageError(f"--fans {text}: give fan numbers counted from 0, with commas: --fans 2,5") from error
+        raise UsageError(f"--fans {text}: {error}") from error
+    if numbers != sorted(set(numbers)):
+        raise UsageError(f"--fans {text}: give each fan once, in ascending order")
+    return numbers
+
+
+def recorded_names(recordings: Sequence[Path], tray: str | None) -> Callable[[], FanNames]:
+    """For `fan_numbers`, the names in the first recording."""
+
+    def names() -> FanNames:
+        from fantwin.pipeline.recordings.reading import read_metadata  # noqa: PLC0415  slow to import
+
+        return read_metadata(recordings[0]).names(tray)
+
+    return names

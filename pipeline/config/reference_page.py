@@ -17,7 +17,7 @@ from pydantic import BaseModel
 
 from fantwin.pipeline.config.loading import LARGEST_FILE_BYTES, File
 from fantwin.pipeline.config.registry import STAGES
-from fantwin.pipeline.config.settings import BusConfig, LauncherConfig, SecurityConfig, TrayConfig
+from fantwin.pipeline.config.settings import BusConfig, FanConfig, LauncherConfig, SecurityConfig, TrayConfig
 from fantwin.pipeline.sources.kinds import SOURCE_KINDS
 from fantwin.pipeline.sources.source import SourceConfig
 from fantwin.schemas.tacho import Tacho
@@ -41,7 +41,7 @@ _TYPE_WORDS = {
     **{"path": "path"},
 }
 _ELSEWHERE = "see below"
-_SHOWN_BELOW = (SourceConfig.__name__, Tacho.__name__)
+_SHOWN_BELOW = (SourceConfig.__name__, Tacho.__name__, FanConfig.__name__)
 _BOUNDS = {"exclusiveMinimum": "above", "minimum": "at least", "exclusiveMaximum": "below", "maximum": "at most"}
 
 
@@ -55,6 +55,8 @@ def page() -> str:
         "## `[[tray]]`\n",
         "One for each tray. `port`, `baud` and `protocol` may be written in it directly, for a serial source.\n",
         table(TrayConfig),
+        "### `[[tray.fan]]`\n",
+        table(FanConfig),
         *_sources(),
         "### `tacho = { kind = ..., ... }`\n",
         "What a reading is of the speed ([tachos](../explanation/tachos.md)).\n",

@@ -6,6 +6,7 @@ The section of a stage is modelled by that stage. No stage is imported here; see
 from __future__ import annotations
 
 import difflib
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,6 +27,7 @@ from fantwin.pipeline.errors import UsageError, UserError
 from fantwin.pipeline.sources.kinds import parse_source
 from fantwin.pipeline.sources.serial.config import MOST_FANS_ON_LINE
 from fantwin.pipeline.sources.source import MOST_FANS, SourceConfig, too_many_fans
+from fantwin.schemas.fan_names import LONGEST_NAME, FanNames, fan_label, is_one_short_line
 from fantwin.schemas.tacho import INSTANTANEOUS, Tacho, Tachos, tacho_of_each_fan
 from fantwin.schemas.topics import RESERVED_TRAY_NAMES
 from fantwin.schemas.units import SpeedUnit
@@ -207,18 +209,50 @@ def _require_stages(names: Iterable[str]) -> None:
             raise ValueError(f"unknown stage {name!r}{nearest(name, STAGES)}")
 
 
+class FanConfig(Section):
+    """One fan of a tray, as people call it."""
+
+    name: str = Field(
+        default="", description="what people call the fan, `CPU`; it comes first wherever the fan is shown"
+    )
+    place: str = Field(default="", description="where to find it: `rack 3, slot 4`")
+
+    @field_validator("name", "place")
+    @classmethod
+    def _is_one_short_line(cls, value: str) -> str:
+        if not is_one_short_line(value):
+            raise ValueError(f"write at most {LONGEST_NAME} visible characters, without spaces at the ends")
+        return value
+
+    @field_validator("name")
+    @classmethod
+    def _tells_fans_apart(cls, value: str) -> str:
+        if not value:
+            raise ValueError("an empty name: give one, or write [[tray.fan]] for each fan and leave out name")
+        if value.isdecimal() or value.casefold() == "all":
+            raise ValueError("a number, or `all`, is no name: it would be taken for other fans")
+        return value
+
+
 class TrayConfig(Section):
     """One tray of fans whose samples come from one source.
 
     `port`, `baud` and `protocol` written directly in [[tray]] are the short form of
-    `source = { kind = "serial", port = ..., baud = ..., protocol = ... }`.
+    `source = { kind = "serial", port = ..., baud = ..., protocol = ... }`, and a list of names as `fans` is that of a
+    [[tray.fan]] for each.
     """
 
     short_form_keys: ClassVar[tuple[str, ...]] = ("port", "baud", "protocol")
 
     name: Name = Field(description="letters, digits, `_` and `-`; names of trays differ")
     fans: int = Field(
-        ge=1, le=MOST_FANS, description=f"number of fans in every sample; on a serial line at most {MOST_FANS_ON_LINE}"
+        ge=1,
+        le=MOST_FANS,
+        description=f"number of fans in every sample, on a serial line at most {MOST_FANS_ON_LINE}; or a list of their "
+        'names: ["CPU", "rear top"]',
+    )
+    fan: tuple[FanConfig, ...] = Field(
+        default=(), description="instead of a list of names: one [[tray.fan]] for each fan, in their order"
     )
     source: Annotated[SourceConfig, BeforeValidator(parse_source)] = Field(
         default={"kind": "serial"}, validate_default=True, description="where samples come from; used by acquisition"
@@ -247,6 +281,48 @@ class TrayConfig(Section):
             return ()
         return self.tachos[:1] if len(set(self.tachos)) == 1 else self.tachos
 
+    @property
+    def names(self) -> FanNames:
+        """Names of all fans."""
+        return FanNames(tuple(fan.name for fan in self.fan))
+
+    def label(self, fan: int) -> str:
+        """A fan for people: `CPU (fan 0)`."""
+        return fan_label(fan, self.fan[fan].name)
+
+    def fan_called(self, text: str) -> int:
+        """The number of the fan that a user means by its number or name.
+
+        Raises:
+            ConfigUsageError: the tray has no such fan.
+        """
+        try:
+            number = self.names.number(text)
+        except ValueError as error:
+            raise ConfigUsageError(f"tray {self.name}: {error}") from error
+        if not 0 <= number < self.fans:
+            raise ConfigUsageError(f"fan {number}: tray {self.name} has fans 0 to {self.fans - 1}")
+        return number
+
+    @model_validator(mode="before")
+    @classmethod
+    def _one_entry_for_each_fan(cls, values: Any) -> Any:
+        """Turn `fans = [...]` and `fans = 3` into a number and an entry `fan` for each."""
+        if not isinstance(values, dict):
+            return values
+        fans, given = values.get("fans"), values.get("fan")
+        if isinstance(given, dict):
+            raise ValueError("[tray.fan]: write [[tray.fan]], one for each fan")
+        if given is not None and isinstance(fans, list):
+            raise ValueError("fans is a list of names, and there are [[tray.fan]]: give one of the two")
+        if isinstance(fans, list | tuple):
+            return {**values, "fans": len(fans), "fan": [{"name": name} for name in fans]}
+        if isinstance(given, list | tuple) and given:
+            return {"fans": len(given), **values}
+        if not given and isinstance(fans, int) and 0 < fans <= MOST_FANS:
+            return {**values, "fan": [FanConfig()] * fans}
+        return values
+
     @model_validator(mode="before")
     @classmethod
     def _expand_short_form(cls, values: Any) -> Any:
@@ -271,6 +347,11 @@ class TrayConfig(Section):
 
     @model_validator(mode="after")
     def _fits(self) -> Self:
+        if len(self.fan) != self.fans:
+            raise ValueError(f"fans = {self.fans}, and there are {len(self.fan)} [[tray.fan]]: name each fan, or none")
+        times = Counter(fan.name.casefold() for fan in self.fan if fan.name)
+        if twice := next((fan.name for fan in self.fan if times[fan.name.casefold()] > 1), ""):
+            raise ValueError(f"two fans are called {twice!r}: names of a tray's fans differ")
         tacho_of_each_fan(self.tachos, self.fans)
         if self.fans > self.source.most_fans:
             raise ValueError(too_many_fans(self.source.kind, self.fans, self.source.most_fans))

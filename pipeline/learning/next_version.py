@@ -322,7 +322,7 @@ class _Work:
         self._say(f"{self._name}: training")
         training, validation = read_excerpts(parts.training), read_excerpts(parts.validation)
         longest = max(training.runs, key=lambda run: len(run.t_s))
-        hints = tacho_hints(longest.t_s, longest.speed_rad_s, longest.tacho, training.fans)
+        hints = tacho_hints(longest.t_s, longest.speed_rad_s, longest.tacho, training.fans, training.names)
         if self._before is None and hints:
             place = self._recordings[0].path.parent
             raise UserError(

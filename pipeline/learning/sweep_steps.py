@@ -12,6 +12,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from fantwin.pipeline.errors import UserError
+from fantwin.schemas.fan_names import NO_NAMES, FanNames
 from fantwin.schemas.messages import Array
 
 LEVELS = (0.5, 1.0, 0.25, 0.75, 0.0, 0.6, 0.1, 0.9, 0.35, 0.8, 0.2, 0.65, 0.45)
@@ -78,6 +79,7 @@ class Excitation:
     rounds: int
     progress: Callable[[str], None]
     """is given a line for each step"""
+    names: FanNames = NO_NAMES
 
     def run(self) -> dict[int, float]:
         """Move the commands; returns the time constant of each fan, s; NaN for one that does not follow its command.
@@ -122,7 +124,7 @@ class Excitation:
         for fan, seconds in constants.items():
             shown = f"its readings show 63 % of a change after {seconds:.2g} s"
             follows = shown if np.isfinite(seconds) else "does not follow its command"
-            self.progress(f"fan {fan}: {follows}")
+            self.progress(f"{self.names.label(fan)}: {follows}")
         if not np.isfinite(slowest_s).any():
             raise UserError(
                 f"no fan follows its command from {self.low:g} to {self.high:g}: do the fans have power and a tacho?"
@@ -134,7 +136,9 @@ class Excitation:
         speeds = self.line.observed().speed_rad_s[:, self.fans]
         for fan, speed_rad_s in zip(self.fans, speeds[-1] if len(speeds) else (), strict=False):
             if speed_rad_s == 0.0 and self.low > 0.0:
-                self.progress(f"fan {fan} reads 0 at command {self.low:g}; if it stands still, give a higher --low")
+                self.progress(
+                    f"{self.names.label(fan)} reads 0 at command {self.low:g}; if it stands still, give a higher --low"
+                )
 
     def _settle(self, command: float, words: str) -> Array:
         """Send a command and wait until all speeds have settled. Returns the time constants, (fans,)."""
@@ -164,8 +168,8 @@ class Excitation:
             place = int(np.argmax(wrong))
             fan = self.fans[place]
             raise UserError(
-                f"fan {fan} has command {applied[-1, fan]:g} and not {commands[place]:g}: something else sets it; "
-                "stop that"
+                f"{self.names.label(fan)} has command {applied[-1, fan]:g} and not {commands[place]:g}: something else "
+                "sets it; stop that"
             )
 
 

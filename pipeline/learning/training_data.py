@@ -19,6 +19,7 @@ from fantwin.pipeline.recordings.training_runs import RecordedRun, RecordedTray,
 from fantwin.pipeline.replay.offline.healthy_runs import MapRecordings
 from fantwin.pipeline.sources.tables.measured_table import RAD_S_PER_TABLE_UNIT
 from fantwin.pipeline.sources.tacho_evidence import tacho_hints
+from fantwin.schemas.fan_names import NO_NAMES, FanNames
 from fantwin.schemas.tacho import Tacho
 
 if TYPE_CHECKING:
@@ -41,7 +42,7 @@ class Source:
 
 @dataclass(frozen=True, eq=False)
 class TrainingData:
-    """Runs without their outliers, with the fan numbers and the speed unit of their recordings.
+    """Runs without their outliers, with the numbers and names of the fans, and the speed unit, of their recordings.
 
     sources: of each run. fans: the fan number of each column. outliers: a warning for each fan and file with many
     outliers. hints: what speaks against the declared tachos in the longest run; see pipeline.sources.tacho_evidence.
@@ -56,17 +57,26 @@ class TrainingData:
     hints: tuple[str, ...] = ()
     damage: tuple[str, ...] = ()
     sha256: Mapping[Path, str] = field(default_factory=dict)
+    names: FanNames = NO_NAMES
 
     @property
     def rad_s_per_unit(self) -> float:
         """How many rad/s one unit of the recordings is."""
         return RAD_S_PER_TABLE_UNIT[self.speed_unit]
 
+    @property
+    def labels(self) -> list[str]:
+        """What people call the fan of each column."""
+        return [self.names.label(fan) for fan in self.fans]
+
     def with_fan_numbers(self, warnings: Sequence[str]) -> list[str]:
-        """The outlier warnings, then those of the model maker with its column numbers replaced by fan numbers, and with
-        its speeds in the unit of the recordings, too."""
-        numbered = [re.sub(r"^fan (\d+):", lambda found: f"fan {self.fans[int(found[1])]}:", line) for line in warnings]
-        return [*self.outliers, *map(self._with_unit, numbered)]
+        """The outlier warnings, then those of the model maker with its column numbers replaced by the fans of the
+        recordings, and with its speeds in their unit, too."""
+
+        def fan_of(found: re.Match[str]) -> str:
+            return f"{self.names.label(self.fans[int(found[1])])}:"
+
+        return [*self.outliers, *(self._with_unit(re.sub(r"^fan (\d+):", fan_of, line)) for line in warnings)]
 
     def _with_unit(self, line: str) -> str:
         if self.speed_unit == "rad/s":
@@ -116,7 +126,7 @@ def read_recording_data(path: Path, part: Part) -> TrainingData:
         ((run, run_data.tacho) for run, run_data in zip(found.runs, data.runs, strict=True)),
         key=lambda each: len(each[0].t_s),
     )
-    hints = tacho_hints(longest.t_s, longest.speed_rad_s, tacho, data.fans)
+    hints = tacho_hints(longest.t_s, longest.speed_rad_s, tacho, data.fans, data.names)
     return replace(data, hints=tuple(hints), sha256={path: sha256_of(path)})
 
 
@@ -149,12 +159,14 @@ def training_data_of(
         speed_unit=common_unit([(found.speed_unit, path)]),
         fans=numbers,
         outliers=tuple(
-            f"{path}: fan {fan}: {share:.1%} of the speeds are outliers and left out; check the tacho and its wiring"
+            f"{path}: {found.names.label(fan)}: {share:.1%} of the speeds are outliers and left out; check the tacho "
+            "and its wiring"
             for _, shares in cleaned
             for fan, share in zip(numbers, shares, strict=False)
             if share > MANY_OUTLIERS
         ),
         damage=(found.damage,) if found.damage else (),
+        names=found.names,
     )
 
 
@@ -174,6 +186,7 @@ def joined(parts: Sequence[TrainingData]) -> TrainingData:
         hints=longest.hints,
         damage=tuple(line for part in parts for line in part.damage),
         sha256={path: digest for part in parts for path, digest in part.sha256.items()},
+        names=parts[0].names,
     )
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fantwin.schemas.fan_numbers import fans_in_words
+from fantwin.schemas.fan_names import NO_NAMES, FanNames
 from fantwin.schemas.messages import Array, Grid
 from fantwin.schemas.reference_conditions import ConditionRatios, ReferenceConditions
 from fantwin.schemas.units import NS_PER_S
@@ -37,8 +37,8 @@ SHOWN_NS = 5 * NS_PER_S
 class ConditionTracker(ColumnState):
     """Follows what is measured; a value that is missing is held for a while. Does not depend on the cuts of blocks."""
 
-    def __init__(self, reference: ReferenceConditions, fans: int) -> None:
-        self.reference = reference
+    def __init__(self, reference: ReferenceConditions, fans: int, names: FanNames = NO_NAMES) -> None:
+        self.reference, self._names = reference, names
         self._ratios = ConditionRatios(reference, fans)
         self._beyond_t_ns = np.full(fans, NEVER_NS)
         """time of the last sample that the conditions alone took out of the twin's range, and the ratio of torque
@@ -63,7 +63,7 @@ class ConditionTracker(ColumnState):
         fans = np.flatnonzero(self._beyond_t_ns > t_ns - SHOWN_NS)
         if not len(fans):
             return ""
-        subject = f"fan {fans[0]} is" if len(fans) == 1 else f"fans {fans_in_words(fans.tolist())} are"
+        subject = f"{self._names.labels(fans.tolist())} {'is' if len(fans) == 1 else 'are'}"
         voltage_v, cause = self.reference.supply_voltage_v, "the temperature of the air takes"
         if voltage_v is not None:
             found_v = voltage_v * self._beyond_torque[fans].mean()

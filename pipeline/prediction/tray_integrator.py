@@ -20,6 +20,7 @@ from fantwin.pipeline.runtime.stage import StageConfig
 from fantwin.schemas.blocks import present_columns
 from fantwin.schemas.channels import measured_columns
 from fantwin.schemas.enums import InvalidReason
+from fantwin.schemas.fan_names import NO_NAMES, FanNames
 from fantwin.schemas.messages import Array, Grid, Prediction
 from fantwin.schemas.standstill import Standstill
 from fantwin.schemas.units import NS_PER_S
@@ -66,7 +67,7 @@ class FanCounts(ColumnState):
 class TrayIntegrator:
     """The free runs and the torque balance of one tray's fans."""
 
-    def __init__(self, twin: TwinFile, config: TwinIntegratorConfig) -> None:
+    def __init__(self, twin: TwinFile, config: TwinIntegratorConfig, names: FanNames = NO_NAMES) -> None:
         self.twin, self.config = twin, config
         reach_s = max(tacho.reach_s for tacho in twin.tachos)
         self._warm_up_ns = round((config.warm_up_s + reach_s) * NS_PER_S)
@@ -81,7 +82,7 @@ class TrayIntegrator:
             self._starting = StartingFans(twin.fans, self._standstill, self._warm_up_ns, reach_s)
         self._balance = _balance_of(twin, self._off_below)
         conditions = twin.card.conditions
-        self._conditions = ConditionTracker(conditions, twin.fans) if conditions else None
+        self._conditions = ConditionTracker(conditions, twin.fans, names) if conditions else None
         self.missing_columns = ""
         """those that the twin needs and the last block did not have"""
         self._averages = any(tacho.window_s > 0.0 for tacho in twin.tachos)

@@ -6,7 +6,7 @@ import hashlib
 import json
 import logging
 
-from fantwin.pipeline.recordings.reading import TACHO_KEY
+from fantwin.pipeline.recordings.reading import NAMES_KEY, TACHO_KEY
 from fantwin.pipeline.runtime.stage import Context
 from fantwin.schemas.tacho import INSTANTANEOUS, tachos_to_json
 
@@ -26,6 +26,8 @@ def recording_metadata(context: Context) -> tuple[dict[str, str], dict[str, byte
     for tray in context.trays:
         metadata[f"fans.{tray.name}"] = str(tray.fans)
         metadata[f"speed_unit.{tray.name}"] = tray.speed_unit
+        if any(tray.names.names):
+            metadata[f"{NAMES_KEY}.{tray.name}"] = tray.names.as_json()
         if tray.tachos != INSTANTANEOUS:
             metadata[f"{TACHO_KEY}.{tray.name}"] = tachos_to_json(tray.tachos)
         if tray.twin is not None:

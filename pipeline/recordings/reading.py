@@ -28,13 +28,14 @@ from fantwin.pipeline.recordings.records import (
 )
 from fantwin.schemas.codec import CodecError
 from fantwin.schemas.envelope import Envelope
+from fantwin.schemas.fan_names import NO_NAMES, FanNames
 from fantwin.schemas.messages import StatedTacho
 from fantwin.schemas.tacho import INSTANTANEOUS, Tacho, tachos_from_json
 from fantwin.schemas.topics import HEALTH_CHUNK, known_topic
 
 __all__ = ["METADATA_NAME", "Reading", "RecordingError", "RecordingMetadata", "read_metadata", "read_recording"]
 
-TACHO_KEY = "tacho"
+TACHO_KEY, NAMES_KEY = "tacho", "fan_names"
 """with the name of a tray: its tachos, as schemas.tacho writes them"""
 LEFT_OUT_KEY = "left_out"
 """topics that were left out on purpose, separated by commas"""
@@ -172,6 +173,11 @@ class RecordingMetadata:
     def speed_unit(self, tray: str) -> str:
         """The unit in which people see a tray's speeds: the tray's, the recording's, or rad/s."""
         return self.metadata.get(f"speed_unit.{tray}") or self.metadata.get("speed_unit", "rad/s")
+
+    def names(self, tray: str | None = None) -> FanNames:
+        """Names of the fans of a tray; without one of the only tray."""
+        trays = self.trays if tray is None else (tray,)
+        return FanNames.from_json(self.metadata.get(f"{NAMES_KEY}.{trays[0]}", "")) if len(trays) == 1 else NO_NAMES
 
     @property
     def left_out(self) -> tuple[str, ...]:

@@ -20,6 +20,7 @@ from fantwin.pipeline.sources.tables.measured_table import hold_last
 from fantwin.pipeline.timebase.device_clock import DeviceClock
 from fantwin.schemas.channels import CHANNELS, measured_columns
 from fantwin.schemas.codec import CodecError, decode_together
+from fantwin.schemas.fan_names import NO_NAMES, FanNames
 from fantwin.schemas.messages import Array, Raw
 from fantwin.schemas.tacho import Tacho, tacho_of_each_fan
 from fantwin.schemas.topics import tray_of
@@ -56,6 +57,8 @@ class RecordedTray:
     """of each fan of its runs"""
     damage: str
     """what of the file could not be read, in one line; empty if all of it was read"""
+    names: FanNames = NO_NAMES
+    """of all fans of the tray"""
 
     def between(self, from_s: float, to_s: float) -> RecordedTray:
         """The samples with from_s <= t_s < to_s, of runs that have at least two of them."""
@@ -155,7 +158,7 @@ def recorded_tray(
     except (ValueError, RecordingError) as error:
         raise RecordingError(f"{path}: {error}") from error
     chosen = tacho if fans is None else tuple(tacho[fan] for fan in fans)
-    return RecordedTray(runs, metadata.speed_unit(tray), chosen, damage)
+    return RecordedTray(runs, metadata.speed_unit(tray), chosen, damage, metadata.names(tray))
 
 
 Columns = tuple[Array, Array, Array, Mapping[str, Array]]

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fantwin.pipeline.config.settings import TrayConfig
+from fantwin.pipeline.config.settings import FanConfig, TrayConfig
 from fantwin.pipeline.site.trace import SILENT, state_codes, state_name
 from fantwin.schemas.enums import FanState, InvalidReason, Transition
 from fantwin.schemas.fields import LARGEST_ENUM_VALUE
@@ -75,6 +75,8 @@ class FanNow:
     group: FanGroup
     score: float
     since_t_ns: int
+    about: FanConfig = FanConfig()
+    """its name and place"""
 
 
 _OF_STATE = {
@@ -117,6 +119,7 @@ class Fleet:
 
     def __init__(self, trays: Sequence[TrayConfig]) -> None:
         self.fans = [Fan(tray.name, number) for tray in trays for number in range(tray.fans)]
+        self._about = [fan for tray in trays for fan in tray.fan]
         ends = np.cumsum([tray.fans for tray in trays])
         self._of_tray = {
             tray.name: slice(int(end) - tray.fans, int(end)) for tray, end in zip(trays, ends, strict=True)
@@ -244,7 +247,7 @@ class Fleet:
         group = SHOWN_CLASSES[cell].group
         if group == FanGroup.SILENCED:
             name += " (silenced)"
-        return FanNow(self.fans[index], name, group, float(self._score[index]), since_t_ns)
+        return FanNow(self.fans[index], name, group, float(self._score[index]), since_t_ns, self._about[index])
 
     def _change(self, of_tray: slice, codes: Array, t_ns: int) -> None:
         changed = self._codes[of_tray] != codes

@@ -10,7 +10,7 @@ from fantwin.pipeline.runtime.figures import without_figures
 from fantwin.pipeline.site.site_model import SiteModel
 from fantwin.pipeline.site.stage_states import StageState, Word
 from fantwin.schemas.enums import InvalidReason
-from fantwin.schemas.fan_numbers import fans_in_words
+from fantwin.schemas.fan_names import NO_NAMES, FanNames
 from fantwin.schemas.messages import Alarm
 from fantwin.scoring.alarms.alarm_text import STARTING, STOPPED
 from fantwin.scoring.alarms.current_alarms import CurrentAlarm
@@ -26,6 +26,7 @@ class Unjudged:
     tray: str
     fans: tuple[int, ...]
     why: str
+    names: FanNames = NO_NAMES
 
     def concerns(self, tray: str, fan: int) -> bool:
         """Whether a fan is one of them."""
@@ -35,8 +36,7 @@ class Unjudged:
         """A text for people."""
         if not self.fans:
             return f"{self.tray}: no fan is judged: {self.why}"
-        names = fans_in_words(self.fans)
-        return f"{self.tray}: {'fan' if len(self.fans) == 1 else 'fans'} {names} not judged: {self.why}"
+        return f"{self.tray}: {self.names.labels(self.fans)} not judged: {self.why}"
 
     def as_json(self) -> dict[str, object]:
         """JSON values for machines; no fans: all of the tray."""
@@ -50,11 +50,11 @@ class AtRest:
     tray: str
     fans: tuple[int, ...]
     reason: InvalidReason
+    names: FanNames = NO_NAMES
 
     def line(self) -> str:
         """A text for people."""
-        names = fans_in_words(self.fans)
-        return f"{self.tray}: {'fan' if len(self.fans) == 1 else 'fans'} {names}: {self.words}"
+        return f"{self.tray}: {self.names.labels(self.fans)}: {self.words}"
 
     @property
     def words(self) -> str:
@@ -81,14 +81,16 @@ def unjudged(model: SiteModel, states: Sequence[StageState]) -> list[Unjudged]:
             continue
         for reason, fans in reasons.items():
             why = REASONS.get(reason, reason.words)
-            found.append(Unjudged(tray.name, () if len(fans) == tray.fans else fans, why))
+            found.append(Unjudged(tray.name, () if len(fans) == tray.fans else fans, why, tray.names))
     return found
 
 
 def at_rest(model: SiteModel) -> list[AtRest]:
     """The fans that are stopped or starting now; they are judged by whether they stand or turn as commanded."""
     return [
-        AtRest(tray.name, fans, reason) for tray in model.trays for reason, fans in model.at_rest(tray.name).items()
+        AtRest(tray.name, fans, reason, tray.names)
+        for tray in model.trays
+        for reason, fans in model.at_rest(tray.name).items()
     ]
 
 

@@ -28,6 +28,7 @@ def readable_alarm(alarm: Alarm) -> Alarm:
     return replace(
         alarm,
         message=_short_line(alarm.message),
+        fan_name=_short_line(alarm.fan_name),
         operator_name=_short_line(alarm.operator_name),
         comment=_short_line(alarm.comment),
         feedback_by=_short_line(alarm.feedback_by),

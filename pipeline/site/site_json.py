@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from fantwin.pipeline.config.settings import TrayConfig
+from fantwin.pipeline.config.settings import FanConfig, TrayConfig
 from fantwin.pipeline.recordings.clips.clip import Clip
 from fantwin.pipeline.site.fan_history import Curves
 from fantwin.pipeline.site.fleet import SHOWN_CLASSES, Fan, FanGroup, FanNow
@@ -46,6 +46,8 @@ def site_json(model: SiteModel, viewer_urls: Mapping[str, str]) -> dict[str, Any
         {
             "name": tray.name,
             "fans": tray.fans,
+            "names": [fan.name for fan in tray.fan],
+            "places": [fan.place for fan in tray.fan],
             "speed_unit": tray.speed_unit,
             "viewer_url": viewer_urls.get(tray.name, ""),
         }
@@ -78,6 +80,8 @@ def fan_json(now: FanNow) -> dict[str, Any]:
     return {
         "tray": now.fan.tray,
         "fan": now.fan.number,
+        "name": now.about.name,
+        "place": now.about.place,
         "state": now.state,
         "group": str(now.group),
         "score": None if math.isnan(now.score) else round(now.score, 4),
@@ -92,7 +96,7 @@ def fan_in_full(model: SiteModel, fan: Fan) -> dict[str, Any]:
     return {
         **fan_json(model.fan_now(fan)),
         "newest_t_ns": model.newest_t_ns(fan.tray),
-        "alarm": alarm_json(alarm) | {"now": model.words_now([fan])[0]} if alarm else None,
+        "alarm": alarm_json(alarm, model.about(fan)) | {"now": model.words_now([fan])[0]} if alarm else None,
         "twin": twin_json(twin, fan.number) if twin else None,
         "wear": [_wear_json(row) for row in model.wear(fan)],
     }
@@ -133,11 +137,14 @@ def curves_json(curves: Curves, tray: TrayConfig) -> dict[str, Any]:
     return {"speed_unit": tray.speed_unit, "t_s": (curves.t_ns / 1e9).round(3).tolist(), **columns}
 
 
-def alarm_json(current: CurrentAlarm) -> dict[str, Any]:
-    """A current alarm with what the page says of it. probability: of the first of the likely causes."""
+def alarm_json(current: CurrentAlarm, about: FanConfig) -> dict[str, Any]:
+    """A current alarm with what the page says of it. about: its fan. probability: of the first of the likely causes."""
     causes = current.causes
     return {
         **current.as_json(),
+        "name": about.name,
+        "place": about.place,
+        "about": current.describing.about if current.describing else "",
         "listed": is_listed(current.newest),
         "states": current.states(),
         "cause": likely_causes(causes),
@@ -154,8 +161,9 @@ def alarm_json(current: CurrentAlarm) -> dict[str, Any]:
 def alarms_json(model: SiteModel, *, everything: bool) -> dict[str, Any]:
     """All current alarms, each with what its fan does `now`. everything: also those that are over."""
     found = [each for each in model.current_alarms() if everything or is_listed(each.newest)]
-    words = model.words_now([Fan(each.newest.header.tray, each.newest.fan) for each in found])
-    return {"alarms": [alarm_json(each) | {"now": now} for each, now in zip(found, words, strict=True)]}
+    fans = [Fan(each.newest.header.tray, each.newest.fan) for each in found]
+    of_each = zip(found, fans, model.words_now(fans), strict=True)
+    return {"alarms": [alarm_json(each, model.about(fan)) | {"now": now} for each, fan, now in of_each]}
 
 
 def clip_json(clip: Clip) -> dict[str, Any]:
@@ -179,6 +187,7 @@ def transition_json(number: int, alarm: Alarm, feedback: Feedback = Feedback.NON
         "t_ns": alarm.t_ns,
         "tray": alarm.header.tray,
         "fan": alarm.fan,
+        "name": alarm.fan_name,
         "onset_t_ns": alarm.onset_t_ns,
         "transition": alarm.transition.name.lower(),
         "severity": alarm.severity.name.lower(),
@@ -201,7 +210,13 @@ def answers_json(answers: Sequence[Alarm]) -> dict[str, Any]:
     """The scorer's answers to a request, with an `error` if it has refused it for every fan."""
     body: dict[str, Any] = {
         "answers": [
-            {"fan": each.fan, "transition": each.transition.name.lower(), "message": each.message} for each in answers
+            {
+                "fan": each.fan,
+                "name": each.fan_name,
+                "transition": each.transition.name.lower(),
+                "message": each.message,
+            }
+            for each in answers
         ]
     }
     is_refused = all(each.transition == Transition.REFUSED for each in answers)

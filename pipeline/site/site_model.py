@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from fantwin.pipeline.config.registry import STAGES
-from fantwin.pipeline.config.settings import TrayConfig
+from fantwin.pipeline.config.settings import FanConfig, TrayConfig
 from fantwin.pipeline.config.shards import StageProcess
 from fantwin.pipeline.site.alarm_book import AlarmBook
 from fantwin.pipeline.site.alarm_history import AlarmHistory
@@ -213,6 +213,10 @@ class SiteModel:
         """None: there is no such tray."""
         return self._by_name.get(name)
 
+    def about(self, fan: Fan) -> FanConfig:
+        """Name and place of a fan of the site."""
+        return self._by_name[fan.tray].fan[fan.number]
+
     def fans_now(self) -> tuple[Array, Array]:
         """All fans at a glance, tray after tray: the class of each fan's cell, (fans,) uint8, an index into
         `SHOWN_CLASSES`, and its score, (fans,) float32, NaN where it is not judged."""
@@ -312,7 +316,7 @@ class SiteModel:
         wear = wear_in(snapshot)
         if wear is not None and len(wear["fans"]) == self._by_name[tray].fans:
             with self._lock:
-                self._wear[tray] = (snapshot.t_ns, wear_rows(tray, snapshot.t_ns, wear))
+                self._wear[tray] = (snapshot.t_ns, wear_rows(tray, snapshot.t_ns, wear, self._by_name[tray].names))
 
     def wear(self, fan: Fan) -> Sequence[Mapping[str, Any]]:
         """The wear of a fan as of the last snapshot of its scorer, one row; empty: none is known."""

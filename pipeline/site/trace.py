@@ -12,6 +12,7 @@ import numpy as np
 
 from fantwin.schemas.channels import CHANNELS
 from fantwin.schemas.enums import FanState, InvalidReason
+from fantwin.schemas.fan_names import NO_NAMES, FanNames
 from fantwin.schemas.fields import LARGEST_ENUM_VALUE
 from fantwin.schemas.messages import Array, Score
 from fantwin.schemas.units import RAD_S_PER_UNIT, SpeedUnit
@@ -73,6 +74,7 @@ class Trace:
     state: Array
     invalid_reason: Array
     auxiliary: Mapping[str, Array] = field(default_factory=dict[str, Array])
+    names: FanNames = NO_NAMES
 
     @property
     def fans(self) -> int:
@@ -80,7 +82,13 @@ class Trace:
         return self.measured.shape[1]
 
 
-def trace_of(tray: str, scores: Sequence[Score], speed_unit: SpeedUnit, fans: Sequence[int] | None = None) -> Trace:
+def trace_of(
+    tray: str,
+    scores: Sequence[Score],
+    speed_unit: SpeedUnit,
+    fans: Sequence[int] | None = None,
+    names: FanNames = NO_NAMES,
+) -> Trace:
     """Join the scores of one tray, of which only `TRACE_COLUMNS` are needed.
 
     Args:
@@ -88,6 +96,7 @@ def trace_of(tray: str, scores: Sequence[Score], speed_unit: SpeedUnit, fans: Se
         scores: at least one, all with the same number of fans.
         speed_unit: unit of the speeds in the trace.
         fans: which fans, counted from 0; all if not given.
+        names: of all fans of the tray.
     """
     scale = 1.0 / RAD_S_PER_UNIT[speed_unit]
     fan_numbers = range(scores[0].fans) if fans is None else fans
@@ -116,6 +125,7 @@ def trace_of(tray: str, scores: Sequence[Score], speed_unit: SpeedUnit, fans: Se
         state=state,
         invalid_reason=column("invalid_reason"),
         auxiliary={name: _known_or_nan(name, scores)[:, chosen] for name in present},
+        names=names,
     )
 
 

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from fantwin.schemas.fan_names import NO_NAMES, FanNames
 from fantwin.schemas.tacho import Tacho, tacho_of_each_fan
 from fantwin.schemas.units import RAD_S_PER_UNIT
 
@@ -87,10 +88,12 @@ def find_tacho(t_s: Array, speed_rad_s: Array) -> TachoEvidence | None:
     return TachoEvidence(tacho, resolution, change_s)
 
 
-def tacho_hints(t_s: Array, speed_rad_s: Array, declared: Sequence[Tacho], fans: Sequence[int]) -> list[str]:
+def tacho_hints(
+    t_s: Array, speed_rad_s: Array, declared: Sequence[Tacho], fans: Sequence[int], names: FanNames = NO_NAMES
+) -> list[str]:
     """Hints, one line for each kind of evidence that speaks against the declared tachos.
 
-    t_s: (n,). speed_rad_s: (n, fans). declared: one for all fans, or one for each. fans: their numbers, for the text.
+    t_s: (n,). speed_rad_s: (n, fans). declared: one for all fans, or one for each. fans, names: for the text.
     """
     of_each = tacho_of_each_fan(declared, len(fans))
     found = [find_tacho(t_s, column) for column in speed_rad_s.T]
@@ -98,10 +101,7 @@ def tacho_hints(t_s: Array, speed_rad_s: Array, declared: Sequence[Tacho], fans:
     for number, its, evidence in zip(fans, of_each, found, strict=True):
         if evidence is not None and not _agree(its, evidence.tacho):
             lines.setdefault((str(evidence), str(its)), []).append(number)
-    return [
-        f"{'fan' if len(numbers) == 1 else 'fans'} {', '.join(map(str, numbers))}: {evidence}; declared is {its}"
-        for (evidence, its), numbers in lines.items()
-    ]
+    return [f"{names.labels(numbers)}: {evidence}; declared is {its}" for (evidence, its), numbers in lines.items()]
 
 
 def _agree(declared: Tacho, found: Tacho) -> bool:

@@ -19,6 +19,7 @@ from fantwin.pipeline.tray_scoring.scorer_state import ScorerState, with_times_m
 from fantwin.pipeline.tray_scoring.snapshot_store import SnapshotStore
 from fantwin.pipeline.tray_scoring.tray_scorer import JudgedShare, TrayScorer
 from fantwin.schemas.enums import Transition
+from fantwin.schemas.fan_names import NO_NAMES, FanNames
 from fantwin.schemas.messages import Alarm, Message, ModelCard, Prediction, Request, Score, ScorerSnapshot
 from fantwin.schemas.units import NS_PER_S, SpeedUnit
 from fantwin.scoring.alarms.alarm_text import AlarmText
@@ -61,6 +62,7 @@ class ScorerCore(Core):
         continues: ScorerSnapshot | None = None,
         is_learned: bool = False,
         is_replayed: Callable[[], bool] = never,
+        names: FanNames = NO_NAMES,
     ) -> None:
         """snapshot_store: where snapshots are kept; None: nowhere, as in a replay. started_t_ns: the present time.
         continues: the last snapshot of the twin before this one, instead of the one in the store. is_learned: the twin
@@ -68,10 +70,10 @@ class ScorerCore(Core):
         self._fans = fans
         self._twin = twin
         self._config = config
-        self._text = AlarmText(speed_unit, twin.advice.command_unit)
+        self._text = AlarmText(speed_unit, twin.advice.command_unit, names)
         self._is_learned = is_learned
         self._is_replayed = is_replayed
-        self._unscored = UnscoredMonitor(fans, round(NOT_JUDGED_S * NS_PER_S))
+        self._unscored = UnscoredMonitor(fans, round(NOT_JUDGED_S * NS_PER_S), names)
         self._snapshot_store = snapshot_store
         self._samples = NewSamples(fans, "predictions", "scorer")
         self._judged_share = JudgedShare()

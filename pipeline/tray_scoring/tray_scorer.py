@@ -88,9 +88,10 @@ class TrayScorer(Saved):
         self.fans, self.twin = fans, twin
         self._alarm_share = config.alarm_share
         self._words = CauseWords(twin.advice, has_supply=twin.has_supply)
-        self.wear = WearMonitor(fans, WEAR_EVERY_S)
+        self.wear = WearMonitor(fans, WEAR_EVERY_S, text.names)
         self._against = AgainstCommand(twin.standstill, twin.tachos) if twin.standstill else None
         self.alarms = AlarmManager(fans, text)
+        self._names = text.names
         self._period_ns = 0
         self._open(NS_PER_S)
         self._period_ns = 0  # of no sample yet
@@ -136,7 +137,8 @@ class TrayScorer(Saved):
         """Notes on fans that change slowly, and on tachos that are not sound."""
         many = self._decision.wrong.many
         unsound = [
-            f"fan {fan}: {many[fan]:.0%} of the readings of its tacho are wrong: check the tacho and its wire"
+            f"{self._names.label(fan)}: {many[fan]:.0%} of the readings of its tacho are wrong: check the tacho and "
+            "its wire"
             for fan in np.flatnonzero(many).tolist()
         ]
         return [*self.wear.notices(), *unsound]

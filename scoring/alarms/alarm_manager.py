@@ -180,7 +180,7 @@ class AlarmManager:
                 marked_onset_t_ns=self.state.conditions.onset_meant(fan, request.onset_t_ns) if is_marked else 0,
                 **(_state_fields(self.state.conditions.alarm_state(fan)) if exists else {}),
             )
-            alarms.append(self._emit(alarm, refusal) if exists else replace(alarm, message=f"fan {fan}: {refusal}"))
+            alarms.append(self._emit(alarm, refusal) if exists else replace(alarm, message=f"{alarm.label}: {refusal}"))
         return alarms
 
     def republish(self) -> list[Alarm]:
@@ -252,7 +252,8 @@ class AlarmManager:
 
     def _emit(self, alarm: Alarm, refusal: str = "") -> Alarm:
         is_of_size = alarm.transition in (Transition.RAISED, Transition.SEVERITY)
-        alarm = replace(alarm, message=self._alarm_text.of(alarm, refusal, self._alike(alarm) if is_of_size else 0))
+        message = self._alarm_text.of(alarm, refusal, self._alike(alarm) if is_of_size else 0)
+        alarm = replace(alarm, message=message, fan_name=self._alarm_text.names.name(alarm.fan))
         self.state.last_emitted[alarm.fan] = alarm
         return alarm
 

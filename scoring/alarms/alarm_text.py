@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from fantwin.schemas.enums import FanState, InvalidReason, Severity, Statistic, Transition
+from fantwin.schemas.fan_names import NO_NAMES, FanNames
 from fantwin.schemas.messages import Alarm
 from fantwin.schemas.units import RAD_S_PER_UNIT, SpeedUnit
 from fantwin.scoring.diagnosis.causes import CANNOT_TELL, CAUSES, is_of_standstill
@@ -79,14 +80,14 @@ class AlarmUnits:
 class AlarmText:
     """Writes alarm messages in the units of a tray."""
 
-    def __init__(self, speed_unit: SpeedUnit, command_unit: str) -> None:
+    def __init__(self, speed_unit: SpeedUnit, command_unit: str, names: FanNames = NO_NAMES) -> None:
         """command_unit: empty where the twin does not name it."""
-        self.units = AlarmUnits(speed_unit, command_unit)
+        self.units, self.names = AlarmUnits(speed_unit, command_unit), names
 
     def of(self, alarm: Alarm, refusal: str = "", alike: int = 0) -> str:
         """The line. refusal: the reason why a request was refused; alike: how many other fans of the tray have a
         similar alarm, if that is most of them."""
-        fan = f"fan {alarm.fan}"
+        fan = self.names.label(alarm.fan)
         if alarm.transition == Transition.REFUSED:
             return f"{fan}: refused: {refusal}"
         if alarm.transition == Transition.DIAGNOSED:
@@ -128,9 +129,9 @@ class AlarmText:
         return f"{name}, {100 * first.probability:.0f} %{evidence}"
 
 
-def deviation_in(message: str, fan: int) -> str:
-    """The part of the line of a raised alarm that says how far the fan is off, without its name and causes."""
-    return message.removeprefix(f"fan {fan}: ").partition("; ")[0].partition(": ")[0]
+def deviation_in(about: str) -> str:
+    """The part of the line of a raised alarm that says how far the fan is off, without causes. about: see Alarm."""
+    return about.partition("; ")[0].partition(": ")[0]
 
 
 def _after_restart(alarm: Alarm) -> str:

@@ -33,20 +33,29 @@ class CurrentAlarm:
     """The alarm of a fan: its newest message, and what earlier messages of the same occurrence add."""
 
     newest: Alarm
-    message: str
+    describing: Alarm | None
     """last message of the occurrence that describes the fan, not an operator's action"""
     causes: tuple[Diagnosis, ...]
     acknowledged_by: str
-    message_t_ns: int = 0
-    """time of the sample that the message describes; 0 where it describes none"""
     raised: Alarm | None = None
     """the last message of the occurrence that says how far the fan is from its twin"""
     commented: Alarm | None = None
     """the last message of the occurrence with a comment of an operator"""
 
+    @property
+    def message(self) -> str:
+        """The line of the message that describes the fan; empty where there is none."""
+        return self.describing.message if self.describing else ""
+
+    @property
+    def message_t_ns(self) -> int:
+        """Time of the sample that it describes; 0 where it describes none."""
+        describing = self.describing
+        return describing.t_ns if describing and describing.transition != Transition.REPUBLISHED else 0
+
     def about(self) -> str:
         """The message without the fan and with its time: commands and speeds in it are those of then."""
-        about = self.message.removeprefix(f"fan {self.newest.fan}: ")
+        about = self.describing.about if self.describing else ""
         return f"at {clock(self.message_t_ns)}: {about}" if about and self.message_t_ns else about
 
     def line(self) -> str:
@@ -82,6 +91,7 @@ class CurrentAlarm:
         return {
             "tray": alarm.header.tray,
             "fan": alarm.fan,
+            "name": alarm.fan_name,
             "severity": alarm.severity.name.lower(),
             "active": alarm.active,
             "acknowledged": alarm.acknowledged,
@@ -119,10 +129,9 @@ def current_alarm(messages: Sequence[Alarm]) -> CurrentAlarm:
     newest, describing, with_causes, acknowledging, raised, commented = _parts(messages)
     return CurrentAlarm(
         newest,
-        message=describing.message if describing else "",
+        describing,
         causes=with_causes.causes if with_causes else (),
         acknowledged_by=acknowledging.operator_name if acknowledging and newest.acknowledged else "",
-        message_t_ns=describing.t_ns if describing and describing.transition != Transition.REPUBLISHED else 0,
         raised=raised,
         commented=commented,
     )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from fantwin.schemas.enums import InvalidReason
-from fantwin.schemas.fan_numbers import fans_in_words
+from fantwin.schemas.fan_names import NO_NAMES, FanNames
 from fantwin.schemas.messages import Array
 from fantwin.schemas.units import NS_PER_S
 from fantwin.scoring.samples import IDLE, among
@@ -40,8 +40,8 @@ class UnscoredMonitor:
     `limit_ns`.
     """
 
-    def __init__(self, fans: int, limit_ns: int) -> None:
-        self._limit_ns = limit_ns
+    def __init__(self, fans: int, limit_ns: int, names: FanNames = NO_NAMES) -> None:
+        self._limit_ns, self._names = limit_ns, names
         self._unscored_ns = np.zeros(fans, np.int64)
         self._invalid_reason = np.zeros(fans, np.uint8)
         self._was_scored = np.zeros(fans, np.bool_)
@@ -88,17 +88,15 @@ class UnscoredMonitor:
             fans = np.flatnonzero(late & (self._invalid_reason == reason))
             doublings = int(self._unscored_ns[fans].min() // self._limit_ns).bit_length() - 1
             at_least_s = self._limit_ns * 2**doublings / NS_PER_S
-            parts.append(f"{_subject(fans)} not scored: {_explanation(reason)}, for {at_least_s:g} s or more")
+            parts.append(f"{self._subject(fans)} not scored: {_explanation(reason)}, for {at_least_s:g} s or more")
         rarely = ~late & (self._rare_windows >= RARE_WINDOWS)
         for reason in np.unique(self._latest_reason[rarely]).tolist():
             fans = np.flatnonzero(rarely & (self._latest_reason == reason))
-            parts.append(f"{_subject(fans)} not scored most of the time: {_explanation(reason)}")
+            parts.append(f"{self._subject(fans)} not scored most of the time: {_explanation(reason)}")
         return "; ".join(parts)
 
-
-def _subject(fans: Array) -> str:
-    names = fans_in_words(fans.tolist())
-    return f"fan {names} is" if len(fans) == 1 else f"fans {names} are"
+    def _subject(self, fans: Array) -> str:
+        return f"{self._names.labels(fans.tolist())} {'is' if len(fans) == 1 else 'are'}"
 
 
 def _explanation(reason: int) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from typing import Any
 
+from fantwin.schemas.fan_names import NO_NAMES, FanNames
 from fantwin.schemas.messages import ScorerSnapshot
 from fantwin.scoring.wear.slow_change import LIMIT_SHARE, SlowChange
 
@@ -40,10 +41,19 @@ def wear_in(snapshot: ScorerSnapshot) -> dict[str, Any] | None:
     return wear
 
 
-def wear_rows(tray: str, t_ns: int, wear: dict[str, Any]) -> list[dict[str, Any]]:
-    """A row for each fan with a point, for machines. t_ns: of the snapshot; its seen_t_ns: at which the values hold."""
+def wear_rows(tray: str, t_ns: int, wear: dict[str, Any], names: FanNames = NO_NAMES) -> list[dict[str, Any]]:
+    """A row for each fan with a point, for machines. t_ns: of the snapshot; its seen_t_ns: at which the values hold.
+    names: of the fans."""
     return [
-        {"tray": tray, "fan": number, "parameter": "speed", "unit": "relative", "limit": LIMIT_SHARE, "t_ns": t_ns}
+        {
+            "tray": tray,
+            "fan": number,
+            "name": names.name(number),
+            "parameter": "speed",
+            "unit": "relative",
+            "limit": LIMIT_SHARE,
+            "t_ns": t_ns,
+        }
         | {name: fan[name] for name in _SHOWN}
         for number, fan in enumerate(wear["fans"])
         if fan["seen_t_ns"]

@@ -37,12 +37,12 @@ def is_of_slow_change(note: str) -> bool:
     return note.endswith(WEAR_HINT) or note.startswith(MOST_FANS)
 
 
-def own_change(fan: int, change: float, age_ns: int, beside: float | None) -> str:
-    """The notice about a fan that has changed against the fans beside it. Changes are shares of the speed."""
+def own_change(fan: str, change: float, age_ns: int, beside: float | None) -> str:
+    """The notice about a fan, by its label, that has changed against those beside it. Changes: shares of the speed."""
     hours = age_ns / (3600.0 * NS_PER_S)
     age = f"{hours:.0f} h" if hours < 48.0 else f"{hours / 24.0:.0f} days"
     compared = f", the fans beside it {100 * beside:+.1f} %" if beside is not None else ""
-    return f"fan {fan}: speed {100 * change:+.1f} % in {age}{compared}: {WEAR_HINT}"
+    return f"{fan}: speed {100 * change:+.1f} % in {age}{compared}: {WEAR_HINT}"
 
 
 def shared_change(share: float) -> str:
@@ -54,8 +54,8 @@ def shared_change(share: float) -> str:
     )
 
 
-def limit_ahead(fan: int, others: Sequence[int], change: float, days: Sequence[float]) -> str:
-    """The line about the fan that reaches its limit first, and the others that will.
+def limit_ahead(fan: str, others: str, change: float, days: Sequence[float]) -> str:
+    """The line about the fan that reaches its limit first, and the others that will, as they are shown.
 
     change: so far. days: until the limit is likely reached, at the earliest and at the latest; zeros: it may have been.
     """
@@ -66,5 +66,5 @@ def limit_ahead(fan: int, others: Sequence[int], change: float, days: Sequence[f
     when = f"in about {likely:.0f} {unit} ({earliest:.0f} to {latest:.0f})" if likely > 0.5 else "within a day"
     if not latest:
         reached, when = "it has lost" if change < 0.0 else "it turns faster by", f"about {limit} of its speed"
-    more = f", and fan {', '.join(map(str, others))}" if others else ""
-    return f"fan {fan} is wearing: {reached} {when}; inspect it{more}"
+    more = f", and {others}" if others else ""
+    return f"{fan} is wearing: {reached} {when}; inspect it{more}"

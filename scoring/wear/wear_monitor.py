@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from fantwin.schemas.fan_names import NO_NAMES, FanNames
 from fantwin.schemas.messages import Array
 from fantwin.schemas.units import NS_PER_S
 from fantwin.scoring.saved import Saved
@@ -60,8 +61,9 @@ class WearMonitor(Saved):
         *("joined_variance", "is_over"),
     )
 
-    def __init__(self, fans: int, every_s: float) -> None:
+    def __init__(self, fans: int, every_s: float, names: FanNames = NO_NAMES) -> None:
         """Begin without a point. every_s: interval between the points of a fan."""
+        self._names = names
         self._every_ns = max(1, round(every_s * NS_PER_S))
         # the points of a large tray are not all due at once, which would hold up its scores
         self._settling_ns = SETTLING_INTERVALS * self._every_ns + np.arange(fans) * self._every_ns // fans
@@ -179,7 +181,8 @@ class WearMonitor(Saved):
         if not soon:
             return ""
         (days, fan, change), *others = sorted(soon)
-        return limit_ahead(fan, [other for _, other, _ in others], change, days)
+        more = self._names.labels(sorted(other for _, other, _ in others)) if others else ""
+        return limit_ahead(self._names.label(fan), more, change, days)
 
     def notices(self) -> list[str]:
         """A line on what most fans share, and one for each fan that has changed against the fans beside it."""
@@ -187,7 +190,7 @@ class WearMonitor(Saved):
         for fan in self._changed_fans():
             beside = self._beside(fan)
             age_ns = int(self.t_ns[fan] - self.first_t_ns[fan])
-            lines.append(own_change(fan, float(self.change[fan]), age_ns, beside and beside[0]))
+            lines.append(own_change(self._names.label(fan), float(self.change[fan]), age_ns, beside and beside[0]))
         return lines
 
     def _shared_change(self) -> list[str]:

@@ -75,6 +75,8 @@ def test_states_alarms_and_status_are_retained(tmp_path, broker, listener, start
     eventually(lambda: state_of(listener).get("state") == "normal", "the state is there")
     listener.publish(f"{FAN}/request", '{"action": "acknowledge"}')  # not heard by default
     assert state_of(listener) == {
+        "name": "",
+        "place": "",
         "state": "normal",
         "in_alarm": False,
         "judged": True,

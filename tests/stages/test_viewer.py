@@ -250,9 +250,14 @@ def test_the_file_of_a_fleet_has_the_fans_that_were_drawn_and_one_log(
 @pytest.mark.parametrize(
     ("name", "problem"),
     [
-        ("tray1/x", 'viewer.show: \'tray1/x\' is no fan; write "tray/number", for example "tray1/0"'),
+        ("x", 'viewer.show: \'x\' is no fan; write "tray/fan", for example "tray1/0"'),
+        (
+            "tray1/x",
+            "viewer.show: 'tray1/x': tray tray1: no fan called 'x': the fans have no names; give a number, counted "
+            "from 0",
+        ),
         ("tary1/0", "viewer.show: 'tary1/0': no tray called 'tary1'; did you mean 'tray1'?"),
-        ("tray1/3", "viewer.show: 'tray1/3': tray1 has fans 0 to 2"),
+        ("tray1/3", "viewer.show: 'tray1/3': fan 3: tray tray1 has fans 0 to 2"),
     ],
 )
 def test_a_fan_to_show_that_does_not_exist_is_a_one_line_error(tmp_path: Path, name: str, problem: str) -> None:

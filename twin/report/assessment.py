@@ -207,6 +207,8 @@ def _biased(fan: FanSummary) -> bool:
 def _these(fans: Sequence[FanSummary], content: Summary) -> str:
     if len(content.fans) == 1:
         return "this fan"
+    if any(fan.label != f"fan {fan.number}" for fan in fans):
+        return ", ".join(fan.label for fan in fans)
     return ("fan " if len(fans) == 1 else "fans ") + ", ".join(str(fan.number) for fan in fans)
 
 

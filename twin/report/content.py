@@ -43,12 +43,13 @@ class Parameter:
 
 @dataclass(frozen=True, eq=False)
 class FanSummary:
-    """One fan without its samples. row: of the twin. number: as the recordings count fans. fastest_rad_s: the largest
-    measured speed. missing_share, outside_share: of the samples without a speed, and with a command outside the trained
-    range. error_std_rad_s: of the free-run errors that are finite; NaN without any."""
+    """One fan without its samples. row: of the twin. number, label: as the recordings call it. fastest_rad_s: the
+    largest measured speed. missing_share, outside_share: of the samples without a speed, and with a command outside the
+    trained range. error_std_rad_s: of the free-run errors that are finite; NaN without any."""
 
     row: int
     number: int
+    label: str
     figures: Figures
     sigma_rad_s: float
     fastest_rad_s: float
@@ -118,8 +119,10 @@ def summary_of(
     recordings: Sequence[DataCard],
     unit: SpeedUnit,
     fan_numbers: Sequence[int] | None = None,
+    labels: Sequence[str] | None = None,
 ) -> Summary:
-    """What is assessed, from the sums over recordings of this extent. recordings, fan_numbers: as of report_content.
+    """What is assessed, from the sums over recordings of this extent. recordings, fan_numbers, labels: as of
+    report_content.
 
     Raises TwinError when the fans do not fit.
     """
@@ -127,7 +130,7 @@ def summary_of(
     fans = len(evaluation.per_fan)
     residuals = analysis_of(sums.residual, extent.grid)
     error_std_rad_s = sums.by_speed.error_std_rad_s()
-    rows = fan_rows(card, fans, fan_numbers)
+    rows, numbers = fan_rows(card, fans, fan_numbers), fan_numbers or range(fans)
     return Summary(
         twin=twin,
         unit=unit,
@@ -137,7 +140,8 @@ def summary_of(
         fans=tuple(
             FanSummary(
                 row=row,
-                number=fan_numbers[fan] if fan_numbers is not None else fan,
+                number=number,
+                label=labels[fan] if labels else f"fan {number}",
                 figures=evaluation.per_fan[fan],
                 sigma_rad_s=float(card.sigma_rad_s[row]),
                 fastest_rad_s=float(sums.fastest_rad_s[fan]),
@@ -148,7 +152,7 @@ def summary_of(
                 residual=residuals[fan],
                 by_speed=sums.by_speed.bins(fan, extent.range_rad_s[:, fan]),
             )
-            for fan, row in enumerate(rows)
+            for fan, (row, number) in enumerate(zip(rows, numbers, strict=True))
         ),
     )
 
@@ -159,8 +163,10 @@ def report_content(
     recordings: Sequence[DataCard],
     unit: SpeedUnit,
     fan_numbers: Sequence[int] | None = None,
+    labels: Sequence[str] | None = None,
 ) -> Content:
     """Run the twin over the runs. recordings: the files that the runs came from. fan_numbers: see build.runs_of_twin.
+    labels: of its columns, what people call them; None: by their numbers.
 
     Raises TwinError when the twin does not fit the runs, or there is nothing to evaluate.
     """
@@ -168,7 +174,7 @@ def report_content(
     pieces = tuple(evaluation_pieces(of.runs))
     free_runs = [free_run_of_piece(of.model, of.parameters, piece) for piece in pieces]
     sums = reduce(add, (sums_of_free_run(of, each, extent) for each in free_runs))
-    summary = summary_of(twin, sums, extent, recordings, unit, fan_numbers)
+    summary = summary_of(twin, sums, extent, recordings, unit, fan_numbers, labels)
     command, measured = (
         np.concatenate([getattr(piece, name) for piece in pieces]) for name in ("command", "speed_rad_s")
     )

@@ -155,7 +155,7 @@ class _Tables:
             "speed_unit": self._metadata.speed_unit(block.tray),
             "exported_by": f"fantwin {version('fantwin')}",
         }
-        file = open_table(self._form, self._folder / path.name, block.topic, about)
+        file = open_table(self._form, self._folder / path.name, block.topic, about, self._metadata.names(block.tray))
         self.begun[path] = _Table(of, path, file)
         return self.begun[path]
 

@@ -24,7 +24,7 @@ from fantwin.pipeline.recordings.clips.clip import clip_lines
 from fantwin.pipeline.recordings.contents import contents_of, continuity, losses_of, messages_as_text
 from fantwin.pipeline.recordings.dates import format_clock, format_local
 from fantwin.pipeline.recordings.metadata import CONFIGURATION
-from fantwin.pipeline.recordings.reading import left_out_of, read_recording
+from fantwin.pipeline.recordings.reading import NAMES_KEY, left_out_of, read_recording
 from fantwin.pipeline.recordings.records import active_path
 from fantwin.pipeline.recordings.repair import recover as recover_file
 from fantwin.pipeline.recordings.run_recordings import RECORDING_KEY, recorded_files
@@ -32,6 +32,7 @@ from fantwin.pipeline.recordings.scan import NO_LOSS, STILL_WRITTEN, Contents
 from fantwin.pipeline.recordings.sequence_ledger import StreamCounts, sum_by_key
 from fantwin.pipeline.site.loss_accounting import label, losses, refused, refused_lines
 from fantwin.pipeline.site.stage_states import note_lines, notes_as_json
+from fantwin.schemas.fan_names import FanNames
 from fantwin.schemas.health import Health
 from fantwin.schemas.messages import Raw
 from fantwin.schemas.streams import StreamId
@@ -235,6 +236,8 @@ def _about(part: Contents) -> list[str]:
         lines.append(f"  reason: {reason}")
     for tray in filter(None, metadata.get("trays", "").split(",")):
         fans = f", {metadata[f'fans.{tray}']} fans" if f"fans.{tray}" in metadata else ""
+        names = FanNames.from_json(metadata.get(f"{NAMES_KEY}.{tray}", "")).all_in_words()
+        fans += f" ({names})" if names else ""
         lines.append(
             f"tray {tray}{fans}, speeds in {metadata.get(f'speed_unit.{tray}') or metadata.get('speed_unit', 'rad/s')}"
         )

@@ -24,6 +24,7 @@ from fantwin.pipeline.recordings.records import active_path
 from fantwin.pipeline.recordings.run_recordings import describe, recorded_files, recordings_of
 from fantwin.pipeline.replay.offline.comparison import RELATIVE
 from fantwin.pipeline.replay.offline.outcome import Again, score_again, together
+from fantwin.schemas.fan_names import fan_cell, fan_label
 from fantwin.schemas.messages import Diagnosis
 from fantwin.schemas.units import NS_PER_S
 from fantwin.scoring.alarms.alarm_text import deviation_in
@@ -220,8 +221,9 @@ def _print_alarms(console: Console, title: str, alarms: Sequence[dict[str, Any]]
         cleared = "active" if one["cleared_ns"] is None else f"{(one['cleared_ns'] - start_ns) / NS_PER_S:.2f}"
         first = "\n".join(most_probable([Diagnosis(**each) for each in one["causes"]])) or "-"
         # the message also names fan and first cause; both have columns of their own, with the newest cause
-        what = deviation_in(one["message"], one["fan"])
-        table.add_row(one["tray"], str(one["fan"]), raised, cleared, one["severity"], first, escape(what))
+        fan = one["fan"], one["name"]
+        what = deviation_in(one["message"].removeprefix(f"{fan_label(*fan)}: "))
+        table.add_row(one["tray"], escape(fan_cell(*fan)), raised, cleared, one["severity"], first, escape(what))
     console.print(table)
     if len(alarms) > _SHOWN:
         console.print(f"and {len(alarms) - _SHOWN} more; all with --json")

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from fantwin.pipeline.cli.options import JsonOption, ViewLayout, fan_numbers
+from fantwin.pipeline.cli.options import JsonOption, ViewLayout, fan_numbers, recorded_names
 from fantwin.pipeline.cli.printing import show
 from fantwin.pipeline.cli.progress import working
 from fantwin.pipeline.errors import UsageError, UserError
@@ -55,7 +55,7 @@ def view(
 
     Example: fantwin view runs/demo/recording.mcap --truth runs/demo/truth.json -o bands.png
     """
-    is_plot, chosen = output.suffix in PLOTS, fan_numbers(fans)
+    is_plot, chosen = output.suffix in PLOTS, fan_numbers(fans, recorded_names(files, tray))
     if unit not in ("rpm", "rad/s", None):
         raise UsageError(f"--unit {unit}: no such unit of speed; known: rpm, rad/s")
     if output.suffix not in (".rrd", *PLOTS):
@@ -67,9 +67,10 @@ def view(
         if is_plot:
             from fantwin.pipeline.outputs.rerun.band_plot import plot_recording  # noqa: PLC0415  an extra
 
-            drawn, unread = plot_recording(scored.files, output, tray=tray, fans=chosen, speed_unit=unit, truth=truth)
+            drawn, shown, unread = plot_recording(
+                scored.files, output, tray=tray, fans=chosen, speed_unit=unit, truth=truth
+            )
             result: dict[str, Any] = {"plot": str(output), "fans": drawn}
-            shown = f"fans {', '.join(map(str, drawn))}"
         else:
             from fantwin.pipeline.outputs.rerun.recorded_view import recorded_site, write_view  # noqa: PLC0415  an extra
             from fantwin.pipeline.outputs.rerun.rerun_sink import ViewOptions  # noqa: PLC0415

@@ -10,10 +10,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.markup import escape
 from rich.table import Table
 
 from fantwin.pipeline.cli.in_parallel import JobsOption, RecordingsInParallel, SkipBadOption
-from fantwin.pipeline.cli.options import JsonOption, fan_numbers
+from fantwin.pipeline.cli.options import JsonOption, fan_numbers, recorded_names
 from fantwin.pipeline.cli.printing import table_of
 from fantwin.pipeline.cli.progress import interruptible
 from fantwin.pipeline.cli.twins.data_options import (
@@ -34,6 +35,7 @@ from fantwin.pipeline.learning.training_data import (
     read_recording_data,
     twin_errors,
 )
+from fantwin.schemas.fan_names import fan_cell
 
 if TYPE_CHECKING:
     from fantwin.twin.evaluation.accuracy import Evaluation
@@ -71,7 +73,7 @@ def evaluate(
     Example: fantwin evaluate TWIN.onnx held-out.mcap --rate 20 --rate irregular --json
     """
     grids: list[Grid] = [_grid(text) for text in rate or []]
-    part = Part(tray, fan_numbers(fans), from_s, to_s)
+    part = Part(tray, fan_numbers(fans, recorded_names(recordings, tray)), from_s, to_s)
     pool = RecordingsInParallel(jobs, skip_bad)
     with interruptible("nothing was evaluated"), twin_errors(), pool:
         # The command line loads twin only when it is needed.
@@ -87,7 +89,7 @@ def evaluate(
         work = partial(_sums_of, part=part, twin=twin, extent=extent, grids=grids)
         sums, *on_grids = reduce(_added, pool.map(work, recordings, "evaluating"))
         unit = SpeedUnit(about.speed_unit, about.rad_s_per_unit)
-        summary = summary_of(loaded, sums, extent, data_cards(about), unit, part.fans)
+        summary = summary_of(loaded, sums, extent, data_cards(about), unit, part.fans, about.labels)
         assessment = assess(summary)
     result = as_json(
         summary, assessment, [(grid, of.evaluation()) for grid, of in zip(grids, on_grids, strict=True)], about
@@ -132,7 +134,9 @@ def as_json(
     def figures_of(evaluation: Evaluation) -> dict[str, Any]:
         by_fan = zip(about.fans, evaluation.per_fan, strict=True)
         return figures_in(evaluation.pooled, scale) | {
-            "fans": [{"fan": number} | figures_in(fan, scale) for number, fan in by_fan]
+            "fans": [
+                {"fan": number, "name": about.names.name(number)} | figures_in(fan, scale) for number, fan in by_fan
+            ]
         }
 
     result = figures_of(summary.evaluation)
@@ -184,7 +188,7 @@ def _fan_table(result: dict[str, Any]) -> Table:
     for figures in result["fans"]:
         residual = figures["residual"]
         tests = (_probability(residual["ljung_box_p"]), shown(residual["cross_over_bound"], ".1f", "-"))
-        table.add_row(str(figures["fan"]), *_cells(figures), *tests)
+        table.add_row(escape(fan_cell(figures["fan"], figures["name"])), *_cells(figures), *tests)
     if len(result["fans"]) > 1:
         table.add_row("all", *_cells(result), "", "")
     return table

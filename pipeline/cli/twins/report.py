@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.markup import escape
 from rich.table import Table
 
 from fantwin.pipeline.cli.in_parallel import JobsOption, RecordingsInParallel, SkipBadOption
-from fantwin.pipeline.cli.options import JsonOption, fan_numbers
+from fantwin.pipeline.cli.options import JsonOption, fan_numbers, recorded_names
 from fantwin.pipeline.cli.printing import table_of
 from fantwin.pipeline.cli.progress import interruptible, training_progress, working
 from fantwin.pipeline.cli.twins.data_options import (
@@ -33,6 +34,7 @@ from fantwin.pipeline.extras import require
 from fantwin.pipeline.files import write_whole
 from fantwin.pipeline.learning.drops_found import drops_found
 from fantwin.pipeline.learning.training_data import Part, TrainingData, data_cards, read_training_data, twin_errors
+from fantwin.schemas.fan_names import fan_cell
 
 if TYPE_CHECKING:
     from fantwin.twin.fitting.identification import Identification
@@ -78,7 +80,14 @@ def report(
     twins = [file for file in files if file.suffix == ".onnx"]
     if not recordings or len(twins) > 1:
         raise UsageError("name recordings, and at most one twin: fantwin report [TWIN.onnx] REC.mcap...")
-    part = Part(tray, fan_numbers(fans), from_s, to_s, tuple(window_s or ()), ignored_columns(ignore))
+    part = Part(
+        tray,
+        fan_numbers(fans, recorded_names(recordings, tray)),
+        from_s,
+        to_s,
+        tuple(window_s or ()),
+        ignored_columns(ignore),
+    )
     pool = RecordingsInParallel(jobs, skip_bad)
     if twins:
         if window_s or ignore:
@@ -107,7 +116,9 @@ def _write_page(
         report_damage(training_data)
         unit = SpeedUnit(training_data.speed_unit, training_data.rad_s_per_unit)
         with working(f"drawing {output}"):
-            content = report_content(loaded, training_data.runs, data_cards(training_data), unit, part.fans)
+            content = report_content(
+                loaded, training_data.runs, data_cards(training_data), unit, part.fans, training_data.labels
+            )
             assessment = assess(content)
             drops = drops_found(twin, training_data.rad_s_per_unit)
             alarms = [drop.line(unit.name) for drop in drops] or ["alarms are not calibrated: fantwin calibrate"]
@@ -118,6 +129,7 @@ def _write_page(
     by_fan = [
         {
             "fan": fan.number,
+            "name": training_data.names.name(fan.number),
             **figures_in(fan.figures, training_data.rad_s_per_unit),
             "sigma": fan.sigma_rad_s / training_data.rad_s_per_unit,
             "assessment": level_of(fan),
@@ -177,6 +189,7 @@ def fans_as_json(at_reference: AtReference, training_data: TrainingData) -> dict
     fans = [
         {
             "fan": training_data.fans[fan],
+            "name": training_data.names.name(training_data.fans[fan]),
             **dict(zip(PARAMETER_NAMES, found.parameters[fan].tolist(), strict=True)),
             **{f"{name}_95": _interval(found, fan, k) for k, name in enumerate(PARAMETER_NAMES)},
             "covariance": found.covariance[fan].tolist(),
@@ -213,7 +226,7 @@ def _table(result: dict[str, Any]) -> Table:
     for fan in result["fans"]:
         values = [_with_interval(fan[name], fan[f"{name}_95"]) for name in mechanical]
         figures = (f"{fan['time_constant_s']:.3g}", f"{fan['rmse']:.4g}", f"{fan['lambda_per_s']:.3g}")
-        table.add_row(str(fan["fan"]), *values, _lag(fan), *figures)
+        table.add_row(escape(fan_cell(fan["fan"], fan["name"])), *values, _lag(fan), *figures)
     return table
 
 

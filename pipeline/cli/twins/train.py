@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from fantwin.pipeline.cli.in_parallel import JobsOption, RecordingsInParallel, SkipBadOption
-from fantwin.pipeline.cli.options import JsonOption, fan_numbers
+from fantwin.pipeline.cli.options import JsonOption, fan_numbers, recorded_names
 from fantwin.pipeline.cli.progress import interruptible, training_progress
 from fantwin.pipeline.cli.twins.data_options import (
     FansOption,
@@ -117,7 +117,14 @@ def train(
     Example: fantwin train new-tray.mcap --type type.onnx -o new-tray.onnx
     """
     given = TrainingSettings(model, seed, trainer, iterations, networks, command_unit)
-    part = Part(tray, fan_numbers(fans), from_s, to_s, tuple(window_s or ()), ignored_columns(ignore))
+    part = Part(
+        tray,
+        fan_numbers(fans, recorded_names(recordings, tray)),
+        from_s,
+        to_s,
+        tuple(window_s or ()),
+        ignored_columns(ignore),
+    )
     if type_twin and (given != DEFAULT_SETTINGS or window_s or ignore):
         raise UsageError("--type keeps the network of the type: leave out the options of a model and of its training")
     not_written = "no twin was written; --iterations N ends after N iterations of each network and writes one"

@@ -138,7 +138,7 @@ def alarm_lines(current: CurrentAlarm, now: str = "") -> Text:
     words += [f"now {now}"] if now else []
     style = STYLES.get(alarm.severity, "bold red") if is_presented(alarm) else "dim"
     text = Text.assemble(
-        (f"{alarm.header.tray} fan {alarm.fan}  {alarm.severity.name:7}", style), f"  {', '.join(words)}"
+        (f"{alarm.header.tray} {alarm.label}  {alarm.severity.name:7}", style), f"  {', '.join(words)}"
     )
     if alarm.severity != Severity.NONE:
         lasted = duration_text(max(0, time.time_ns() - alarm.onset_t_ns) / NS_PER_S)
@@ -157,12 +157,12 @@ def _transition_line(alarm: Alarm) -> Text:
     by = f" by {alarm.operator_name}" if alarm.operator_name else ""
     why = f"  {probable(alarm.causes)}" if alarm.causes else ""
     return Text.assemble(
-        f"{clock(alarm.t_ns)}  {alarm.header.tray} fan {alarm.fan}  {alarm.severity.name:7}  ",
+        f"{clock(alarm.t_ns)}  {alarm.header.tray} {alarm.label}  {alarm.severity.name:7}  ",
         (
             f"{alarm.transition.name.replace('_', ' ')}{by}",
             STYLES.get(alarm.severity, "bold red") if alarm.active else "",
         ),
-        f"{why}  {alarm.message.removeprefix(f'fan {alarm.fan}: ').removeprefix('refused: ')}",
+        f"{why}  {alarm.about.removeprefix('refused: ')}",
     )
 
 
@@ -210,7 +210,7 @@ def _line(alarm: Episode) -> Text:
     reason = f": {alarm.feedback_reason}" if alarm.feedback_reason else ""
     is_marked = alarm.feedback != Feedback.NONE
     return Text.assemble(
-        f"{format_local(alarm.onset_ns)}  {alarm.tray} fan {alarm.fan}  ",
+        f"{format_local(alarm.onset_ns)}  {alarm.tray} {alarm.label}  ",
         (f"{alarm.severity.upper():7}", STYLES[Severity[alarm.severity.upper()]]),
         f"  {lasted}{causes}  ",
         (f"{alarm.feedback.words}{by}{reason}" if is_marked else "not marked", "bold" if is_marked else ""),

@@ -57,7 +57,9 @@ def alarms(
         OperatorAction | None, typer.Argument(metavar="ACTION", help=f"{', '.join(OperatorAction)}.")
     ] = None,
     tray: Annotated[str | None, typer.Argument(help="The tray.")] = None,
-    fan: Annotated[int | None, typer.Argument(help="The fan, counted from 0; all fans if omitted.")] = None,
+    fan: Annotated[
+        str | None, typer.Argument(help="The fan: its name, or its number, counted from 0; all fans if omitted.")
+    ] = None,
     config: ConfigOption = DEFAULT_CONFIG,
     duration: Annotated[
         str | None, typer.Option("--for", metavar="TIME", help="How long to shelve: 90s, 30m, 8h or 2d.")
@@ -140,20 +142,19 @@ def alarms(
     with join_bus(settings, listens=False, roles=(OPERATOR,)) as bus:
         watcher = SiteWatcher(bus, settings.site, roles_of(settings))
         wait_for_stages(bus, watcher, settings, stop, tray=name)
-        fans = set(range(settings.tray(name).fans)) if number < 0 else {number}
-        answers = ask(bus, settings.site, name, request, fans, timeout_s, stop, watcher)
+        of = settings.tray(name)
+        fans = set(range(of.fans)) if number < 0 else {number}
+        answers = ask(bus, settings.site, name, request, fans, timeout_s, stop, watcher, of.names)
     _report(asked, name, answers, json_output)
 
 
-def _named(config: Config, asked: OperatorAction, tray: str | None, fan: int | None) -> tuple[int, str]:
+def _named(config: Config, asked: OperatorAction, tray: str | None, fan: str | None) -> tuple[int, str]:
     """The number of the fan, -1 for all, and the tray."""
     names = ", ".join(each.name for each in config.trays)
     if tray is None:
         raise UsageError(f"name a tray: fantwin alarms {asked} TRAY [FAN] (trays: {names})")
-    fans = config.tray(tray).fans
-    if fan is not None and not 0 <= fan < fans:
-        raise UsageError(f"fan {fan}: tray {tray} has fans 0 to {fans - 1}")
-    return -1 if fan is None else fan, tray
+    chosen = config.tray(tray)
+    return -1 if fan is None else chosen.fan_called(fan), tray
 
 
 def _seconds(asked: OperatorAction, duration: str | None) -> float:
@@ -202,4 +203,4 @@ def _report(asked: OperatorAction, tray: str, answers: list[Alarm], json_output:
 
 
 def _granted(alarm: Alarm) -> str:
-    return f"fan {alarm.fan}: shelved {until(alarm)}" if alarm.transition == Transition.SHELVED else alarm.message
+    return f"{alarm.label}: shelved {until(alarm)}" if alarm.transition == Transition.SHELVED else alarm.message

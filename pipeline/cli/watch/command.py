@@ -33,7 +33,8 @@ from fantwin.pipeline.runtime.signals import stop_on_signals
 
 def command(
     fan: Annotated[
-        tuple[int, float] | None, typer.Option("--fan", metavar="N VALUE", help="The fan and its command.")
+        tuple[str, float] | None,
+        typer.Option("--fan", metavar="FAN VALUE", help="The fan, by its name or number, and its command."),
     ] = None,
     config: ConfigOption = DEFAULT_CONFIG,
     tray: Annotated[str | None, typer.Option(help="The tray; required if there are several.")] = None,
@@ -46,7 +47,9 @@ def command(
     sweep: Annotated[
         bool, typer.Option("--sweep", help="Move the fans over their range instead, for a recording to train on.")
     ] = False,
-    fans: Annotated[str, typer.Option(metavar="all|N,N,...", help="With --sweep: the fans that are moved.")] = "all",
+    fans: Annotated[
+        str, typer.Option(metavar="all|FAN,FAN,...", help="With --sweep: the fans that are moved.")
+    ] = "all",
     low: LowOption = None,
     high: HighOption = None,
     safe: SafeOption = None,
@@ -68,7 +71,7 @@ def command(
     Example: fantwin command --sweep --low 0.2
     """
     if (fan is None) is not sweep:
-        raise UsageError("say what to send: --fan N VALUE, or --sweep")
+        raise UsageError("say what to send: --fan FAN VALUE, or --sweep")
     settings = load_config(config, overrides or (), stages=())
     chosen = chosen_tray(settings, tray)
     if fan is None:
@@ -77,7 +80,7 @@ def command(
         move(settings, chosen, fans, low, high, safe, rounds, json_output=json_output)
         return
     require_commandable(chosen, "")
-    number, value = fan
+    number, value = chosen.fan_called(fan[0]), fan[1]
     message = command_of(chosen, {number: value}, is_set_point=set_point)
     stop = stop_on_signals()
     with join_bus(settings, listens=False, roles=(OPERATOR,)) as bus:
@@ -86,7 +89,14 @@ def command(
         sender.send(message)
         sender.confirm()
     kind, unit = ("set-point", f" {chosen.speed_unit}") if set_point else ("command", "")
-    found = {"tray": chosen.name, "fan": number, "kind": kind, "value": value, "unit": unit.strip()}
-    show(found, f"{chosen.name}, fan {number}: {kind} {value:g}{unit} sent", json_output=json_output)
+    found = {
+        "tray": chosen.name,
+        "fan": number,
+        "name": chosen.names.name(number),
+        "kind": kind,
+        "value": value,
+        "unit": unit.strip(),
+    }
+    show(found, f"{chosen.name}, {chosen.label(number)}: {kind} {value:g}{unit} sent", json_output=json_output)
     if not set_point and (note := share_note(chosen, value)):
         typer.echo(note, err=True)

@@ -183,7 +183,7 @@ def _line(tray: TrayConfig, watcher: SiteWatcher) -> str:
     if not watcher.model.trays_now():
         return "waiting for the first score"
     states = [watcher.model.fan_now(Fan(tray.name, fan)).state for fan in range(tray.fans)]
-    notable = (f"fan {fan} {state}" for fan, state in enumerate(states) if state != FanState.NORMAL.words)
+    notable = (f"{tray.label(fan)} {state}" for fan, state in enumerate(states) if state != FanState.NORMAL.words)
     said = f"all fans {states[0]}" if len(set(states)) == 1 else ", ".join(notable)
     return f"{said}; lost {sum(watcher.losses().values())}"
 

@@ -156,8 +156,7 @@ def _ranges(command: Array, speed_rad_s: Array, tray: TrayConfig, twin: TrayTwin
     per_unit = RAD_S_PER_UNIT[tray.speed_unit]
     silent = np.flatnonzero(~np.isfinite(speed_rad_s).any(axis=0)).tolist()
     if silent:
-        names = ", ".join(map(str, silent))
-        yield False, f"no speed of fan {names}: is its tacho connected?"
+        yield False, f"no speed of {tray.names.labels(silent)}: is its tacho connected?"
     low, high = float(command.min()), float(command.max())
     if twin and not (twin.card.command_range[0] <= high and low <= twin.card.command_range[1]):
         known = "{:g} to {:g}".format(*twin.card.command_range)
@@ -180,20 +179,15 @@ def _ranges(command: Array, speed_rad_s: Array, tray: TrayConfig, twin: TrayTwin
 
 def _tachos(t_s: Array, speed_rad_s: Array, tray: TrayConfig) -> Iterator[Finding]:
     """Whether the readings are those of the declared tachos. t_s: (n,). speed_rad_s: (n, fans)."""
-    hints = tacho_hints(t_s, speed_rad_s, tray.tachos, range(tray.fans))
+    hints = tacho_hints(t_s, speed_rad_s, tray.tachos, range(tray.fans), tray.names)
     for hint in hints:
         yield False, hint
-    seen = [find_tacho(t_s, readings) is not None for readings in speed_rad_s.T]
-    if any(seen) and not hints:
-        yield True, f"tachos of {_fans(seen)}: they read as declared"
-    if not all(seen) and (hints or (tray.tacho is None and not tray.stated_tachos)):
-        unseen = f"{_fans([not one for one in seen])}: not shown whether the tacho counts"
+    seen = np.array([find_tacho(t_s, readings) is not None for readings in speed_rad_s.T])
+    if seen.any() and not hints:
+        yield True, f"tachos of {tray.names.labels(np.flatnonzero(seen).tolist())}: they read as declared"
+    if not seen.all() and (hints or (tray.tacho is None and not tray.stated_tachos)):
+        unseen = f"{tray.names.labels(np.flatnonzero(~seen).tolist())}: not shown whether the tacho counts"
         yield True, f"{unseen}; listen while the speeds change: --listen-s {LISTEN_FOR_TACHOS_S}"
-
-
-def _fans(chosen: Sequence[bool]) -> str:
-    numbers = [str(fan) for fan, is_chosen in enumerate(chosen) if is_chosen]
-    return f"fan{'s' * (len(numbers) > 1)} {', '.join(numbers)}"
 
 
 def _speeds(speed_rad_s: Array, unit: SpeedUnit) -> str:

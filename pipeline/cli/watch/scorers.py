@@ -14,6 +14,7 @@ from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.site.one_line import readable_alarm
 from fantwin.pipeline.site.site_watcher import SiteWatcher
 from fantwin.schemas.codec import CodecError, decode, encode, type_name
+from fantwin.schemas.fan_names import NO_NAMES, FanNames
 from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Alarm, Request
 from fantwin.schemas.topics import BY_NAME, alive_key, tray_key
@@ -70,8 +71,9 @@ def ask(
     timeout_s: float,
     stop: threading.Event,
     watcher: SiteWatcher,
+    names: FanNames = NO_NAMES,
 ) -> list[Alarm]:
-    """Publish a request and return the answers for `fans`, in the order of their numbers.
+    """Publish a request and return the answers for `fans`, in the order of their numbers. names: of the tray's fans.
 
     The stages must have been discovered before, or the request may reach none of them. `watcher` knows whose answers
     count: those of the session that owns the scorer.
@@ -91,9 +93,9 @@ def ask(
     until_s = time.monotonic() + timeout_s
     while set(answers) < fans:
         if time.monotonic() > until_s or stop.is_set():
-            missing = ", ".join(map(str, sorted(fans - set(answers))))
+            missing = names.labels(sorted(fans - set(answers)))
             raise UserError(
-                f"tray {tray}: no answer for fan {missing} within {timeout_s:g} s: perhaps no scorer runs, "
+                f"tray {tray}: no answer for {missing} within {timeout_s:g} s: perhaps no scorer runs, "
                 "for example because the tray has no twin yet: see `fantwin status`"
             )
         try:

@@ -236,7 +236,7 @@ def _alarm_line(current: CurrentAlarm, now: str) -> Text:
     style = STYLES.get(alarm.severity, "bold red") if alarm.active else "green"
     text = Text.assemble(
         (f"{clock(alarm.t_ns)}  {alarm.severity.name:7}", style if is_presented(alarm) else "dim"),
-        f"  {alarm.header.tray}  fan {alarm.fan}: {', '.join(current.states())}",
+        f"  {alarm.header.tray}  {alarm.label}: {', '.join(current.states())}",
     )
     about = current.about()
     if now:

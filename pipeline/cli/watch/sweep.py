@@ -56,7 +56,7 @@ def sweep(
         typer.Exit: the user stopped it.
     """
     require_commandable(chosen, "run `fantwin up` while the fans' own controller varies their commands; it is recorded")
-    numbers = fan_numbers(None if fans == "all" else fans) or list(range(chosen.fans))
+    numbers = fan_numbers(None if fans == "all" else fans, lambda: chosen.names) or list(range(chosen.fans))
     if not all(0 <= number < chosen.fans for number in numbers):
         raise UsageError(f"--fans {fans}: tray {chosen.name} has fans 0 to {chosen.fans - 1}")
     lowest, highest = range_within(chosen, low, high, safe)
@@ -76,23 +76,23 @@ def sweep(
             raise UserError(f"another sweep moves the fans of tray {chosen.name}: wait until it has ended")
         bus.declare_alive(key)
         at_end = {fan: float(before[fan]) if safe is None else safe for fan in numbers}
-        left_at = _in_words(at_end)
+        left_at = _in_words(chosen, at_end)
         progress(_range_in_words(chosen, lowest, highest))
         if low is None and lowest > chosen.command_min:
             progress(f"the lowest command should keep fans turning; --low {chosen.command_min:g} uses the whole range")
         progress(f"at the end and after Ctrl-C the fans get these commands: {left_at}")
         is_stopped, constants_s, ended = False, dict[int, float](), ""
         try:
-            constants_s = Excitation(line, numbers, lowest, highest, rounds, progress).run()
+            constants_s = Excitation(line, numbers, lowest, highest, rounds, progress, chosen.names).run()
         except StoppedError:
             is_stopped = True
         except UserError as error:
             ended = f"the sweep has ended: {error}"
             raise UserError(f"{ended}; the fans are left at these commands: {left_at}") from error
         finally:
-            _leave(line, at_end, ended)
+            _leave(line, chosen, at_end, ended)
     known = {str(fan): value if math.isfinite(value) else None for fan, value in constants_s.items()}
-    found = {"tray": chosen.name, "time_constants_s": known, "steps": steps}
+    found = {"tray": chosen.name, "names": list(chosen.names.names), "time_constants_s": known, "steps": steps}
     found |= {"left_at": {str(fan): value for fan, value in at_end.items()}, "stopped": is_stopped}
     end = "stopped" if is_stopped else "done"
     show(found, f"{end}; the fans are left at these commands: {left_at}", json_output=json_output)
@@ -138,7 +138,7 @@ def _range_in_words(tray: TrayConfig, lowest: float, highest: float) -> str:
     return f"tray {tray.name}: commands from {lowest:g} to {highest:g}, {low:.0%} to {high:.0%} of its range"
 
 
-def _leave(line: _BusLine, at_end: Mapping[int, float], ended: str) -> None:
+def _leave(line: _BusLine, tray: TrayConfig, at_end: Mapping[int, float], ended: str) -> None:
     """Send the safe commands, whatever happened before: together, or one by one if that fails. ended: why the sweep has
     ended; empty if it was done or stopped by the user.
 
@@ -158,14 +158,14 @@ def _leave(line: _BusLine, at_end: Mapping[int, float], ended: str) -> None:
             except UserError as error:
                 failed[fan] = str(error)
     if failed:
-        by_hand = _in_words({fan: at_end[fan] for fan in failed})
+        by_hand = _in_words(tray, {fan: at_end[fan] for fan in failed})
         reasons = "; ".join(dict.fromkeys(failed.values()))
         kept = f"THESE FANS KEEP THE LAST COMMAND; send these by hand: {by_hand} ({reasons})"
         raise UserError("; ".join(filter(None, (kept, ended))))
 
 
-def _in_words(commands: Mapping[int, float]) -> str:
-    return ", ".join(f"fan {fan} {value:g}" for fan, value in commands.items())
+def _in_words(tray: TrayConfig, commands: Mapping[int, float]) -> str:
+    return ", ".join(f"{tray.label(fan)} {value:g}" for fan, value in commands.items())
 
 
 class _BusLine:

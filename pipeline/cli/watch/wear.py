@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -20,10 +20,11 @@ from fantwin.pipeline.config.roles import roles_of
 from fantwin.pipeline.config.settings import Config
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.recordings.dates import format_local, has_date
-from fantwin.pipeline.recordings.reading import read_recording
+from fantwin.pipeline.recordings.reading import read_metadata, read_recording
 from fantwin.pipeline.runtime.signals import stop_on_signals
 from fantwin.pipeline.site.site_watcher import SiteWatcher
 from fantwin.schemas.codec import CodecError, decode
+from fantwin.schemas.fan_names import NO_NAMES, FanNames
 from fantwin.schemas.messages import ScorerSnapshot
 from fantwin.schemas.topics import tray_key
 from fantwin.schemas.units import NS_PER_S
@@ -50,7 +51,7 @@ def show_wear_of_site(settings: Config, *, json_output: bool) -> None:
         heard = [(key, snapshot) for key, payload in answers for snapshot in _decoded(payload)]
         snapshots = [snapshot for key, snapshot in heard if watcher.counts(key, snapshot.header.producer)]
     nothing = "no scorer has recorded wear so far: it does so regularly; try again later"
-    _show(snapshots, nothing, json_output=json_output)
+    _show(snapshots, {tray.name: tray.names for tray in settings.trays}, nothing, json_output=json_output)
 
 
 def show_recorded_wear(recordings: Sequence[Path], *, json_output: bool) -> None:
@@ -60,19 +61,21 @@ def show_recorded_wear(recordings: Sequence[Path], *, json_output: bool) -> None
         UserError: nothing is known.
         typer.Exit: 3, a recording could not be read in full.
     """
-    snapshots, damage = _recorded(recordings)
+    snapshots, names, damage = _recorded(recordings)
     nothing = f"no wear in {', '.join(map(str, recordings))}: a scorer records it regularly and when it stops"
-    _show(snapshots, nothing, json_output=json_output)
+    _show(snapshots, names, nothing, json_output=json_output)
     for line in damage:
         typer.echo(line, err=True)
     if damage:
         raise typer.Exit(3)
 
 
-def _show(snapshots: Sequence[ScorerSnapshot], nothing: str, *, json_output: bool) -> None:
+def _show(
+    snapshots: Sequence[ScorerSnapshot], names: Mapping[str, FanNames], nothing: str, *, json_output: bool
+) -> None:
     latest = {each.header.tray: each for each in sorted(snapshots, key=lambda each: (each.t_ns, each.header.sequence))}
     last = [(tray, snapshot.t_ns, wear_in(snapshot)) for tray, snapshot in sorted(latest.items())]
-    found = [(tray, t_ns, wear) for tray, t_ns, wear in last if wear is not None]
+    found = [(tray, t_ns, wear, names.get(tray, NO_NAMES)) for tray, t_ns, wear in last if wear is not None]
     if not found:
         raise UserError(nothing)
     rows = [row for each in found for row in wear_rows(*each)]
@@ -82,14 +85,16 @@ def _show(snapshots: Sequence[ScorerSnapshot], nothing: str, *, json_output: boo
     show({"wear": rows}, *(_table(*each) for each in found), json_output=json_output)
 
 
-def _recorded(recordings: Iterable[Path]) -> tuple[list[ScorerSnapshot], list[str]]:
-    snapshots, damage = [], []
+def _recorded(recordings: Iterable[Path]) -> tuple[list[ScorerSnapshot], dict[str, FanNames], list[str]]:
+    snapshots, names, damage = [], {}, []
     with working(f"reading {', '.join(map(str, recordings))}"):
         for path in recordings:
             reading = read_recording(path, {"snapshot"})
             snapshots += [entry.message for entry in reading if isinstance(entry.message, ScorerSnapshot)]
             damage += [reading.damage] if reading.damage else []
-    return snapshots, damage
+            about = read_metadata(path)
+            names |= {tray: about.names(tray) for tray in about.trays}
+    return snapshots, names, damage
 
 
 def _decoded(payload: bytes) -> list[ScorerSnapshot]:
@@ -100,12 +105,12 @@ def _decoded(payload: bytes) -> list[ScorerSnapshot]:
         return []
 
 
-def _table(tray: str, t_ns: int, state: dict[str, Any]) -> Table:
+def _table(tray: str, t_ns: int, state: dict[str, Any], names: FanNames) -> Table:
     rows = wear_rows(tray, t_ns, state)
     without = sorted(set(range(len(state["fans"]))) - {row["fan"] for row in rows})
     limit = f"{100 * LIMIT_SHARE:.0f} %"
     caption = ["% of the speed, ± 95 %, since commissioning; beside: the change of the fans beside it"]
-    caption += [f"no data yet for fan {', '.join(map(str, without))}: {_NEEDED}"] if without else []
+    caption += [f"no data yet for {escape(names.labels(without))}: {_NEEDED}"] if without else []
     title, reached = f"wear of {escape(tray)} up to {_minute(t_ns)}", f"{limit} reached"
     columns = ("fan", "at"), ("change", "beside", "per day"), (reached,)
     table = table_of(*columns, title=title, caption="\n".join(caption), padding=(0, 0, 0, 1))
@@ -113,7 +118,7 @@ def _table(tray: str, t_ns: int, state: dict[str, Any]) -> Table:
         per_day, beside = row["per_day"], row["beside"]
         significant = per_day and not per_day["low"] <= 0.0 <= per_day["high"]
         table.add_row(
-            str(row["fan"]),
+            escape(names.cell(row["fan"])),
             _minute(row["seen_t_ns"], "%m-%d %H:%M"),
             _percent(row["change"], 1.96 * row["change_std_error"]),
             "" if beside is None else f"{100 * beside:+.1f}",

@@ -48,6 +48,8 @@ class FanStates:
             judged = bool(newest.is_judged[now.fan.number])
         unit = RAD_S_PER_UNIT[tray.speed_unit]
         return {
+            "name": now.about.name,
+            "place": now.about.place,
             "state": now.state,
             "in_alarm": now.group == FanGroup.ALARM,
             "judged": judged,

@@ -41,12 +41,12 @@ class HomeAssistant:
         self._node = node if topics.instance == ALL_TRAYS else f"{node}_{topics.instance}"
         self._path = f"{DISCOVERY_PREFIX}/device/{self._node}"
         chosen = [tray for tray in trays if tray.name in config.home_assistant]
-        self._fans = [(Fan(tray.name, number), tray.speed_unit) for tray in chosen for number in range(tray.fans)]
+        self._fans = [(Fan(tray.name, number), tray) for tray in chosen for number in range(tray.fans)]
 
     def messages(self) -> Mapping[str, str]:
         """The text of each device by its topic."""
         devices = {SITE_DEVICE: self._site()}
-        devices |= {f"{fan.tray}-{fan.number}": self._fan(fan, unit) for fan, unit in self._fans}
+        devices |= {f"{fan.tray}-{fan.number}": self._fan(fan, tray) for fan, tray in self._fans}
         return {f"{self._path}/{name}/config": text_of(device) for name, device in devices.items()}
 
     def _site(self) -> dict[str, Any]:
@@ -68,7 +68,7 @@ class HomeAssistant:
         }
         return self._device(SITE_DEVICE, {"name": f"Fans of {self._topics.site}", "model": "site"}, entities)
 
-    def _fan(self, fan: Fan, unit: str) -> dict[str, Any]:
+    def _fan(self, fan: Fan, tray: TrayConfig) -> dict[str, Any]:
         name, topic = f"{fan.tray}-{fan.number}", self._topics.state(fan)
 
         def number(key: str, words: str, icon: str, precision: int, **more: str) -> dict[str, Any]:
@@ -84,7 +84,7 @@ class HomeAssistant:
             "json_attributes_topic": self._topics.alarm(fan),
             "json_attributes_template": "{{ (value_json or {}) | tojson }}",
         }
-        in_unit = {"unit_of_measurement": unit}
+        in_unit = {"unit_of_measurement": tray.speed_unit}
         entities = {
             "problem": problem,
             "state": self._value(name, topic, "state", "State", "mdi:fan"),
@@ -100,7 +100,10 @@ class HomeAssistant:
                 "payload_press": text_of({"action": ACKNOWLEDGE, "comment": "from Home Assistant"}),
                 "icon": "mdi:check",
             }
-        about = {"name": f"{fan.tray} fan {fan.number}", "model": "fan", "via_device": f"{self._node}-{SITE_DEVICE}"}
+        known = tray.fan[fan.number]
+        about = {"name": known.name or f"{fan.tray} fan {fan.number}", "model": "fan"}
+        about |= {"via_device": f"{self._node}-{SITE_DEVICE}"}
+        about |= {"suggested_area": known.place} if known.place else {}
         return self._device(name, about, entities)
 
     def _device(self, name: str, about: dict[str, Any], entities: dict[str, Any]) -> dict[str, Any]:

@@ -11,6 +11,7 @@ from urllib.parse import quote
 
 from fantwin.pipeline.outputs.notify.deciding import Happened, Kind, ranges
 from fantwin.schemas.enums import Severity
+from fantwin.schemas.fan_names import MOST_LISTED
 from fantwin.schemas.messages import Alarm, Diagnosis
 from fantwin.schemas.units import NS_PER_S
 from fantwin.scoring.alarms.alarm_text import deviation_in
@@ -105,14 +106,14 @@ def about_fan(place: Place, current: CurrentAlarm, happened: Happened, now_ns: i
     lines.append(f"As of {place.clock(now_ns)}")
     if address := place.page_of(alarm):
         lines.append(address)
-    title = f"{beginning}{word}, fan {alarm.fan} of {alarm.header.tray} ({place.site})"
+    title = f"{beginning}{word}, {alarm.label} of {alarm.header.tray} ({place.site})"
     return Text(title, "\n".join(lines), _level([alarm]))
 
 
 def describe(place: Place, current: CurrentAlarm) -> list[str]:
     """The alarm of a fan: since when, how far it is from its twin, the cause, what to do, and who knows."""
     alarm, deviation = current.newest, _deviation(place, current)
-    fan = f"fan {alarm.fan} of {alarm.header.tray} at {place.site}"
+    fan = f"{alarm.label} of {alarm.header.tray} at {place.site}"
     if alarm.onset_t_ns == 0:
         return [f"{fan}: no alarm"]
     if not alarm.active:
@@ -135,7 +136,7 @@ def describe(place: Place, current: CurrentAlarm) -> list[str]:
 def _deviation(place: Place, current: CurrentAlarm) -> str:
     """The deviation of the fan from its twin, by the last message that gives it, with its time; may be empty."""
     raised = current.raised
-    deviation = deviation_in(raised.message, raised.fan) if raised else ""
+    deviation = deviation_in(raised.about) if raised else ""
     return f"{deviation} at {place.clock(raised.t_ns)}" if raised and deviation and raised.t_ns else deviation
 
 
@@ -195,12 +196,13 @@ def _how_many(fans: Sequence[tuple[CurrentAlarm, Happened]]) -> list[str]:
 
 
 def _of_each_tray(alarms: Sequence[Alarm]) -> list[str]:
-    fans: dict[tuple[str, bool], list[int]] = {}
+    fans: dict[tuple[str, bool], dict[int, Alarm]] = {}
     for alarm in alarms:
-        fans.setdefault((alarm.header.tray, not alarm.active), []).append(alarm.fan)
+        fans.setdefault((alarm.header.tray, not alarm.active), {})[alarm.fan] = alarm
     lines: list[str] = []
     for (tray, is_over), numbers in sorted(fans.items()):
-        shown = ranges(numbers)
+        named = len(numbers) <= MOST_LISTED and any(alarm.fan_name for alarm in numbers.values())
+        shown = ", ".join(numbers[fan].label for fan in sorted(numbers)) if named else ranges(numbers)
         if len(shown) > MOST_RANGE_CHARACTERS:
             shown = shown[:MOST_RANGE_CHARACTERS].rpartition(",")[0] + ", ..."
         lines.append(f"{tray}: {'cleared: ' if is_over else ''}{_count(len(numbers), 'fan')}: {shown}")

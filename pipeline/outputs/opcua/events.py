@@ -97,7 +97,7 @@ def condition_fields(fan: Fan, current: CurrentAlarm | None, now_ns: int, namesp
         "EventId": ua.Variant(event_id(newest) if newest else b"", ua.VariantType.ByteString),
         "EventType": node(ua.NodeId(FAN_ALARM_TYPE, namespace)),
         "SourceNode": node(ua.NodeId(str(fan), namespace)),
-        "SourceName": string(str(fan)),
+        "SourceName": string(f"{newest.fan_name} ({fan})" if newest and newest.fan_name else str(fan)),
         "Time": at,
         "ReceiveTime": null_or_time(now_ns),
         "Message": localized(newest.message if newest else "no alarm has been raised"),

@@ -14,7 +14,7 @@ from typing import Any
 from asyncua import ua
 from asyncua.server.address_space import AddressSpace
 
-from fantwin.pipeline.config.settings import TrayConfig
+from fantwin.pipeline.config.settings import FanConfig, TrayConfig
 from fantwin.pipeline.outputs.opcua.encoding import (
     ALARM,
     COMMISSION,
@@ -34,6 +34,7 @@ from fantwin.pipeline.site.fleet import Fan
 ValueOf = Callable[[Fan, str], SharedValue]
 """the value of a node, from its fan and its path below the fan"""
 SAMPLING_MS = 1000.0
+NAMELESS = FanConfig()
 ANALOG_PROPERTIES = {"EURange": "AnalogItemType_EURange", "EngineeringUnits": "BaseAnalogType_EngineeringUnits"}
 _CONDITION_TYPES = ("AlarmConditionType", "AcknowledgeableConditionType", "ConditionType", "BaseEventType")
 _METHOD_TYPES = ("ShelvedStateMachineType", *_CONDITION_TYPES, "AlarmConditionType_ShelvingState")
@@ -96,17 +97,19 @@ class SiteNode:
         attribute_of: Callable[[int], ua.DataValue],
         references: Callable[[], list[ua.ReferenceDescription]],
         value: Callable[[], SharedValue] | None = None,
+        about: FanConfig = NAMELESS,
     ) -> None:
-        """attribute_of: the attributes that its declaration has. value: of a variable; None: it has none."""
+        """attribute_of: the attributes that its declaration has. value: of a variable; None: it has none. about: of the
+        node of a fan, its name and place."""
         self.nodeid = nodeid
         self._attribute_of, self._references, self._value = attribute_of, references, value
         self._own = {
             ua.AttributeIds.NodeId: ua.Variant(nodeid, ua.VariantType.NodeId),
             ua.AttributeIds.BrowseName: ua.Variant(name),
-            ua.AttributeIds.DisplayName: ua.Variant(ua.LocalizedText(name.Name)),
+            ua.AttributeIds.DisplayName: ua.Variant(ua.LocalizedText(about.name or name.Name)),
         }
         if value is None:
-            self._own[ua.AttributeIds.Description] = ua.Variant(ua.LocalizedText(""))
+            self._own[ua.AttributeIds.Description] = ua.Variant(ua.LocalizedText(about.place))
         else:
             self._own[ua.AttributeIds.MinimumSamplingInterval] = ua.Variant(SAMPLING_MS, ua.VariantType.Double)
 
@@ -178,7 +181,8 @@ class SiteNodes:
         template = self._templates[path]
         value = (lambda: self._value_of(fan, path)) if template.node_class == ua.NodeClass.Variable else None
         name = self._name(fan, template)
-        return SiteNode(nodeid, name, self._attributes_of(path), lambda: self._of_fan(fan, template), value)
+        about = self._about(fan, path)
+        return SiteNode(nodeid, name, self._attributes_of(path), lambda: self._of_fan(fan, template), value, about)
 
     def fan(self, nodeid: ua.NodeId) -> tuple[Fan, str] | None:
         """The fan to which a node belongs, and the path below it; None: it belongs to none."""
@@ -218,6 +222,10 @@ class SiteNodes:
         """The browse name of a node of a fan."""
         return template.name if template.path else self._own_name(f"Fan{fan.number}")
 
+    def _about(self, fan: Fan, path: str) -> FanConfig:
+        """Name and place of a fan, for its own node."""
+        return NAMELESS if path else self._trays[fan.tray].fan[fan.number]
+
     def _of_tray(self, name: str) -> list[ua.ReferenceDescription]:
         fans = [self._to(Fan(name, number), "", standard("Organizes")) for number in range(self._trays[name].fans)]
         parent = self._to_folder(SITE_FOLDER, self._site, is_forward=False)
@@ -237,7 +245,8 @@ class SiteNodes:
         template = self._templates[path]
         target = ua.NodeId(f"{fan}/{path}" if path else str(fan), self._namespace)
         name = self._name(fan, template)
-        return _reference(by, target, name, template.node_class, template.type, is_forward=is_forward)
+        shown = self._about(fan, path).name
+        return _reference(by, target, name, template.node_class, template.type, is_forward=is_forward, shown=shown)
 
     def _to_folder(self, identifier: str | int, name: str, *, is_forward: bool = True) -> ua.ReferenceDescription:
         by, target = standard("Organizes"), ua.NodeId(identifier, self._namespace)
@@ -258,5 +267,8 @@ def _reference(
     type_of: ua.NodeId,
     *,
     is_forward: bool,
+    shown: str = "",
 ) -> ua.ReferenceDescription:
-    return ua.ReferenceDescription(by, is_forward, target, name, ua.LocalizedText(name.Name), node_class, type_of)
+    """A reference. shown: what people see; empty: the name."""
+    text = ua.LocalizedText(shown or name.Name)
+    return ua.ReferenceDescription(by, is_forward, target, name, text, node_class, type_of)

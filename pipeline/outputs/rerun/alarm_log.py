@@ -10,6 +10,7 @@ import numpy as np
 
 from fantwin.pipeline.recordings.dates import has_date
 from fantwin.schemas.enums import Severity, Statistic, Transition
+from fantwin.schemas.fan_names import fan_cell
 from fantwin.schemas.messages import Alarm
 from fantwin.schemas.units import NS_PER_S
 from fantwin.scoring.alarms.alarm_state import UNTIL_IT_CLEARS_T_NS, is_listed, is_silenced
@@ -41,7 +42,7 @@ def log_line(alarm: Alarm) -> LogLine:
     is_bad = alarm.active or alarm.transition != Transition.REPUBLISHED
     if is_bad and alarm.transition in (Transition.RAISED, Transition.SEVERITY, Transition.REPUBLISHED):
         level = "ERROR" if alarm.severity == Severity.ALARM else "WARN"
-    text = f"fan {alarm.fan}: {_what_happened(alarm)}"
+    text = f"{alarm.label}: {_what_happened(alarm)}"
     return LogLine(alarm.header.tray, alarm.t_ns, level, cut(text, LINE_LENGTH))
 
 
@@ -114,7 +115,7 @@ def _row(each: CurrentAlarm, now_t_ns: int) -> str:
     state += ", silenced" if is_silenced(alarm) else ", no data" if alarm.stale and alarm.active else ""
     cause = ", ".join(most_probable(each.causes)) if each.causes else exceeded(alarm) if alarm.active else ""
     seen = each.acknowledged_by or ("yes" if alarm.acknowledged else "nobody")
-    name = markdown_literal(cut(f"{alarm.header.tray}/{alarm.fan}", NAME_LENGTH))
+    name = markdown_literal(cut(f"{alarm.header.tray}/{fan_cell(alarm.fan, alarm.fan_name)}", NAME_LENGTH))
     columns = (
         f"**{name}**" if alarm.active else name,
         state,

@@ -65,8 +65,9 @@ def plot_recording(
     fans: Sequence[int] | None = None,
     speed_unit: SpeedUnit | None = None,
     truth: Path | None = None,
-) -> tuple[list[int], list[str]]:
-    """Plot one tray of a recording. Returns the fans that were drawn, and what could not be read, a line each.
+) -> tuple[list[int], str, list[str]]:
+    """Plot one tray of a recording. Returns the fans that were drawn, also in words, and what could not be read, a line
+    each.
 
     Args:
         recordings: a recording, or its parts in any order.
@@ -81,7 +82,8 @@ def plot_recording(
     """
     trace, damage = read_trace(recordings, tray, speed_unit)
     faults = read_faults(truth) if truth is not None else ()
-    return plot_bands(trace, output, fans=fans, faults=faults), damage
+    drawn = plot_bands(trace, output, fans=fans, faults=faults)
+    return drawn, trace.names.labels(drawn), damage
 
 
 def read_trace(recordings: Sequence[Path], tray: str | None, speed_unit: SpeedUnit | None) -> tuple[Trace, list[str]]:
@@ -111,11 +113,9 @@ def read_trace(recordings: Sequence[Path], tray: str | None, speed_unit: SpeedUn
     chosen = sorted(scores[tray], key=lambda score: int(score.t_ns[0]))
     if len({score.fans for score in chosen}) > 1:
         raise UserError(f"{where}: {tray} changes its number of fans; plot the parts one by one")
-    return trace_of(tray, chosen, speed_unit or _display_unit(recordings[0], tray)), damage
-
-
-def _display_unit(recording: Path, tray: str) -> SpeedUnit:
-    return "rpm" if read_metadata(recording).speed_unit(tray) == "rpm" else "rad/s"
+    about = read_metadata(recordings[0])
+    displayed: SpeedUnit = "rpm" if about.speed_unit(tray) == "rpm" else "rad/s"
+    return trace_of(tray, chosen, speed_unit or displayed, names=about.names(tray)), damage
 
 
 def read_faults(path: Path) -> list[Fault]:
@@ -277,7 +277,7 @@ def _draw_lanes(axes: Axes, trace: Trace, fan: int, faults: Sequence[Fault], *, 
 
 def _title(trace: Trace, fan: int, faults: Sequence[Fault]) -> str:
     """The title of a panel: the fan, its faults and its alarms."""
-    parts = [f"fan {fan}"]
+    parts = [trace.names.label(fan)]
     in_alarm = trace.in_alarm[:, fan]
     raised = trace.t_ns[in_alarm & ~np.concatenate(([False], in_alarm[:-1]))]
     if not len(raised):

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from fantwin.pipeline.config.settings import TrayConfig
+from fantwin.pipeline.config.settings import FanConfig, TrayConfig
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.outputs.rerun.rerun_sink import ViewOptions
 from fantwin.pipeline.outputs.rerun.viewer_core import view_of_site
@@ -40,7 +40,7 @@ def recorded_site(recordings: Iterable[Path]) -> RecordedSite:
     metadata = run_metadata(parts)
     stated = {tray: metadata.metadata.get(f"fans.{tray}") for tray in metadata.trays}
     counts = {tray: int(fans) for tray, fans in stated.items() if fans}
-    trays = [TrayConfig(name=tray, fans=fans, speed_unit=_unit(metadata, tray)) for tray, fans in counts.items()]
+    trays = [_tray(metadata, tray, fans) for tray, fans in counts.items()]
     if not trays:
         raise UserError(f"{', '.join(map(str, parts))}: holds no scores to show; {how_to_score(parts)}")
     return RecordedSite(metadata.metadata.get("site", "site"), trays, parts)
@@ -71,5 +71,8 @@ def write_view(site: RecordedSite, output: Path, options: ViewOptions) -> list[s
     return [*damage, *filter(None, [core.problem()])]
 
 
-def _unit(metadata: RecordingMetadata, tray: str) -> SpeedUnit:
-    return "rpm" if metadata.speed_unit(tray) == "rpm" else "rad/s"
+def _tray(metadata: RecordingMetadata, tray: str, fans: int) -> TrayConfig:
+    unit: SpeedUnit = "rpm" if metadata.speed_unit(tray) == "rpm" else "rad/s"
+    names = map(metadata.names(tray).name, range(fans))
+    named = tuple(FanConfig(name=name) if name else FanConfig() for name in names)
+    return TrayConfig(name=tray, fans=fans, fan=named, speed_unit=unit)

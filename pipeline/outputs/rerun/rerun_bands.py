@@ -47,9 +47,9 @@ class RerunBands:
             for number, of_fan in zip(trace.fan_numbers, values.T, strict=True):
                 self._send_where(auxiliary_path(trace.tray, name, number), trace.t_ns, of_fan)
 
-    def change_states(self, tray: str, fan: int, t_ns: Array, names: Sequence[str]) -> None:
-        """Set the state of a fan's lane from each time on."""
-        self._send(state_path(tray, fan), t_ns, rr.StateChange.columns(state=list(names)))
+    def change_states(self, tray: str, fan: int, name: str, t_ns: Array, names: Sequence[str]) -> None:
+        """Set the state of a fan's lane from each time on. name: of the fan."""
+        self._send(state_path(tray, fan, name), t_ns, rr.StateChange.columns(state=list(names)))
 
     def _send_judged(self, trace: Trace, columns: Sequence[int], balance_path: str, score_path: str) -> None:
         balances = (trace.balance[:, columns], trace.expected_balance[:, columns])

@@ -40,6 +40,7 @@ from fantwin.pipeline.outputs.rerun.rerun_styles import (
     wear_path,
 )
 from fantwin.schemas.channels import Channel
+from fantwin.schemas.fan_names import NO_NAMES, FanNames
 from fantwin.schemas.units import SpeedUnit
 
 LayoutName = Literal["all", "alarms", "wear"]
@@ -70,6 +71,7 @@ class TrayLayout:
     is_of_fleet: bool = False
     auxiliary: Sequence[Channel] = ()
     alarmed: Sequence[int] = ()
+    names: FanNames = NO_NAMES
 
     @property
     def judged_together(self) -> int:
@@ -88,7 +90,7 @@ FanPlot = tuple[TrayLayout, int]
 def log_styles(recording: rr.RecordingStream, tray: TrayLayout, fans: Sequence[int]) -> None:
     """Log the static names, colours and widths of every series of some fans."""
     for fan in fans:
-        log_fan_styles(recording, tray.name, fan, tray.speed_unit)
+        log_fan_styles(recording, tray.name, fan, tray.speed_unit, tray.names.name(fan))
     for page, of_page in enumerate(pages_of(range(tray.fans), tray.judged_together)):
         if not set(of_page).isdisjoint(fans):
             recording.log(judged_path(tray.name, BALANCE, page), balance_style(len(of_page)), static=True)
@@ -102,7 +104,9 @@ def site_blueprint(name: LayoutName, trays: Sequence[TrayLayout], window_s: floa
         return _tabbed([_wear_tab(tray.name) for tray in trays], DAYS, rr.TimeRange(start=endless, end=endless))
     if name == "alarms" or trays[0].is_of_fleet:
         pages = pages_of([(tray, fan) for tray in trays for fan in tray.alarmed], ALARMS_ON_A_PAGE)
-        tabs = [_page_tab(", ".join(f"{tray.name}/{fan}" for tray, fan in page), page) for page in pages]
+        tabs = [
+            _page_tab(", ".join(f"{tray.name}/{tray.names.cell(fan)}" for tray, fan in page), page) for page in pages
+        ]
         logs = list(dict.fromkeys(tray.log for tray in trays))
         tabs = tabs or [rrb.Horizontal(_alarms_view(), _log_view(logs), name="alarms")]
     else:
@@ -165,7 +169,7 @@ def _page_tab(name: str, plots: Sequence[FanPlot]) -> rrb.Container:
     columns = columns_of(len(plots))
     lanes = rrb.StateTimelineView(
         origin="/",
-        contents=[f"/{state_path(tray.name, fan)}" for tray, fan in plots],
+        contents=[f"/{state_path(tray.name, fan, tray.names.name(fan))}" for tray, fan in plots],
         name="state of each fan",
         time_view=LINKED,
     )
@@ -192,11 +196,12 @@ def _page_tab(name: str, plots: Sequence[FanPlot]) -> rrb.Container:
 
 
 def _fan_rows(tray: TrayLayout, fan: int, columns: int) -> rrb.Container:
+    label = tray.names.label(fan)
     fill, lines = speed_style(tray.speed_unit, 0.0), speed_style(tray.speed_unit, LINE_WIDTH)
     speed = rrb.TimeSeriesView(
         origin=f"/{tray.name}/fan_{fan}",
         contents=[f"/{fan_path(tray.name, fan, part)}" for part in FAN_PARTS],
-        name=f"{tray.name} / fan {fan} speed ({tray.speed_unit})",
+        name=f"{tray.name} / {label} speed ({tray.speed_unit})",
         axis_x=LINKED,
         plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.RightTop, visible=columns < FANS_ON_A_PAGE // 2),
         # A single band is faint. Drawing the same data twice makes it solid and sends no more bytes.
@@ -204,7 +209,7 @@ def _fan_rows(tray: TrayLayout, fan: int, columns: int) -> rrb.Container:
     )
     page, number = divmod(fan, tray.judged_together)
     on_page = min(tray.judged_together, tray.fans - page * tray.judged_together)
-    names = {BALANCE: f"{tray.name} / fan {fan} torque balance", SCORE: f"{tray.name} / fan {fan} score"}
+    names = {BALANCE: f"{tray.name} / {label} torque balance", SCORE: f"{tray.name} / {label} score"}
     if columns == 4:  # narrow: a longer name is cut off
         names = {BALANCE: f"balance {fan}", SCORE: f"score {fan}"}
     styles = {BALANCE: balance_style(on_page, number), SCORE: score_style(on_page, number)}

@@ -190,7 +190,10 @@ class RerunSink:
         self._recording = rr.RecordingStream(APPLICATION)
         self._bands = RerunBands(self._recording)
         self._is_fleet = is_fleet(trays)
-        self._trays = {each.name: TrayLayout(each.name, each.fans, each.speed_unit, self._is_fleet) for each in trays}
+        self._trays = {
+            each.name: TrayLayout(each.name, each.fans, each.speed_unit, self._is_fleet, names=each.names)
+            for each in trays
+        }
         self._styled: set[Fan] = set()
         self._options = options
         self._wear = RerunWear(self._recording)
@@ -252,7 +255,7 @@ class RerunSink:
 
     def draw_wear(self, tray: str, points: Sequence[WearPoints]) -> None:
         """Send the newest points of the wear of some fans."""
-        self._wear.draw(tray, points)
+        self._wear.draw(tray, points, self._trays[tray].names)
 
     def show_alarms(self, table: str, t_ns: int) -> None:
         """Show the table of alarms from `t_ns` on."""
@@ -264,7 +267,7 @@ class RerunSink:
 
     def change_states(self, tray: str, fan: int, t_ns: Array, names: Sequence[str]) -> None:
         """Set the state of a fan's lane from each time on."""
-        self._bands.change_states(tray, fan, t_ns, names)
+        self._bands.change_states(tray, fan, self._trays[tray].names.name(fan), t_ns, names)
 
     def log(self, lines: Sequence[LogLine]) -> None:
         """Add lines to the log of their tray, or of the fleet, with their time of day (UTC)."""

@@ -11,6 +11,7 @@ from typing import TypeVar
 import rerun as rr
 
 from fantwin.pipeline.site.trace import SILENT, state_names
+from fantwin.schemas.fan_names import fan_label
 from fantwin.schemas.units import SpeedUnit
 
 TIMELINE = "time"
@@ -48,9 +49,9 @@ def judged_path(tray: str, kind: str, page: int) -> str:
     return f"{tray}/{kind}/page_{page}"
 
 
-def state_path(tray: str, fan: int) -> str:
-    """Entity of a fan's state lane."""
-    return f"{tray}/state/fan_{fan}"
+def state_path(tray: str, fan: int, name: str) -> str:
+    """Entity of a fan's state lane, which is called as the fan is."""
+    return f"{tray}/state/{rr.escape_entity_path_part(fan_label(fan, name)) if name else f'fan_{fan}'}"
 
 
 def auxiliary_path(tray: str, column: str, fan: int) -> str:
@@ -131,7 +132,7 @@ def score_style(fans: int, shown: int | None = None) -> rr.SeriesLines:
     )
 
 
-def log_fan_styles(recording: rr.RecordingStream, tray: str, fan: int, unit: SpeedUnit) -> None:
+def log_fan_styles(recording: rr.RecordingStream, tray: str, fan: int, unit: SpeedUnit, name: str) -> None:
     """Log the static names, colours and widths of the series and the lane of a fan."""
     names = state_names()
     styles = {
@@ -139,7 +140,7 @@ def log_fan_styles(recording: rr.RecordingStream, tray: str, fan: int, unit: Spe
         fan_path(tray, fan, "deviation"): rr.Measurements.from_fields(names="area in alarm", colors=RED, widths=0.0),
         fan_path(tray, fan, "outside"): rr.SeriesPoints(names="dots outside band", colors=RED, marker_sizes=2.0),
         fan_path(tray, fan, "not_scored"): rr.SeriesLines(names="not scored", colors=GREY, widths=LINE_WIDTH),
-        state_path(tray, fan): rr.StateConfiguration(
+        state_path(tray, fan, name): rr.StateConfiguration(
             values=names, colors=[STATE_COLORS.get(name, UNKNOWN_COLOR) for name in names]
         ),
     }

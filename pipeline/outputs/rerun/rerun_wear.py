@@ -13,6 +13,7 @@ import rerun as rr
 
 from fantwin.pipeline.outputs.rerun.rerun_styles import DAYS, FAN_COLORS, LINE_WIDTH, wear_path
 from fantwin.pipeline.site.fleet import Fan
+from fantwin.schemas.fan_names import FanNames
 from fantwin.schemas.messages import Array, ScorerSnapshot
 
 
@@ -54,15 +55,17 @@ class RerunWear:
         self._recording = recording
         self._drawn_t_ns: dict[Fan, int] = {}
 
-    def draw(self, tray: str, points: Sequence[WearPoints]) -> None:
-        """Send what is newer than what was drawn before."""
+    def draw(self, tray: str, points: Sequence[WearPoints], names: FanNames) -> None:
+        """Send what is newer than what was drawn before. names: of the fans."""
         for each in points:
             fan = Fan(tray, each.fan)
             drawn = self._drawn_t_ns.get(fan)
             path = wear_path(*fan)
             if drawn is None:
                 style = rr.Measurements.from_fields(
-                    names=str(fan), colors=FAN_COLORS[fan.number % len(FAN_COLORS)], widths=LINE_WIDTH
+                    names=f"{tray}/{names.cell(each.fan)}",
+                    colors=FAN_COLORS[fan.number % len(FAN_COLORS)],
+                    widths=LINE_WIDTH,
                 )
                 self._recording.log(path, style, static=True)
             newer = each if drawn is None else each.after(drawn)

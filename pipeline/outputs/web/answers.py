@@ -40,10 +40,12 @@ class Me(Session):
 
 
 class Tray(BaseModel):
-    """A tray. viewer_url: of Rerun; empty without it."""
+    """A tray. names, places: of each fan, empty where it has none. viewer_url: of Rerun; empty without it."""
 
     name: str
     fans: int
+    names: list[str]
+    places: list[str]
     speed_unit: str
     viewer_url: str
 
@@ -73,6 +75,8 @@ class Fan(BaseModel):
 
     tray: str
     fan: int
+    name: str
+    place: str
     state: str
     group: FanGroup
     score: float | None
@@ -100,10 +104,14 @@ class ExplainedCause(Cause):
 
 
 class Alarm(BaseModel):
-    """A current alarm. probability: of the most probable cause. now: what its fan does now, in words."""
+    """A current alarm. about: the message without the fan. probability: of the most probable cause. now: what its fan
+    does now, in words."""
 
     tray: str
     fan: int
+    name: str
+    place: str
+    about: str
     severity: str
     active: bool
     acknowledged: bool
@@ -196,6 +204,7 @@ class Transition(BaseModel):
     t_ns: int
     tray: str
     fan: int
+    name: str
     onset_t_ns: int
     transition: str
     severity: str
@@ -288,6 +297,7 @@ class ScorerAnswer(BaseModel):
     """What the scorer says to a request about a fan."""
 
     fan: int
+    name: str
     transition: str
     message: str
 

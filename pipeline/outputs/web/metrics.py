@@ -22,6 +22,7 @@ from prometheus_client.registry import Collector
 from prometheus_client.utils import floatToGoString
 
 from fantwin.pipeline.site.fan_history import CURVES
+from fantwin.pipeline.site.fleet import Fan
 from fantwin.pipeline.site.site_model import SiteModel
 from fantwin.pipeline.site.stage_states import AT_WORK, StageState, Word
 from fantwin.schemas.channels import CHANNELS
@@ -55,7 +56,7 @@ class SiteMetrics(Collector):
         yield pages
 
     def _of_alarms(self) -> Iterable[Metric]:
-        of_fan = [*_FAN, "severity"]
+        of_fan = [*_FAN, "name", "severity"]
         active = GaugeMetricFamily("fantwin_fan_alarm_active", "1: an alarm of this severity is active.", labels=of_fan)
         unacknowledged = GaugeMetricFamily(
             "fantwin_fan_alarm_unacknowledged",
@@ -78,8 +79,10 @@ class SiteMetrics(Collector):
         for each in alarms:
             alarm = each.newest
             is_open = is_presented(alarm) and not alarm.acknowledged
+            of_site = self._model.site, alarm.header.tray
+            name = self._model.about(Fan(alarm.header.tray, alarm.fan)).name
             for severity in _SEVERITIES:
-                labels = [self._model.site, alarm.header.tray, str(alarm.fan), severity.name.lower()]
+                labels = [*of_site, str(alarm.fan), name, severity.name.lower()]
                 active.add_metric(labels, float(alarm.active and alarm.severity == severity))
                 unacknowledged.add_metric(labels, float(is_open and alarm.severity == severity))
         raised: Counter[tuple[str, str]] = Counter()
@@ -130,9 +133,12 @@ def metrics_text(model: SiteModel, readers: int) -> bytes:
 
 
 def _of_fans(model: SiteModel) -> Iterator[str]:
-    """The newest sample of every fan of the trays that are heard. Names have nothing that must be escaped."""
+    """The newest sample of every fan of the trays that are heard. A fan without a name has no label `name`."""
     labels = {
-        tray.name: [f'{{fan="{fan}",site="{model.site}",tray="{tray.name}"}}' for fan in range(tray.fans)]
+        tray.name: [
+            f'{{fan="{fan}",{_escaped("name", about.name)}site="{model.site}",tray="{tray.name}"}}'
+            for fan, about in enumerate(tray.fan)
+        ]
         for tray in model.trays
     }
     heard = [tray for tray in model.trays_now() if tray.is_heard]
@@ -154,12 +160,29 @@ def _of_fans(model: SiteModel) -> Iterator[str]:
                 for label, value in zip(labels[tray.tray], values, strict=True)
                 if not math.isnan(value)
             )
+    yield from _places(model)
     name = "fantwin_fan_scored"
     yield _head(name, "1: the newest sample is judged; 0: it is not, or there is none.")
     judged = {tray.tray: tray.is_judged.tolist() for tray in heard}
     for tray, of_fans in labels.items():
         are_judged = judged.get(tray) or [False] * len(of_fans)
         yield from (f"{name}{label} {is_judged:d}\n" for label, is_judged in zip(of_fans, are_judged, strict=True))
+
+
+def _places(model: SiteModel) -> Iterator[str]:
+    """Where fans are, which is no label of their series: a fan that moves is the same."""
+    placed = [(tray.name, fan, about) for tray in model.trays for fan, about in enumerate(tray.fan) if about.place]
+    if placed:
+        yield _head("fantwin_fan_info", "1: the place of the fan.")
+    for tray, fan, about in placed:
+        of = f'fan="{fan}",{_escaped("name", about.name)}{_escaped("place", about.place)}'
+        yield f'fantwin_fan_info{{{of}site="{model.site}",tray="{tray}"}} 1\n'
+
+
+def _escaped(label: str, value: str) -> str:
+    """A label before others; nothing without a value, which to Prometheus is the same."""
+    text = value.replace("\\", r"\\").replace('"', r"\"")
+    return f'{label}="{text}",' if value else ""
 
 
 def _head(name: str, about: str) -> str:

@@ -24,7 +24,7 @@ from fantwin.pipeline.recordings.disk import DiskError, refused
 from fantwin.pipeline.recordings.excerpts import CLOCK_MARGIN_S
 from fantwin.pipeline.recordings.indexed import IndexedRecording
 from fantwin.pipeline.recordings.parts import part_files
-from fantwin.pipeline.recordings.reading import TACHO_KEY, RecordingMetadata, read_metadata
+from fantwin.pipeline.recordings.reading import NAMES_KEY, TACHO_KEY, RecordingMetadata, read_metadata
 from fantwin.pipeline.recordings.records import (
     CORRUPT_DATA_ERRORS,
     RecordingError,
@@ -48,7 +48,7 @@ REST_S = 0.002
 """after each chunk, for the thread that records"""
 _JUDGED = ("alarm", "snapshot")
 """topics that a clip has, as samples that were made of others, from its snapshot on"""
-_OF_A_TRAY = ("fans", "speed_unit", TACHO_KEY, "twin_sha256")
+_OF_A_TRAY = ("fans", "speed_unit", NAMES_KEY, TACHO_KEY, "twin_sha256")
 _OF_A_PART = ("part", "continues", "session", "paused_t_ns", "resumed_t_ns", "paused_because", "lost_in_pause")
 
 

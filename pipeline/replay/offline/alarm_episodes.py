@@ -18,6 +18,7 @@ from fantwin.pipeline.recordings.dates import format_local, has_date
 from fantwin.pipeline.recordings.indexed import rare_messages
 from fantwin.pipeline.site.alarm_history import AlarmHistory
 from fantwin.schemas.enums import Feedback, InvalidReason
+from fantwin.schemas.fan_names import fan_label
 from fantwin.schemas.messages import Alarm, Diagnosis, Prediction
 from fantwin.schemas.units import NS_PER_S
 from fantwin.scoring.alarms.alarm_state import GIVES_FEEDBACK
@@ -50,6 +51,13 @@ class Episode:
     """the last one of an operator"""
     feedback_by: str = ""
     feedback_reason: str = ""
+    name: str = ""
+    """of the fan"""
+
+    @property
+    def label(self) -> str:
+        """See Alarm."""
+        return fan_label(self.fan, self.name)
 
     @property
     def end_ns(self) -> int:
@@ -143,6 +151,7 @@ def _episode(messages: list[Alarm], cleared_ns: int | None, marks: Mapping[_Name
         feedback=feedback,
         feedback_by=by,
         feedback_reason=reason,
+        name=first.fan_name,
     )
 
 
@@ -205,7 +214,7 @@ class MarkedAlarm:
             return ""
         by = f" by {alarm.feedback_by}" if alarm.feedback_by else ""
         reason = f" ({alarm.feedback_reason})" if alarm.feedback_reason else ""
-        what = f"{self.first_file}: {alarm.tray} fan {alarm.fan}: alarm of {format_local(alarm.onset_ns)}"
+        what = f"{self.first_file}: {alarm.tray} {alarm.label}: alarm of {format_local(alarm.onset_ns)}"
         marked = f"{what}, marked as a {alarm.feedback.words}{by}{reason}"
         if left_out is None:
             return f"{marked}: used as healthy running"

@@ -43,6 +43,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     tray = '[[tray]]\nname = "{0}"\nfans = 1\nport = "{0}"\n'
     (folder / "trays.toml").write_text(tray.format("a") + tray.format("b"), encoding="utf-8")
     (folder / "plain.toml").write_text('[[tray]]\nname = "tray1"\nfans = 1\n', encoding="utf-8")
+    (folder / "named.toml").write_text('[[tray]]\nname = "tray1"\nfans = ["CPU", "GPU"]\n', encoding="utf-8")
     (folder / "users.toml").write_text(tray.format("a") + '[gateway]\nusers = "none.toml"\n', encoding="utf-8")
     (folder / "table.csv").write_text("t,u,y1,y2\n0,1,2,2\n1,2,3,4\n2,2,2,2\n3,2,2,2\n", encoding="utf-8")
     run = published_run(1, 20.0, fans=2)

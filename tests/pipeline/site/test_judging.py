@@ -153,7 +153,7 @@ def test_changes_are_of_fans_and_reasons_and_not_of_figures():
 def test_active_alarms_of_fans_that_are_not_judged_are_not_confirmed_by_data():
     def alarm(tray: str, fan: int, *, active: bool = True) -> CurrentAlarm:
         newest = made_messages.alarm(fan, 1, tray, active=active, message="too slow")
-        return CurrentAlarm(newest, newest.message, (), "")
+        return CurrentAlarm(newest, newest, (), "")
 
     alarms = [alarm("a", 0), alarm("a", 1), alarm("b", 2), alarm("b", 3, active=False), alarm("c", 0)]
     found = as_judged(alarms, [Unjudged("a", (1,), "no speed"), Unjudged("b", (), "no score arrives")])

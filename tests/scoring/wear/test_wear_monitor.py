@@ -175,9 +175,9 @@ def test_what_is_no_number_is_no_point() -> None:
 
 
 def test_the_notices_are_told_from_other_notes() -> None:
-    alone = own_change(2, -0.0512, 30 * 3600 * 10**9, None)
+    alone = own_change("fan 2", -0.0512, 30 * 3600 * 10**9, None)
     assert alone == "fan 2: speed -5.1 % in 30 h: see fantwin status --wear"
-    beside = own_change(0, 0.04, 12 * 24 * 3600 * 10**9, -0.002)
+    beside = own_change("fan 0", 0.04, 12 * 24 * 3600 * 10**9, -0.002)
     assert beside == "fan 0: speed +4.0 % in 12 days, the fans beside it -0.2 %: see fantwin status --wear"
     shared = shared_change(-0.042)
     assert shared == (
@@ -189,9 +189,9 @@ def test_the_notices_are_told_from_other_notes() -> None:
 
 
 def test_a_limit_ahead_names_the_first_fan_its_days_and_the_others() -> None:
-    line = limit_ahead(3, [], -0.001, [4.2, 2.6, 6.1])
+    line = limit_ahead("fan 3", "", -0.001, [4.2, 2.6, 6.1])
     assert line == "fan 3 is wearing: it will have lost 10 % of its speed in about 4 days (3 to 6); inspect it"
-    line = limit_ahead(3, [1, 5], 0.001, [1.2, 0.0, 2.0])
-    assert line == "fan 3 is wearing: it will turn 10 % faster in about 1 day (0 to 2); inspect it, and fan 1, 5"
-    assert "it turns faster by about 10 % of its speed; i" in limit_ahead(0, [], 0.1, [0.0, 0.0, 0.0])
-    assert "speed within a day; inspect it" in limit_ahead(0, [], -0.001, [0.3, 0.0, 2.0])
+    line = limit_ahead("CPU (fan 3)", "fans 1, 5", 0.001, [1.2, 0.0, 2.0])
+    assert line == "CPU (fan 3) is wearing: it will turn 10 % faster in about 1 day (0 to 2); inspect it, and fans 1, 5"
+    assert "it turns faster by about 10 % of its speed; i" in limit_ahead("fan 0", "", 0.1, [0.0, 0.0, 0.0])
+    assert "speed within a day; inspect it" in limit_ahead("fan 0", "", -0.001, [0.3, 0.0, 2.0])

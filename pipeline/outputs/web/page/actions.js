@@ -1,6 +1,6 @@
 // What an operator does: log in, and ask a scorer something about a fan.
 
-import { element, notice } from "./dom.js";
+import { element, fanLabel, notice } from "./dom.js";
 import { learnWhoIAm, me, Refused, send } from "./server.js";
 
 export const ACTIONS = {
@@ -68,7 +68,7 @@ export function askFor(action, tray, fan, alarm = null) {
   const { title, about, lasts, needsReason } = ACTIONS[action];
   const duration = lasts ? element("select", { id: "duration" }, ...SHELVED_FOR.map(([text, s]) => element("option", { value: s }, text))) : null;
   const comment = element("input", { id: "comment", maxlength: 500, autocomplete: "off", required: needsReason });
-  dialog(`${title}: ${tray} fan ${fan}`, element("div", {}, element("p", {}, about),
+  dialog(`${title}: ${fanLabel({ tray, fan })}`, element("div", {}, element("p", {}, about),
     duration && element("label", { for: "duration" }, "How long"), duration ?? "",
     element("label", { for: "comment" }, "Reason (for the record)"), comment), title, async () => {
     const body = { action, comment: comment.value };

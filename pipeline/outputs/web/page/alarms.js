@@ -1,7 +1,7 @@
 // The list of alarms, and the history of their transitions.
 
 import { ACTIONS, askFor, buttons, buttonsForAll, feedbackOn } from "./actions.js";
-import { age, clock, element, facts, keepFocus, percent, stamp } from "./dom.js";
+import { age, clock, element, facts, fanLabel, keepFocus, percent, stamp } from "./dom.js";
 import { clipLink } from "./clips.js";
 import { ask, learn, me } from "./server.js";
 
@@ -12,7 +12,7 @@ const SHOWN = 100;
 const RATE_EVERY_MS = 60000, RATE_AFTER_MS = 3000;
 
 const name = (alarm) => `${alarm.tray}/${alarm.fan}`;
-const link = (alarm) => element("a", { href: `#/fan/${encodeURIComponent(alarm.tray)}/${alarm.fan}` }, `${alarm.tray} fan ${alarm.fan}`);
+const link = (alarm) => element("a", { href: `#/fan/${encodeURIComponent(alarm.tray)}/${alarm.fan}` }, fanLabel(alarm));
 const share = (cause) => `${cause.cause}, ${percent(cause.probability)}`;
 
 export function badge(severity, text) {
@@ -30,14 +30,14 @@ export function card(alarm, viewerUrl) {
   const by = alarm.acknowledged_by ? ` by ${alarm.acknowledged_by}` : "";
   const states = alarm.states.map((state) => (state === "acknowledged" ? state + by : state))
     .concat(alarm.now ? `now ${alarm.now}` : []).join(", ");
-  return element("article", { class: `card ${kind}`, "data-fan": name(alarm), "aria-label": `Alarm of ${alarm.tray} fan ${alarm.fan}` },
+  return element("article", { class: `card ${kind}`, "data-fan": name(alarm), "aria-label": `Alarm of ${fanLabel(alarm)}` },
     element("p", {}, badge(alarm.active ? alarm.severity : "none", alarm.active ? alarm.severity : "over"), " ",
       element("strong", {}, link(alarm)), ` since ${clock(alarm.onset_t_ns)} (`, age(alarm.onset_t_ns), ")"),
     facts({
       "Cause": [alarm.cause_with_share, ...alarm.other_causes.map(share)].filter(Boolean).join("; or "),
       "Evidence": alarm.evidence,
       "What to do": alarm.advice,
-      "Deviation": alarm.evidence && alarm.message.includes(alarm.evidence) ? "" : alarm.message.replace(`fan ${alarm.fan}: `, ""),
+      "Deviation": alarm.evidence && alarm.message.includes(alarm.evidence) ? "" : alarm.about,
       "State": states,
     }),
     rerunLink(viewerUrl, alarm.onset_t_ns), " ", clipLink(alarm), buttons(alarm.tray, alarm.fan, alarm));

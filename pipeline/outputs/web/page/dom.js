@@ -1,5 +1,16 @@
 // Elements and texts. What comes from outside is only ever set as text, never as markup.
 
+let trays = new Map();
+export const knowTrays = (site) => { trays = new Map(site.trays.map((tray) => [tray.name, tray])); };
+
+// A fan as people call it: its name comes first.
+export function fanLabel({ tray, fan }) {
+  const name = trays.get(tray)?.names[fan];
+  return name ? `${name} (${tray} fan ${fan})` : `${tray} fan ${fan}`;
+}
+
+export const fanPlace = ({ tray, fan }) => trays.get(tray)?.places[fan] ?? "";
+
 export function element(tag, attributes = {}, ...children) {
   const made = document.createElement(tag);
   for (const [name, value] of Object.entries(attributes)) {

@@ -3,7 +3,7 @@
 import { AlarmsView, HistoryView } from "./alarms.js";
 import { logOut, showLogin } from "./actions.js";
 import { learnClips } from "./clips.js";
-import { element, notice } from "./dom.js";
+import { element, knowTrays, notice } from "./dom.js";
 import { FanView } from "./one_fan.js";
 import { address, bytes, Overview } from "./overview.js";
 import { StagesView } from "./stages.js";
@@ -164,6 +164,7 @@ async function start() {
       return;
     }
     site = await ask("/site");
+    knowTrays(site);
     document.getElementById("site").textContent = site.site;
     showView();
     await learnState();

@@ -4,7 +4,7 @@ import { HistoryView, card, rerunLink } from "./alarms.js";
 import { buttons } from "./actions.js";
 import { address, bytes, levelText, NO_LEVEL } from "./overview.js";
 import { Plot } from "./plot.js";
-import { clock, element, facts, keepFocus } from "./dom.js";
+import { clock, element, facts, fanLabel, fanPlace, keepFocus } from "./dom.js";
 import { ask, learn } from "./server.js";
 import { wearTable } from "./wear.js";
 
@@ -35,8 +35,8 @@ export class FanView {
     this.history = new HistoryView({ tray, fan });
     this.windows = element("div", { class: "actions", role: "group", "aria-label": "Time shown" }, ...WINDOWS.map(([text, s]) =>
       element("button", { type: "button", "aria-pressed": String(s === this.window_s), onclick: (event) => this.show(s, event.target) }, text)));
-    this.root = element("div", {}, element("div", { class: "title" }, element("h2", {}, `${tray} fan ${fan}`),
-      element("a", { href: address }, "← all fans (Esc)")), element("p", {}, this.state, this.score, " ", rerunLink(viewerUrl, 0)),
+    this.root = element("div", {}, element("div", { class: "title" }, element("h2", {}, fanLabel(this)),
+      element("a", { href: address }, "← all fans (Esc)")), element("p", {}, fanPlace(this) && `${fanPlace(this)}: `, this.state, this.score, " ", rerunLink(viewerUrl, 0)),
       this.alarm, this.windows, this.charts, element("h2", {}, "Wear"), this.wear, element("h2", {}, "Twin"), this.twin,
       this.history.root);
     this.updateAlarm(alarm);

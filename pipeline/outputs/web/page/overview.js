@@ -1,7 +1,7 @@
 // Every fan of the site as a cell, in groups, the worst group first. A cell moves only when its group changes, so that
 // thousands of fans cost nothing while they are well.
 
-import { element } from "./dom.js";
+import { element, fanLabel } from "./dom.js";
 
 const GROUPS = [
   { name: "alarm", title: "In alarm", mark: "✖" },
@@ -68,7 +68,7 @@ export class Overview {
     const mark = element("span", { class: "mark", "aria-hidden": "true" });
     const words = element("span", { class: "words" });
     const root = element("button", { class: "cell", type: "button", tabindex: "-1" }, mark,
-      element("span", { class: "name" }, `${fan.tray} fan ${fan.fan}`), words);
+      element("span", { class: "name" }, fanLabel(fan)), words);
     root.index = index;
     return { root, mark, words, text: "", group: -1, class: -1, percent: -1 };
   }
@@ -137,7 +137,7 @@ export class Overview {
       cell.root.style.backgroundSize = `${Math.min(100, percent)}% .25rem`;
     }
     const share = percent ? `, ${levelText(percent)}` : "";
-    const text = `${fan.tray} fan ${fan.fan} ${words}${share}${share && " of the limit"}`;
+    const text = `${fanLabel(fan)} ${words}${share}${share && " of the limit"}`;
     if (cell.text !== text) {
       cell.text = text;
       cell.root.title = text;

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import pytest
 
-from fantwin.schemas.fan_numbers import fans_in_words
+from fantwin.schemas.fan_names import fans_in_words
 
 
 @pytest.mark.parametrize(
