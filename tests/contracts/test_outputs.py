@@ -9,6 +9,7 @@ import re
 import shutil
 import threading
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
@@ -17,7 +18,6 @@ import pytest
 from asyncua.client.client import Client as OpcuaClient
 from prometheus_client.parser import text_string_to_metric_families
 
-from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.outputs.notify.config import NotifierConfig
 from fantwin.pipeline.outputs.rerun.viewer_core import FLUSH_PERIOD_NS, ViewerCore
 from fantwin.schemas.enums import FanState, Severity, Transition
@@ -31,7 +31,7 @@ from tests.support.message_receivers import HttpReceiver
 from tests.support.mosquitto import Mosquitto, retained_by
 from tests.support.notified_alarms import START_NS, notifier_core, secret
 from tests.support.running_chain import eventually
-from tests.support.running_core import FANS, SITE, TRAY
+from tests.support.running_core import FANS, SITE, TRAY, Fans, tray_of
 from tests.support.running_gateway import Client, RunningGateway
 from tests.support.running_mqtt import ROOT, RunningMqtt
 from tests.support.running_opcua import RunningOpcua
@@ -48,6 +48,10 @@ class Output:
     keeps_state = True
     """whether its reader sees acknowledgements and silenced fans; otherwise it hears events only"""
     running: Any
+
+    def named(self) -> str:
+        """All that its reader sees of fan 2, which has a name."""
+        raise NotImplementedError
 
     def feed(self, *messages: Message) -> None:
         """Pass messages, as the runner does."""
@@ -71,8 +75,18 @@ class Output:
 class GatewayOutput(Output):
     """The operators' page, by its API."""
 
-    def __init__(self, folder: Path) -> None:
-        self.running = RunningGateway(folder)
+    def __init__(self, folder: Path, fans: Fans = FANS) -> None:
+        self.running = RunningGateway(folder, fans=fans)
+
+    def named(self) -> str:
+        client, found = Client(self.running), []
+        for path in ("alarms?all=1", f"fans/{TRAY}/2", "alarms/history"):
+            found.append(client.ask("GET", f"/api/v1/{path}")[1])
+        site = client.ask("GET", "/api/v1/site")[1]["trays"][0]
+        alarm, fan, transition = found[0]["alarms"][0], found[1], found[2]["transitions"][0]
+        assert (site["names"][2], site["places"][2]) == (fan["name"], fan["place"]) == (alarm["name"], alarm["place"])
+        assert alarm["about"] == "90 rpm below the twin"
+        return "\n".join([alarm["message"], fan["name"], fan["place"], transition["name"], transition["message"]])
 
     def alarms(self) -> Alarms:
         """Alarms of the fans that the list of alarms and the list of fans agree on."""
@@ -92,6 +106,13 @@ class PrometheusOutput(GatewayOutput):
 
     keeps_state = False
 
+    def named(self) -> str:
+        """Labels have no text of an alarm."""
+        families = text_string_to_metric_families(Client(self.running).ask("GET", "/metrics")[1])
+        of_fan = [s.labels for each in families for s in each.samples if s.labels.get("fan") == "2"]
+        assert len(of_fan) > 4 and all(labels["name"] == 'CPU "left"' for labels in of_fan)
+        return f"{of_fan[0]['name']} (fan 2) " + "".join({labels.get("place", "") for labels in of_fan})
+
     def alarms(self) -> Alarms:
         families = text_string_to_metric_families(Client(self.running).ask("GET", "/metrics")[1])
         samples = [sample for family in families for sample in family.samples if sample.value]
@@ -105,8 +126,22 @@ class PrometheusOutput(GatewayOutput):
 class OpcuaOutput(Output):
     """The OPC UA server, read by a client of the same library."""
 
-    def __init__(self, folder: Path) -> None:
-        self.running = RunningOpcua(folder)
+    def __init__(self, folder: Path, fans: Fans = FANS) -> None:
+        self.running = RunningOpcua(folder, fans=fans)
+
+    def named(self) -> str:
+        return asyncio.run(self._read_names())
+
+    async def _read_names(self) -> str:
+        async with OpcuaClient(self.running.url, timeout=60) as client:
+            fan = client.get_node(f"ns=2;s={TRAY}/2")
+            shown = [await fan.read_display_name(), await fan.read_description()]
+            alarm = [client.get_node(f"ns=2;s={TRAY}/2/Alarm/{name}") for name in ("SourceName", "Message")]
+            source, message = await client.read_values(alarm)
+            below = await client.get_node(f"ns=2;s={TRAY}").get_children_descriptions()
+            listed = [each.DisplayName.Text for each in below]
+        assert shown[0].Text in listed and source == f"{shown[0].Text} ({TRAY}/2)"
+        return "\n".join([*(each.Text or "" for each in shown), message.Text])
 
     def alarms(self) -> Alarms:
         return asyncio.run(self._read())
@@ -123,10 +158,17 @@ class OpcuaOutput(Output):
 class MqttOutput(Output):
     """What a real broker keeps."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, fans: Fans = FANS) -> None:
         self.broker = Mosquitto(folder)
         self.broker.start()
-        self.running = RunningMqtt(folder, self.broker.port)
+        self.running = RunningMqtt(folder, self.broker.port, fans=fans, home_assistant=[TRAY])
+
+    def named(self) -> str:
+        kept = retained_by(self.broker.port)
+        state, alarm = (json.loads(kept[f"{ROOT}/{TRAY}/2/{topic}"]) for topic in ("state", "alarm"))
+        (device,) = (json.loads(text)["device"] for topic, text in kept.items() if topic.endswith(f"{TRAY}-2/config"))
+        assert (state["name"], state["place"]) == (device["name"], device["suggested_area"])
+        return "\n".join([state["name"], state["place"], alarm["name"], alarm["message"]])
 
     def alarms(self) -> Alarms:
         kept = retained_by(self.broker.port)
@@ -146,7 +188,7 @@ class NotifierOutput(Output):
     posted: ClassVar[dict[Path, list[Any]]] = {}
     """what the reader has, by folder: more than one notifier may have sent it"""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, _fans: Fans = FANS) -> None:
         self._receiver = HttpReceiver()
         self._receiver.received = self.posted.setdefault(folder, [])
         url = secret(folder, "hook", f"json://127.0.0.1:{self._receiver.port}/")
@@ -160,13 +202,18 @@ class NotifierOutput(Output):
         for message in messages:
             self.running.step(message)
 
+    def named(self) -> str:
+        self.alarms()
+        posted = self._receiver.received[-1]
+        return f"{posted['title']}\n{posted['message']}\n{PLACE}"  # only messages name the fan here, none its place
+
     def alarms(self) -> Alarms:
         for _ in range(20):
             self._now_ns += NS_PER_S
             self.running.tick(self._now_ns)
         active: Alarms = {}
         for title in [posted["title"] for posted in self._receiver.received]:
-            fan = int(re.findall(r"fan (\d+) of", title)[0])
+            fan = int(re.findall(r"fan (\d+)\)? of", title)[0])
             active.pop(fan, None) if title.startswith("Cleared") else active.update({fan: (False, False)})
         return active
 
@@ -180,10 +227,14 @@ class NotifierOutput(Output):
 class ViewerOutput(Output):
     """The table of alarms in the viewer."""
 
-    def __init__(self, _folder: Path) -> None:
+    def __init__(self, _folder: Path, fans: Fans = FANS) -> None:
         self._sink = FakeSink()
-        self.running = ViewerCore(SITE, [TrayConfig(name=TRAY, fans=FANS, speed_unit="rpm")], self._sink)
+        self.running = ViewerCore(SITE, [tray_of(fans)], self._sink)
         self._ticks = 0
+
+    def named(self) -> str:
+        assert not self.alarms()
+        return f"{self._sink.tables[-1][1]}\n{[line.text for line in self._sink.lines]}\n{PLACE}"
 
     def feed(self, *messages: Message) -> None:
         for each in messages:
@@ -202,7 +253,9 @@ class ViewerOutput(Output):
             self.running.close()
 
 
-OUTPUTS: dict[str, Callable[[Path], Output]] = {
+PLACE = "rack 3, slot 4"
+NAMED: Fans = [{}, {"name": "rear"}, {"name": 'CPU "left"', "place": PLACE}, {}]
+OUTPUTS: dict[str, Callable[..., Output]] = {
     "gateway": GatewayOutput,
     "prometheus": PrometheusOutput,
     "opcua": OpcuaOutput,
@@ -258,6 +311,24 @@ def test_an_alarm_of_before_it_started_is_shown_again_after_a_restart_and_its_en
             running.close()
             running.close()
     eventually(lambda: not [each for each in set(threading.enumerate()) - threads if each.is_alive()], "all has ended")
+
+
+def test_the_name_of_a_fan_comes_first_everywhere_and_its_place_is_beside_it(kind: str, tmp_path: Path) -> None:
+    running = OUTPUTS[kind](tmp_path, NAMED)
+    try:
+        running.feed(score(), of(2, fan_name='CPU "left"', message='CPU "left" (fan 2): 90 rpm below the twin'))
+
+        def is_named() -> bool:
+            with suppress(KeyError, IndexError, ValueError):  # not there yet
+                text = running.named()
+                assert PLACE in text and 'CPU "left" (fan 2)' in text, text
+                assert not re.search(r"(?<!\()fan 2", text), text
+                return True
+            return False
+
+        eventually(is_named, "the fan is named")
+    finally:
+        running.close()
 
 
 @pytest.fixture(scope="module")

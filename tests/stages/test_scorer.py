@@ -14,6 +14,7 @@ import pytest
 from fantwin.pipeline.tray_scoring.scorer_core import ScorerCore
 from fantwin.schemas.blocks import cut
 from fantwin.schemas.enums import Action, FanState, InvalidReason, Severity, Statistic, Transition
+from fantwin.schemas.fan_names import FanNames
 from fantwin.schemas.messages import Alarm, Prediction, ScorerSnapshot
 from fantwin.schemas.units import NS_PER_S
 from fantwin.scoring.unseen_error import UnseenError
@@ -67,6 +68,22 @@ def test_an_alarm_says_when_its_fault_began_what_it_takes_and_how_large_it_is_in
     assert {each.transition for each in later} <= {Transition.SEVERITY, Transition.DIAGNOSED}
     assert later[-1].severity == Severity.ALARM
     assert (score.state[:190, 0] != ALARM).all() and score.state[-1, 0] in (ALARM, RETURNING)
+
+
+def test_each_message_begins_with_the_name_of_its_fan_and_carries_it_also_after_the_fan_got_another_one() -> None:
+    core = learned(2, names=FanNames(("CPU", "rear top")))
+    asked = [request_of(Action.ACKNOWLEDGE, fan=1), request_of(Action.UNSHELVE, fan=0, sequence=1)]
+    _, alarms = feed(core, [prediction_of(with_step(5.0, 2.0, fans=2, fan=1)), *asked])
+    assert {each.transition for each in alarms} >= {Transition.RAISED, Transition.ACKNOWLEDGED, Transition.REFUSED}
+    for each in alarms:
+        assert each.fan_name == each.label.partition(" (")[0] == ("CPU", "rear top")[each.fan]
+        assert each.message == f"{each.label}: {each.about}" and not each.about.startswith(("fan", each.fan_name))
+    silent = prediction_of(np.zeros((40 * SECOND, 2)), np.zeros((40 * SECOND, 2), np.bool_), first=500)
+    core.step(silent)
+    assert core.problem().startswith("CPU (fan 0), rear top (fan 1) are not scored: ")
+    renamed = core_of(2, names=FanNames(("CPU", "front")))
+    republished = [each for each in renamed.restore(scored_blocks.snapshot_of(core)) if isinstance(each, Alarm)]
+    assert [each.message for each in republished] == ["front (fan 1): the alarm continues from before the restart"]
 
 
 def test_before_an_alarm_the_score_is_at_most_one_and_a_fan_is_suspect_above_a_half() -> None:

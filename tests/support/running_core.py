@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Generic, TypeVar
@@ -17,6 +17,8 @@ from fantwin.schemas.messages import Alarm, Message, Request, Score
 from fantwin.schemas.topics import tray_key
 
 SITE, TRAY, FANS = "hall", "tray1", 4
+Fans = int | Sequence[Mapping[str, str]]
+"""how many fans the tray has, or its entries [[tray.fan]]"""
 TICK_S = 0.02
 SECONDS_A_TICK = 1
 """of the time that the core is given"""
@@ -27,15 +29,21 @@ CoreType = TypeVar("CoreType", bound=SiteCore)
 Answer = Callable[[Request], list[Alarm]]
 
 
+def tray_of(fans: Fans = FANS) -> TrayConfig:
+    """The tray of the site."""
+    given = {"fans": fans} if isinstance(fans, int) else {"fan": fans}
+    return TrayConfig.model_validate({"name": TRAY, "speed_unit": "rpm", **given})
+
+
 class RunningCore(Generic[CoreType]):
     """answer: what the scorer says to a request; the answers are passed back as the bus would."""
 
     def __init__(
-        self, stage: Stage, config: Any, folder: Path, answer: Answer | None = None, fans: int = FANS, **more: Any
+        self, stage: Stage, config: Any, folder: Path, answer: Answer | None = None, fans: Fans = FANS, **more: Any
     ) -> None:
         """more: of the context."""
         self.producer = f"{stage.name}-all-0123"
-        trays = (TrayConfig(name=TRAY, fans=fans, speed_unit="rpm"),)
+        trays = (tray_of(fans),)
         context = replace(Context(SITE, trays, config, folder, folder, 0, producer=self.producer), **more)
         self.core: CoreType = stage.build(context).core  # type: ignore[assignment]
         self.sent: list[Request] = []

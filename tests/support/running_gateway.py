@@ -10,7 +10,7 @@ from typing import Any
 from fantwin.pipeline.outputs.web.config import GatewayConfig
 from fantwin.stages.gateway import STAGE, GatewayCore
 from tests.support.ports import free_port
-from tests.support.running_core import FANS, Answer, RunningCore
+from tests.support.running_core import FANS, Answer, Fans, RunningCore
 
 
 class RunningGateway(RunningCore[GatewayCore]):
@@ -20,7 +20,7 @@ class RunningGateway(RunningCore[GatewayCore]):
         self,
         folder: Path,
         answer: Answer | None = None,
-        fans: int = FANS,
+        fans: Fans = FANS,
         *,
         configuration: str = "",
         started_t_ns: int = 0,

@@ -14,7 +14,7 @@ from asyncua.server.internal_server import InternalServer
 from fantwin.pipeline.outputs.opcua.config import OpcuaConfig
 from fantwin.stages.opcua import STAGE, OpcuaCore
 from tests.support.ports import free_port
-from tests.support.running_core import FANS, Answer, RunningCore
+from tests.support.running_core import FANS, Answer, Fans, RunningCore
 from tests.support.site_users import make_users
 
 _make_standard_nodes = InternalServer.load_standard_address_space
@@ -40,7 +40,7 @@ async def _load_standard_nodes(server: InternalServer, shelf_file: Path | None =
 class RunningOpcua(RunningCore[OpcuaCore]):
     """It listens at `url`, and has an operator and a viewer."""
 
-    def __init__(self, folder: Path, answer: Answer | None = None, fans: int = FANS, **settings: Any) -> None:
+    def __init__(self, folder: Path, answer: Answer | None = None, fans: Fans = FANS, **settings: Any) -> None:
         self.port = free_port()
         self.users = folder / "users.toml"
         folder.mkdir(parents=True, exist_ok=True)

@@ -15,6 +15,7 @@ from fantwin.pipeline.tray_scoring.scorer_config import ScorerConfig
 from fantwin.pipeline.tray_scoring.scorer_core import ScorerCore
 from fantwin.pipeline.tray_scoring.snapshot_store import SnapshotStore
 from fantwin.schemas.enums import Action, InvalidReason
+from fantwin.schemas.fan_names import NO_NAMES, FanNames
 from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Alarm, Prediction, Request, Score, ScorerSnapshot
 from fantwin.schemas.standstill import Standstill
@@ -88,6 +89,7 @@ def core_of(
     is_learned: bool = False,
     started_t_ns: int | None = None,
     config: Mapping[str, Any] | None = None,
+    names: FanNames = NO_NAMES,
     **twin: Any,
 ) -> ScorerCore:
     """A scorer of `twin_of` these."""
@@ -101,6 +103,7 @@ def core_of(
         started_t_ns=started_t_ns,
         is_learned=is_learned,
         is_replayed=lambda: is_replayed,
+        names=names,
     )
 
 

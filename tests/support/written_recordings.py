@@ -53,10 +53,10 @@ def write(path: Path, messages: int, **options: Any) -> Path:
     return writer.path
 
 
-def write_run(path: Path, run: Run, unit: str = "rad/s") -> Path:
-    """A recording of a run, as `fantwin import` makes one of a table. unit: of speed, for people."""
+def write_run(path: Path, run: Run, unit: str = "rad/s", **more: str) -> Path:
+    """A recording of a run, as `fantwin import` makes one of a table. unit: of speed, for people. more: metadata."""
     t_ns = np.rint(run.t_s * 1e9).astype(np.int64)
-    metadata = {"site": "plant", "trays": "tray1", "source": run.name, "speed_unit": unit}
+    metadata = {"site": "plant", "trays": "tray1", "source": run.name, "speed_unit": unit, **more}
     metadata |= {"tacho.tray1": tachos_to_json(run.tacho)} if run.tacho != INSTANTANEOUS else {}
     with RecordingWriter(path, metadata) as writer:
         for sequence, first in enumerate(range(0, run.samples, 100)):

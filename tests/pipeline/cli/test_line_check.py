@@ -95,7 +95,7 @@ def test_tachos_that_count_are_found_in_what_a_line_sends(tacho: str | None, is_
         ),
         ({"rate_hz": 0.2}, "0.2 samples a second: too slow to be judged; let the device send at least 1 a second"),
         ({"rate_hz": 10, "speed_rad_s": 9000.0}, 'speeds up to 9019 rad/s: is speed_unit "rpm"?'),
-        ({"rate_hz": 10, "speed_rad_s": float("nan")}, "no speed of fan 0, 1: is its tacho connected?"),
+        ({"rate_hz": 10, "speed_rad_s": float("nan")}, "no speed of fans 0, 1: is its tacho connected?"),
         ({"rate_hz": 10, "fans": 3}, "samples of 3 fans, [[tray]] says fans = 2: correct one of them"),
     ],
 )
