@@ -19,6 +19,11 @@ def is_one_short_line(text: str) -> bool:
     return len(text) <= LONGEST_NAME and text.isprintable() and text == text.strip()
 
 
+def is_fan_name(text: str) -> bool:
+    """Whether a text can name a fan: it is no number, and not `all`, which commands would take for other fans."""
+    return bool(text) and is_one_short_line(text) and not text.isdecimal() and text.casefold() != "all"
+
+
 def fan_label(number: int, name: str = "") -> str:
     """`CPU (fan 0)`; without a name `fan 0`."""
     return f"{name} (fan {number})" if name else f"fan {number}"

@@ -599,18 +599,28 @@ class Note(_message.Message):
     def __init__(self, tray: _Optional[str] = ..., text: _Optional[str] = ...) -> None: ...
 
 class AcceptedSamples(_message.Message):
-    __slots__ = ("tray", "fans", "command_min", "command_max", "speed_max_rad_s")
+    __slots__ = ("tray", "fans", "command_min", "command_max", "speed_max_rad_s", "named")
     TRAY_FIELD_NUMBER: _ClassVar[int]
     FANS_FIELD_NUMBER: _ClassVar[int]
     COMMAND_MIN_FIELD_NUMBER: _ClassVar[int]
     COMMAND_MAX_FIELD_NUMBER: _ClassVar[int]
     SPEED_MAX_RAD_S_FIELD_NUMBER: _ClassVar[int]
+    NAMED_FIELD_NUMBER: _ClassVar[int]
     tray: str
     fans: int
     command_min: float
     command_max: float
     speed_max_rad_s: float
-    def __init__(self, tray: _Optional[str] = ..., fans: _Optional[int] = ..., command_min: _Optional[float] = ..., command_max: _Optional[float] = ..., speed_max_rad_s: _Optional[float] = ...) -> None: ...
+    named: _containers.RepeatedCompositeFieldContainer[NamedFan]
+    def __init__(self, tray: _Optional[str] = ..., fans: _Optional[int] = ..., command_min: _Optional[float] = ..., command_max: _Optional[float] = ..., speed_max_rad_s: _Optional[float] = ..., named: _Optional[_Iterable[_Union[NamedFan, _Mapping]]] = ...) -> None: ...
+
+class NamedFan(_message.Message):
+    __slots__ = ("name", "place")
+    NAME_FIELD_NUMBER: _ClassVar[int]
+    PLACE_FIELD_NUMBER: _ClassVar[int]
+    name: str
+    place: str
+    def __init__(self, name: _Optional[str] = ..., place: _Optional[str] = ...) -> None: ...
 
 class LatencyBucket(_message.Message):
     __slots__ = ("upper_s", "count")

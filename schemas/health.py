@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from fantwin.schemas.enums import StageStatus
+from fantwin.schemas.fan_names import FanNames
 from fantwin.schemas.header import Header
 
 
@@ -68,6 +69,14 @@ class Note:
 
 
 @dataclass(frozen=True, kw_only=True)
+class NamedFan:
+    """What people call a fan, and where it is; empty: not known."""
+
+    name: str = ""
+    place: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
 class AcceptedSamples:
     """What an acquisition accepts of the clients that push samples of a tray; commands in the tray's unit."""
 
@@ -76,6 +85,12 @@ class AcceptedSamples:
     command_min: float
     command_max: float
     speed_max_rad_s: float
+    named: tuple[NamedFan, ...] = ()
+
+    @property
+    def names(self) -> FanNames:
+        """Names of the fans."""
+        return FanNames(tuple(fan.name for fan in self.named))
 
 
 @dataclass(frozen=True, kw_only=True)

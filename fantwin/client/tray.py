@@ -88,6 +88,11 @@ class Tray:
         """Number of fans of the tray, as the configuration of the site says."""
         return self._accepts.fans
 
+    @property
+    def fan_names(self) -> tuple[str, ...]:
+        """Name of each fan in the configuration of the site; empty for a fan without one."""
+        return tuple(map(self._accepts.names.name, range(self.fans)))
+
     def publish(
         self,
         t: Time | Sequence[Time] | NDArray[Any],
@@ -236,10 +241,11 @@ class Tray:
         least, most = limits_of_float32(low, high)
         wrong = ~((commands >= least) & (commands <= most))  # NaN is in no range
         if wrong.any():
-            row, fan = np.argwhere(wrong)[0]
+            row, fan = np.argwhere(wrong)[0].tolist()
+            which = f"{commands[row, fan]:g} of {self._accepts.names.label(fan)}, sample {row}"
             raise errors.CommandError(
-                f"tray {self.name}: command {commands[row, fan]:g} of fan {fan}, sample {row}: a command must be known "
-                f"and within command_min = {low:g} to command_max = {high:g}"
+                f"tray {self.name}: command {which}: a command must be known and within command_min = {low:g} to "
+                f"command_max = {high:g}"
             )
 
     def _check_thread(self) -> None:

@@ -32,7 +32,7 @@ from fantwin.pipeline.sources.source import (
 )
 from fantwin.pipeline.timebase.host_clock import HostClock
 from fantwin.schemas.channels import CHANNELS
-from fantwin.schemas.health import AcceptedSamples
+from fantwin.schemas.health import AcceptedSamples, NamedFan
 from fantwin.schemas.messages import Command, PushedSamples, Raw, StatedTacho
 from fantwin.schemas.topics import most_samples
 from fantwin.schemas.units import NS_PER_S, RAD_S_PER_UNIT
@@ -167,6 +167,7 @@ class AcquisitionCore(Core):
             command_min=tray.command_min,
             command_max=tray.command_max,
             speed_max_rad_s=speed_max_rad_s,
+            named=tuple(NamedFan(name=fan.name, place=fan.place) for fan in tray.fan) if any(tray.names.names) else (),
         )
 
     def _problem_of_host_clock(self) -> str:

@@ -27,7 +27,7 @@ from fantwin.pipeline.errors import UsageError, UserError
 from fantwin.pipeline.sources.kinds import parse_source
 from fantwin.pipeline.sources.serial.config import MOST_FANS_ON_LINE
 from fantwin.pipeline.sources.source import MOST_FANS, SourceConfig, too_many_fans
-from fantwin.schemas.fan_names import LONGEST_NAME, FanNames, fan_label, is_one_short_line
+from fantwin.schemas.fan_names import LONGEST_NAME, FanNames, fan_label, is_fan_name, is_one_short_line
 from fantwin.schemas.tacho import INSTANTANEOUS, Tacho, Tachos, tacho_of_each_fan
 from fantwin.schemas.topics import RESERVED_TRAY_NAMES
 from fantwin.schemas.units import SpeedUnit
@@ -229,7 +229,7 @@ class FanConfig(Section):
     def _tells_fans_apart(cls, value: str) -> str:
         if not value:
             raise ValueError("an empty name: give one, or write [[tray.fan]] for each fan and leave out name")
-        if value.isdecimal() or value.casefold() == "all":
+        if not is_fan_name(value):
             raise ValueError("a number, or `all`, is no name: it would be taken for other fans")
         return value
 

@@ -86,6 +86,8 @@ class PollingSource(ABC):
         self._is_connected = False
         self._thread: threading.Thread | None = None
         self._sequence = 0
+        self.fans_called: tuple[tuple[str, str], ...] = ()
+        """name and place of each fan, where the device says so"""
 
     @property
     @abstractmethod

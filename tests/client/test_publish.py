@@ -57,7 +57,7 @@ def client(endpoint: str, raws: Raws) -> Iterator[Client]:
 def test_samples_arrive_with_their_times_numbers_and_units(endpoint: str, raws: Raws, tmp_path: Path) -> None:
     with acquisition(push_config(endpoint, tmp_path)), fantwin.client.connect(endpoint, site=SITE) as client:
         tray = client.tray(TRAY, speed_unit="rpm")
-        assert tray.fans == 2
+        assert tray.fans == 2 and tray.fan_names == ("", "")
         tray.publish(T_S, command=[0.25, 0.5], speed=[1500.0, np.nan])
         tray.publish(round((T_S + 0.01) * 1e9), command=[0.25, 0.5], speed=[1501.0, 2000.0])
         tray.publish(datetime.fromtimestamp(T_S + 0.02, UTC), command=[0.3, 0.5], speed=[1502.0, 2001.0])
@@ -86,14 +86,15 @@ def test_samples_arrive_with_their_times_numbers_and_units(endpoint: str, raws: 
 def test_what_cannot_be_a_sample_of_the_tray_is_refused_at_once(
     endpoint: str, client: Client, raws: Raws, tmp_path: Path
 ) -> None:
-    with acquisition(push_config(endpoint, tmp_path)):
+    with acquisition(push_config(endpoint, tmp_path, '["CPU", "rear top"]')):
         tray = client.tray(TRAY)
+        assert tray.fan_names == ("CPU", "rear top")
         tray.publish(T_S, [0.5, 0.5], [1.0, 1.0])
         with pytest.raises(FanCountError, match=r"command has shape \(3,\); 1 samples of 2 fans have shape \(1, 2\)"):
             tray.publish(T_S + 1, [0.5] * 3, [1.0] * 3)
         with pytest.raises(FanCountError, match="speed has shape"):
             tray.publish(T_S + 1, [0.5] * 2, [1.0])
-        with pytest.raises(CommandError, match="command nan of fan 1, sample 0"):
+        with pytest.raises(CommandError, match=r"command nan of rear top \(fan 1\), sample 0"):
             tray.publish(T_S + 1, [0.5, np.nan], [1.0, 1.0])
         with pytest.raises(CommandError, match="within command_min = 0 to command_max = 1"):
             tray.publish(T_S + 1, [1.5, 0.5], [1.0, 1.0])

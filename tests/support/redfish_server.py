@@ -62,7 +62,9 @@ class Controller:
         if path in fan_paths:
             n = fan_paths.index(path)
             speed = {"Reading": self.percent[n], "SpeedRPM": self.rpm[n]}
-            return {"Id": str(n + 1), "Name": f"FAN{n + 1}", "SpeedPercent": speed, "Status": {"State": "Enabled"}}
+            return {"Id": str(n + 1), "Name": f"FAN{n + 1}", "SpeedPercent": speed, "Status": {"State": "Enabled"}} | (
+                {"PhysicalContext": "Intake"} if n else {"Location": {"PartLocation": {"ServiceLabel": "Fan bay 1"}}}
+            )
         return None
 
 

@@ -24,7 +24,7 @@ SITE, TRAY = "plant", "tray1"
 
 
 def push_config(
-    endpoint: str, folder: Path, fans: int = 2, source: str = '{ kind = "push" }', more: str = ""
+    endpoint: str, folder: Path, fans: int | str = 2, source: str = '{ kind = "push" }', more: str = ""
 ) -> Config:
     """A site of one tray."""
     text = f"""

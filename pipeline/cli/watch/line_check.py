@@ -7,6 +7,7 @@ only: they are listened to while acquisition runs, as clients need it to begin.
 
 from __future__ import annotations
 
+import json
 import queue
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -16,10 +17,12 @@ from typing import Any
 import numpy as np
 
 from fantwin.pipeline.acquisition.raw_samples import RawSamples
+from fantwin.pipeline.acquisition.sample_blocks import SampleBlocks
 from fantwin.pipeline.bus.session import join_bus
 from fantwin.pipeline.config.settings import Config, TrayConfig
 from fantwin.pipeline.prediction.tray_twin import TrayTwin, load_tray_twin, twin_path
 from fantwin.pipeline.runtime.stage import Context, StageError, load_stage
+from fantwin.pipeline.sources.polling import PollingSource
 from fantwin.pipeline.sources.tacho_evidence import find_tacho, tacho_hints
 from fantwin.pipeline.timebase.device_clock import UINT32
 from fantwin.pipeline.timebase.grid_timing import GridTiming, grid_rate_hz, is_too_slow, leaves_gaps
@@ -35,6 +38,7 @@ FASTEST_FAN_RAD_S = 5000.0
 RATE_TOLERANCE = 0.01
 LISTEN_FOR_TACHOS_S = 60
 PUSHED_LATER = "clients push its samples: they are checked only while `fantwin up` runs; run doctor again then"
+_KEYS = ("name", "place")
 Finding = tuple[bool, str]
 """in order or not, and one line"""
 
@@ -47,7 +51,9 @@ def check_line(context: Context, config: Config, seconds: float, *, is_running: 
     tray = context.tray
     if tray.source.takes_pushed and not is_running:
         return [(True, f"{tray.name}: {PUSHED_LATER}")]
-    samples, problem = (_from_bus(config, tray, seconds), "") if is_running else _from_source(context, seconds)
+    samples, problem, called = (
+        (_from_bus(config, tray, seconds), "", ()) if is_running else _from_source(context, seconds)
+    )
     found = [(False, f"{tray.name}: {problem}")] if problem else []
     if not samples:
         return found or [(False, f"{tray.name}: no sample in {FIRST_SAMPLE_S:g} s")]
@@ -55,11 +61,25 @@ def check_line(context: Context, config: Config, seconds: float, *, is_running: 
     if tray.twin is not None:
         with suppress(StageError):  # the twin integrator reports it
             twin = load_tray_twin(twin_path(tray, context.folder), tray.fans)
+    if any(name for name, _ in called) and not any(tray.names.names):
+        found.append((True, f"{tray.name}: its device names the fans: to show these, write {_as_toml(called)}"))
     return [*found, *((ok, f"{tray.name}: {line}") for ok, line in _findings(samples, tray, config, twin))]
 
 
-def _from_source(context: Context, seconds: float) -> tuple[list[Raw], str]:
-    """The samples that acquisition would publish, and what it would report as its problem."""
+def _as_toml(called: Sequence[tuple[str, str]]) -> str:
+    """Fans with names and places, in the place of `fans`."""
+    fans = (
+        ", ".join(
+            f"{key} = {json.dumps(value, ensure_ascii=False)}" for key, value in zip(_KEYS, fan, strict=True) if value
+        )
+        for fan in called
+    )
+    return f"fan = [{', '.join(f'{{ {each} }}' for each in fans)}]"
+
+
+def _from_source(context: Context, seconds: float) -> tuple[list[Raw], str, Sequence[tuple[str, str]]]:
+    """The samples that acquisition would publish, what it would report as its problem, and what the device calls the
+    fans and their places."""
     settings = context.config.model_copy(update={"block_s": 0.0})
     built = load_stage("acquisition").build(Context(**(vars(context) | {"config": settings})))
     core, source = built.core, built.source
@@ -79,7 +99,9 @@ def _from_source(context: Context, seconds: float) -> tuple[list[Raw], str]:
     finally:
         source.stop()
     problem = core.problem()
-    return samples, problem or refusal(core.counters())
+    device = source.source if isinstance(source, SampleBlocks) else source
+    called = device.fans_called if isinstance(device, PollingSource) else ()
+    return samples, problem or refusal(core.counters()), called
 
 
 def refusal(counters: Mapping[str, int]) -> str:

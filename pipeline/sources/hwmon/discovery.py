@@ -11,6 +11,7 @@ from fantwin.pipeline.sources.found import Found, free_name
 from fantwin.pipeline.sources.hwmon.chip_folder import ChipFolder, chip_folders, chip_words
 from fantwin.pipeline.sources.hwmon.chip_table import chip_of
 from fantwin.pipeline.sources.hwmon.config import ROOT
+from fantwin.schemas.fan_names import is_fan_name
 
 HIGHEST_RPM = 20_000
 
@@ -70,7 +71,7 @@ def _of_chip(chip: ChipFolder, chips: Sequence[ChipFolder], root: Path, names: s
         source["root"] = str(root)
     keys = {
         "name": free_name(chip.name, names),
-        "fans": len(fans),
+        "fans": _names(chip, fans),
         "speed_unit": "rpm",
         "speed_max": HIGHEST_RPM,
         "command_max": 255,
@@ -94,3 +95,11 @@ def _number(chip: ChipFolder, file: str) -> int | None:
 def _label(chip: ChipFolder, fan: int) -> str:
     label = chip.label("fan", fan)
     return f" ({label})" if label else ""
+
+
+def _names(chip: ChipFolder, fans: Sequence[int]) -> list[str]:
+    """What the kernel calls them, as the board says; else the chip's own `fan2`, by which a technician finds them."""
+    own = [f"fan{fan}" for fan in fans]
+    labels = [chip.label("fan", fan) for fan in fans]
+    names = [label if is_fan_name(label) else name for label, name in zip(labels, own, strict=True)]
+    return names if len({name.casefold() for name in names}) == len(names) else own

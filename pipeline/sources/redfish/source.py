@@ -17,6 +17,7 @@ from fantwin.pipeline.sources.polling import DeviceError, PollingSource
 from fantwin.pipeline.sources.redfish.config import RedfishConfig
 from fantwin.pipeline.sources.source import Reading, Rejected, SourceContext
 from fantwin.schemas.channels import TEMPERATURE
+from fantwin.schemas.fan_names import is_fan_name, is_one_short_line
 
 if TYPE_CHECKING:
     from sushy.main import Sushy
@@ -95,6 +96,7 @@ class RedfishSource(PollingSource):
     def read(self) -> Reading | Rejected:
         """Speeds and commands of the fans, and the temperature if asked for."""
         fans = self._chosen(self._fan_objects())
+        self.fans_called = tuple((_name(fan), _place(fan)) for fan in fans)
         command = tuple(_number(fan, self._config.command) for fan in fans)
         if all(map(math.isnan, command)):
             return Rejected(
@@ -205,6 +207,20 @@ def _link(value: Any) -> str:
 def _list(value: Json, key: str) -> list[Json]:
     found = value.get(key)
     return [each for each in found if isinstance(each, Mapping)] if isinstance(found, list) else []
+
+
+def _name(fan: Json) -> str:
+    """What the controller calls a fan; empty where that can be no name."""
+    return next((name for key in ("Name", "FanName") if is_fan_name(name := str(fan.get(key, "")))), "")
+
+
+def _place(fan: Json) -> str:
+    """Where the controller says it is, by the label on the chassis or by the context; may be empty."""
+    location = fan.get("Location")
+    part = location.get("PartLocation") if isinstance(location, Mapping) else None
+    label = part.get("ServiceLabel") if isinstance(part, Mapping) else None
+    places = (str(each) for each in (label, fan.get("PhysicalContext")) if each)
+    return next(filter(is_one_short_line, places), "")
 
 
 def _number(value: Any, pointer: str) -> float:

@@ -10,7 +10,10 @@ from typing import Any
 import pytest
 import trustme
 
+from fantwin.pipeline.cli.watch.line_check import check_line
+from fantwin.pipeline.config.loading import parse_config
 from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.runtime.stage import Context
 from fantwin.pipeline.sources.polling import DeviceError
 from fantwin.pipeline.sources.redfish.config import RedfishConfig
 from fantwin.pipeline.sources.redfish.source import RedfishSource
@@ -43,12 +46,28 @@ def test_the_newer_schema_gives_speed_and_percent() -> None:
     with redfish_server(controller) as url:
         made = connected(url, temperature="Intake")
         assert reading(made) == Reading((40.0, 42.0), (4000.0, 4200.0), measured={TEMPERATURE: (22.0, 22.0)})
+        assert made.fans_called == (("FAN1", "Fan bay 1"), ("FAN2", "Intake"))
         controller.rpm[1], controller.percent[1] = 0, 100
         assert reading(made).speed == (4000.0, 0.0)
         chosen = connected(f"{url}/redfish/v1/Chassis/1U", 1, fans=["FAN2"])
         assert reading(chosen).command == (100.0,)
         made.disconnect()
         chosen.disconnect()
+
+
+def test_doctor_says_what_to_write_for_the_names_and_places_that_the_controller_gives(tmp_path: Path) -> None:
+    tray = '[[tray]]\nname = "bmc"\nspeed_unit = "rpm"\ncommand_max = 100\n'
+    with redfish_server(Controller(is_new=True)) as url:
+
+        def said(fans: str) -> list[str]:
+            source = f'source = {{ kind = "redfish", url = "{url}" }}'
+            config = parse_config(f"{tray}{fans}\n{source}\n", tmp_path / "site.toml", stages=("acquisition",))
+            context = Context("site", config.trays, config.sections["acquisition"], tmp_path, tmp_path, 0)
+            return [line for _, line in check_line(context, config, 0.5, is_running=False)]
+
+        named = 'fan = [{ name = "FAN1", place = "Fan bay 1" }, { name = "FAN2", place = "Intake" }]'
+        assert f"bmc: its device names the fans: to show these, write {named}" in said("fans = 2")
+        assert not any("names the fans" in line for line in said(named))
 
 
 def test_the_older_schema_gives_speeds_and_the_command_of_the_vendor() -> None:

@@ -42,6 +42,27 @@ def test_each_chip_with_fans_is_a_tray_that_reads_what_is_there(root: Path) -> N
     assert any("not known" in note for note in found[2].notes)
 
 
+def test_a_fan_is_called_as_the_kernel_calls_it_or_as_its_chip_counts_it(root: Path) -> None:
+    def names() -> list[str]:
+        trays = parse_config(next(iter(discover_hwmon(root))).toml, Path("fantwin.toml")).trays
+        return list(trays[0].names.names)
+
+    labels = root / "hwmon2" / "fan1_label", root / "hwmon2" / "fan2_label"
+    assert names() == ["fan1", "fan2"]
+    for written, expected in (
+        ("CPU Fan", "CPU Fan"),
+        ("Lüfter", "Lüfter"),
+        ("2", "fan1"),
+        ("a\tb", "fan1"),
+        ("", "fan1"),
+    ):
+        labels[0].write_text(f"{written}\n", encoding="utf-8")
+        assert names() == [expected, "fan2"]
+    for label in labels:
+        label.write_text("System Fan\n", encoding="utf-8")
+    assert names() == ["fan1", "fan2"], "a name of two fans is none"
+
+
 def test_no_tree_one_without_fans_and_one_that_may_not_be_written_say_what_is_missing(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
