@@ -213,7 +213,7 @@ class FanConfig(Section):
     """One fan of a tray, as people call it."""
 
     name: str = Field(
-        default="", description="what people call the fan, `CPU`; it comes first wherever the fan is shown"
+        default="", description="what people call the fan: `CPU`"
     )
     place: str = Field(default="", description="where to find it: `rack 3, slot 4`")
 

@@ -24,6 +24,8 @@ CELL = f"{TRAY} fan {FAULTY} alarm"
 FOCUSED = "(document.activeElement.ariaLabel ?? document.activeElement.innerText).replace(/\\s+/g, ' ').trim()"
 SCRIPT = '<img src=x onerror="document.title=1"><script>document.title=1</script>'
 
+NAME = '<img src=x onerror="document.title=1">'
+
 
 class Scorer:
     """Grants what is asked."""
@@ -58,6 +60,29 @@ def gateway(tmp_path: Path, never_silent: None) -> Iterator[RunningGateway]:
 def browser() -> Iterator[Browser]:
     with running_browser() as running:
         yield running
+
+
+def test_a_fan_is_shown_by_its_name_first_on_every_view_and_a_name_is_text(tmp_path, never_silent, browser):
+    errors: list[str] = []
+    fans = [{}, {}, {"name": NAME, "place": "rack <3>"}, {}]
+    label = f"{NAME} ({TRAY} fan {FAULTY})"
+    running = RunningGateway(tmp_path, fans=fans)
+    try:
+        running.feed(score(), alarm(fan_name=NAME, message=f"{NAME} (fan 2): 90 rpm below the twin"))
+        page = opened(browser, f"http://127.0.0.1:{running.port}/", errors)
+        expect(page.locator(".cell", has_text=label)).to_be_visible()
+        expect(page.locator(".cell", has_text=f"{TRAY} fan 0")).to_be_visible()
+        page.goto(f"http://127.0.0.1:{running.port}/#/fan/{TRAY}/{FAULTY}")
+        expect(page.get_by_role("heading", name=label, exact=True)).to_be_visible()
+        expect(page.get_by_text("rack <3>: ")).to_be_visible()
+        page.goto(f"http://127.0.0.1:{running.port}/#/alarms")
+        card = page.locator("article", has_text=label)
+        expect(card.get_by_text("90 rpm below the twin", exact=True)).to_be_visible()
+        page.goto(f"http://127.0.0.1:{running.port}/#/history")
+        expect(page.get_by_role("link", name=label)).to_be_visible()
+        assert not errors and page.title() != "1"
+    finally:
+        running.close()
 
 
 def test_everything_is_done_by_keyboard(gateway, browser):
