@@ -237,7 +237,7 @@ class SiteReport:
             is_new = last_onset_t_ns != alarm.onset_t_ns >= self._started_t_ns
             if is_new and not alarm.active and alarm.severity != Severity.NONE:
                 at = clock(alarm.onset_t_ns)
-                self._say(f"{current.severity()}  {fan[0]}  fan {fan[1]}: raised for what began at {at}, and over")
+                self._say(f"{current.severity()}  {fan[0]}  {alarm.label}: raised for what began at {at}, and over")
             if is_new or line != last_line:
                 self._say(line)
             self._alarms[fan] = (line, alarm.onset_t_ns)

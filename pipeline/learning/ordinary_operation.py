@@ -26,6 +26,7 @@ class OrdinaryOperation:
     """The commands of a tray's fans so far."""
 
     def __init__(self, tray: TrayConfig) -> None:
+        self._names = tray.names
         self._range = f"{tray.command_min:g} to {tray.command_max:g}"
         self._low, self._width = tray.command_min, (tray.command_max - tray.command_min) / RANGES
         self._seconds = np.zeros((tray.fans, RANGES))
@@ -61,15 +62,16 @@ class OrdinaryOperation:
         """What each fan has not done yet, a few words for each that lacks something."""
         visited = (self._seconds >= NEEDED_S).sum(axis=1)
         return [
-            f"fan {fan}: {self._range_of(fan)}, {NEEDED_S:.0f} s each in {visited[fan]} tenths of {self._range} "
-            f"({NEEDED_RANGES} needed), {self._changes[fan]} changes ({NEEDED_CHANGES} needed)"
+            f"{self._names.label(fan)}: {self._range_of(fan)}, {NEEDED_S:.0f} s each in {visited[fan]} tenths of "
+            f"{self._range} ({NEEDED_RANGES} needed), {self._changes[fan]} changes ({NEEDED_CHANGES} needed)"
             for fan in range(len(visited))
             if visited[fan] < NEEDED_RANGES or self._changes[fan] < NEEDED_CHANGES
         ]
 
     def held(self) -> list[str]:
         """Which fans never changed their command by more than a tenth of the range, a few words for each."""
-        return [f"fan {fan}: {self._range_of(fan)}" for fan in np.flatnonzero(self._changes == 0).tolist()]
+        still = np.flatnonzero(self._changes == 0).tolist()
+        return [f"{self._names.label(fan)}: {self._range_of(fan)}" for fan in still]
 
     def _range_of(self, fan: int) -> str:
         low, high = self._lowest[fan], self._highest[fan]

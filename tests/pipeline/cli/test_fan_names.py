@@ -38,14 +38,14 @@ def raw(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_run(tmp_path_factory.mktemp("raw") / "raw.mcap", published_run(1, 20.0, fans=3), **METADATA)
 
 
-def shown(*words: object) -> str:
-    done = fantwin(*words)
+def shown(name: str, *words: object) -> str:
+    done = fantwin(name, *words)
     assert done.exit_code in (0, 1), done.stderr
     return " ".join(done.stdout.split())
 
 
-def document(*words: object) -> dict[str, Any]:
-    return json.loads(fantwin(*words, "--json").stdout)
+def document(name: str, *words: object) -> dict[str, Any]:
+    return json.loads(fantwin(name, *words, "--json").stdout)
 
 
 def test_a_recording_is_listed_exported_and_drawn_with_the_names_of_its_fans(scored: Path, tmp_path: Path) -> None:
