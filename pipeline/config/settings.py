@@ -212,9 +212,7 @@ def _require_stages(names: Iterable[str]) -> None:
 class FanConfig(Section):
     """One fan of a tray, as people call it."""
 
-    name: str = Field(
-        default="", description="what people call the fan: `CPU`"
-    )
+    name: str = Field(default="", description="what people call the fan: `CPU`")
     place: str = Field(default="", description="where to find it: `rack 3, slot 4`")
 
     @field_validator("name", "place")
