@@ -12,7 +12,8 @@ import numpy as np
 from fantwin.pipeline.config.settings import FanConfig, TrayConfig
 from fantwin.pipeline.recordings.clips.clip import Clip
 from fantwin.pipeline.site.fan_history import Curves
-from fantwin.pipeline.site.fleet import SHOWN_CLASSES, Fan, FanGroup, FanNow
+from fantwin.pipeline.site.fans_json import fans_json, live_values
+from fantwin.pipeline.site.fleet import SHOWN_CLASSES, Fan
 from fantwin.pipeline.site.site_model import SiteModel
 from fantwin.pipeline.site.stage_states import StageState
 from fantwin.schemas.channels import CHANNELS
@@ -65,28 +66,14 @@ def site_json(model: SiteModel, viewer_urls: Mapping[str, str]) -> dict[str, Any
 
 
 def fleet_json(model: SiteModel) -> dict[str, Any]:
-    """All fans at a glance: class and level of each cell, a byte each, in base64."""
+    """All fans at a glance: class and level of each cell, a byte each, in base64; of a small site also the speeds."""
     classes, score = model.fans_now()
     level = np.where(np.isnan(score), NO_LEVEL, (np.nan_to_num(score, posinf=9.0) * 100).clip(0, LEVELS))
     return {
         "classes": _packed(classes),
         "levels": _packed(level.astype(np.uint8)),
         "counts": model.counts(),
-    }
-
-
-def fan_json(now: FanNow) -> dict[str, Any]:
-    """One fan in a list."""
-    return {
-        "tray": now.fan.tray,
-        "fan": now.fan.number,
-        "name": now.about.name,
-        "place": now.about.place,
-        "state": now.state,
-        "group": str(now.group),
-        "score": None if math.isnan(now.score) else round(now.score, 4),
-        "since_t_ns": now.since_t_ns,
-        "in_alarm": now.group == FanGroup.ALARM,
+        "values": live_values(model),
     }
 
 
@@ -94,7 +81,7 @@ def fan_in_full(model: SiteModel, fan: Fan) -> dict[str, Any]:
     """One fan with its alarm and its twin."""
     alarm, twin = model.current_alarm(fan), model.twin(fan.tray)
     return {
-        **fan_json(model.fan_now(fan)),
+        **fans_json(model, [model.fan_now(fan)])[0],
         "newest_t_ns": model.newest_t_ns(fan.tray),
         "alarm": alarm_json(alarm, model.about(fan)) | {"now": model.words_now([fan])[0]} if alarm else None,
         "twin": twin_json(twin, fan.number) if twin else None,

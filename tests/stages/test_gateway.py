@@ -14,11 +14,15 @@ from typing import Any
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
+from fantwin.pipeline.config.settings import TrayConfig
+from fantwin.pipeline.outputs.web import answers as typed
 from fantwin.pipeline.outputs.web.app import LARGEST_BODY_BYTES
 from fantwin.pipeline.outputs.web.config import GatewayConfig
 from fantwin.pipeline.recordings.clips.clip import Clip, ClipAlarm, clips_as_text
+from fantwin.pipeline.site.fans_json import MOST_LIVE, fans_json
 from fantwin.pipeline.site.fleet import Fan
-from fantwin.pipeline.site.site_json import alarms_json, curves_json, fan_in_full, fan_json, rates_json, site_json
+from fantwin.pipeline.site.site_json import alarms_json, curves_json, fan_in_full, fleet_json, rates_json, site_json
+from fantwin.pipeline.site.site_model import SiteModel
 from fantwin.schemas.enums import Action, FanState, Severity, Transition
 from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Diagnosis, ScorerSnapshot
@@ -54,6 +58,14 @@ def test_what_the_api_says_of_fans_alarms_and_curves_is_what_the_messages_said(g
         (3, "unknown: gap"),
     ]
     assert fans[1]["score"] == 0.5
+    worst, well, _, unjudged = fans
+    assert (worst["speed"], worst["speed_unit"], worst["command"]) == (1000.0, "rpm", 0.5)
+    assert (worst["cause"], worst["probability"]) == ("drag", 0.8)
+    assert (worst["deviation_percent"], worst["deviation"]) == (-0.9901, "90 rpm below the twin (limit 50)")
+    assert (well["cause"], well["probability"], well["deviation"]) == ("", None, "")
+    assert (unjudged["speed"], unjudged["deviation_percent"]) == (1000.0, None), (
+        "it has a speed, and nothing to compare"
+    )
     assert client.ask("GET", "/api/v1/fans?state=alarm")[1]["fans"] == fans[:1]
     assert client.ask("GET", "/api/v1/fans?state=not_judged")[1]["fans"] == fans[3:]
     status, body, _ = client.ask("GET", "/api/v1/fans?state=alarms")
@@ -85,7 +97,7 @@ def test_every_answer_has_the_type_that_the_description_declares_and_leaves_noth
     model, tray = gateway.core._model, gateway.core._model.trays[0]
     made = {
         "/site": site_json(model, {}),
-        "/fans": {"fans": [fan_json(each) for each in model.every_fan()]},
+        "/fans": {"fans": fans_json(model, model.every_fan())},
         f"/fans/{TRAY}/2": fan_in_full(model, Fan(TRAY, 2)),
         f"/fans/{TRAY}/2/curves": curves_json(model.history(Fan(TRAY, 2), 0), tray),
         "/alarms": alarms_json(model, everything=False),
@@ -93,6 +105,7 @@ def test_every_answer_has_the_type_that_the_description_declares_and_leaves_noth
     }
     for path, expected in made.items():
         assert Client(gateway).ask("GET", f"/api/v1{path}")[1] == json.loads(json.dumps(expected)), path
+    assert typed.Fans.model_validate(made["/fans"]).model_dump(mode="json") == made["/fans"], "it is not checked there"
     described = Client(gateway).ask("GET", "/api/v1/openapi.json")[1]
     for path, methods in described["paths"].items():
         for operation in methods.values():
@@ -115,7 +128,15 @@ def test_live_events_bring_an_alarm_and_the_samples_of_the_fan_that_is_looked_at
             if line == f"event: {wanted}\n":
                 return json.loads(stream.readline().decode().removeprefix("data: "))
 
-    assert event("fleet")["counts"] == {"in_alarm": 0, "suspect": 0, "not_judged": 1, "silenced": 0}
+    fleet = event("fleet")
+    assert fleet["counts"] == {"in_alarm": 0, "suspect": 0, "not_judged": 1, "silenced": 0}
+    assert fleet["values"] == {
+        "speed": [1000.0] * 4,
+        "command": [0.5] * 4,
+        "deviation_percent": [-0.9901, -0.9901, -0.9901, None],
+    }
+    large = SiteModel(SITE, (TrayConfig(name=TRAY, fans=MOST_LIVE + 1),))
+    assert fleet_json(large)["values"] is None, "a large site sends two bytes a fan, and answers with the speeds"
     gateway.feed(score(1.0))
     assert event("samples")["measured"] == [1000.0] * 5
     gateway.feed(alarm())

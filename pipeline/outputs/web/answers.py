@@ -71,7 +71,12 @@ class Site(BaseModel):
 
 
 class Fan(BaseModel):
-    """A fan in a list. score: relative to its limit; null: not judged."""
+    """A fan in a list; null: not known now.
+
+    name, place: empty where the configuration gives none. score: relative to its limit. deviation_percent: of the
+    measured speed from the twin. deviation: in words, of an active alarm; cause, probability: its most probable causes,
+    and that of the first.
+    """
 
     tray: str
     fan: int
@@ -82,6 +87,13 @@ class Fan(BaseModel):
     score: float | None
     since_t_ns: int
     in_alarm: bool
+    speed: float | None
+    speed_unit: str
+    command: float | None
+    deviation_percent: float | None
+    deviation: str
+    cause: str
+    probability: float | None
 
 
 class Fans(BaseModel):

@@ -1,0 +1,96 @@
+"""The fans of a site as JSON: each with what it does now, how far it is off, and why."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from fantwin.pipeline.site.fan_history import CURVES
+from fantwin.pipeline.site.fleet import FanGroup, FanNow
+from fantwin.pipeline.site.site_model import SiteModel
+from fantwin.schemas.messages import Array
+from fantwin.schemas.units import RAD_S_PER_UNIT
+from fantwin.scoring.alarms.alarm_text import deviation_in
+from fantwin.scoring.alarms.current_alarms import CurrentAlarm
+from fantwin.scoring.diagnosis.causes import CANNOT_TELL, likely_causes
+
+MOST_LIVE = 256
+"""fans whose speeds are in each live event of the fleet; those of a larger site are asked for"""
+_MEASURED, _PREDICTED, _COMMAND = map(CURVES.index, ("measured_speed_rad_s", "predicted_speed_rad_s", "command"))
+_LEAST_PREDICTED_RAD_S = 1.0
+"""a deviation in percent of a lower speed says nothing"""
+_UNKNOWN = (None, None, None)
+
+Row = tuple[float | None, float | None, float | None]
+"""speed in the unit of the tray, command, and deviation of the speed from the twin in percent; None: not known"""
+
+
+def fans_json(model: SiteModel, fans: Sequence[FanNow]) -> list[dict[str, Any]]:
+    """Fans of the site in this order."""
+    rows, units = _rows(model), {tray.name: str(tray.speed_unit) for tray in model.trays}
+    alarms = {(each.newest.header.tray, each.newest.fan): each for each in model.current_alarms()}
+    found: list[dict[str, Any]] = []
+    for now in fans:
+        tray, number = now.fan
+        of_tray = rows.get(tray)
+        speed, command, deviation = of_tray[number] if of_tray else _UNKNOWN
+        found.append(
+            {
+                "tray": tray,
+                "fan": number,
+                "name": "",
+                "place": "",
+                "state": now.state,
+                "group": str(now.group),
+                "score": None if math.isnan(now.score) else round(now.score, 4),
+                "since_t_ns": now.since_t_ns,
+                "in_alarm": now.group == FanGroup.ALARM,
+                "speed": speed,
+                "speed_unit": units[tray],
+                "command": command,
+                "deviation_percent": deviation,
+                **_of_alarm(alarms.get((tray, number)), number),
+            }
+        )
+    return found
+
+
+def live_values(model: SiteModel) -> dict[str, list[float | None]] | None:
+    """Columns of `Row` of all fans, in the order of the cells; None: there are too many."""
+    if sum(tray.fans for tray in model.trays) > MOST_LIVE:
+        return None
+    rows = _rows(model)
+    of_fans = [row for tray in model.trays for row in rows.get(tray.name) or [_UNKNOWN] * tray.fans]
+    return {name: [row[at] for row in of_fans] for at, name in enumerate(("speed", "command", "deviation_percent"))}
+
+
+def _rows(model: SiteModel) -> Mapping[str, Sequence[Row]]:
+    """Of the fans of each tray that is heard."""
+    per_unit = {tray.name: RAD_S_PER_UNIT[tray.speed_unit] for tray in model.trays}
+    found: dict[str, Sequence[Row]] = {}
+    for tray in model.trays_now():
+        if tray.is_heard:
+            measured, predicted, command = (tray.values[:, at] for at in (_MEASURED, _PREDICTED, _COMMAND))
+            usual = np.where(predicted >= _LEAST_PREDICTED_RAD_S, predicted, np.nan)
+            columns = measured / per_unit[tray.tray], command, 100.0 * (measured - predicted) / usual
+            found[tray.tray] = list(zip(*map(_known, columns), strict=True))
+    return found
+
+
+def _known(values: Array) -> list[float | None]:
+    return [None if math.isnan(value) else float(f"{value:.5g}") for value in values.tolist()]
+
+
+def _of_alarm(alarm: CurrentAlarm | None, fan: int) -> dict[str, Any]:
+    """Words of an active alarm; empty where there is none."""
+    if alarm is None or not alarm.newest.active:
+        return {"deviation": "", "cause": "", "probability": None}
+    causes = alarm.causes
+    return {
+        "deviation": deviation_in(alarm.raised.message, fan) if alarm.raised else "",
+        "cause": likely_causes(causes),
+        "probability": causes[0].probability if causes and causes[0].cause != CANNOT_TELL else None,
+    }
