@@ -323,8 +323,8 @@ def _check_shape(layout: _Layout, column: _PackedColumn, values: Array, samples:
 _Kind = TypeVar("_Kind", bound=Message)
 
 
-def decode_together(kind: type[_Kind], payloads: Sequence[bytes]) -> list[_Kind]:
-    """Messages of one type and one producer as few blocks as they allow, usually one.
+def decode_together(kind: type[_Kind], payloads: Sequence[bytes], names: Collection[str] | None = None) -> list[_Kind]:
+    """Messages of one type and one producer as few blocks as they allow, usually one. names: as in `decode`.
 
     Protobuf appends the packed columns of messages that are parsed one after the other, so many messages cost little
     more than one. Where their columns do not fit together, each is decoded by itself. (A producer has one number of
@@ -336,10 +336,10 @@ def decode_together(kind: type[_Kind], payloads: Sequence[bytes]) -> list[_Kind]
     if not payloads:
         return []
     try:
-        together = _once(decode(kind, b"".join(payloads)), len(payloads))
+        together = _once(decode(kind, b"".join(payloads), names), len(payloads))
     except CodecError:
         together = None
-    return [decode(kind, payload) for payload in payloads] if together is None else [together]
+    return [decode(kind, payload, names) for payload in payloads] if together is None else [together]
 
 
 def _once(message: _Kind, payloads: int) -> _Kind | None:

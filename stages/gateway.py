@@ -19,9 +19,11 @@ from fantwin.pipeline.http_server import HttpServer, listen
 from fantwin.pipeline.outputs.web.config import GatewayConfig
 from fantwin.pipeline.outputs.web.live_feed import LiveFeed
 from fantwin.pipeline.recordings.clips.clip import clip_folder
+from fantwin.pipeline.recordings.time_range import RecordedRange
 from fantwin.pipeline.runtime.stage import BuiltStage, Context, Stage
 from fantwin.pipeline.site.alarm_history import FILE, AlarmHistory
 from fantwin.pipeline.site.fan_history import curves_of
+from fantwin.pipeline.site.fan_series import FanSeries
 from fantwin.pipeline.site.fleet import Fan
 from fantwin.pipeline.site.other_stages import VIEWER, configured, expected_stages, recordings_of, viewer_urls
 from fantwin.pipeline.site.request_desk import RequestDesk
@@ -152,7 +154,9 @@ def build(context: Context) -> BuiltStage:
     )
     feed, desk = LiveFeed(), RequestDesk(context.producer)
     recorders, viewers = configured(context, RECORDER), configured(context, VIEWER)
-    clip_folders = tuple(dict.fromkeys(map(clip_folder, recordings_of(recorders) if recorders else ())))
+    recordings = recordings_of(recorders) if recorders else ()
+    clip_folders = tuple(dict.fromkeys(map(clip_folder, recordings)))
+    series = FanSeries(model, RecordedRange(recordings) if recordings else None)
     config: GatewayConfig = context.config
     tls = shown = None
     if config.certificate and config.key:
@@ -160,7 +164,8 @@ def build(context: Context) -> BuiltStage:
         tls, shown = server_context(certificate, context.resolve(config.key)), read_certificate(certificate)
     access = Access(config, Users(context.resolve(config.users)) if config.users else None)
     listening = listen(config.host, config.port + context.shard_number - 1, "gateway")
-    app = application(Api(model, access, feed, desk, viewer_urls(viewers) if viewers else {}, clip_folders), config)
+    urls = viewer_urls(viewers) if viewers else {}
+    app = application(Api(model, access, feed, desk, urls, series, clip_folders), config)
     server = HttpServer(app, listening, tls, MOST_CONNECTIONS, feed.end)
     return BuiltStage(GatewayCore(model, feed, desk, server, access, shown))
 

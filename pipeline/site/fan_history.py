@@ -1,4 +1,8 @@
-"""The last hour of every fan, a sample every few seconds: what a page draws before its live samples begin."""
+"""The last hour of every fan, a row every few seconds: what a page draws before its live samples begin.
+
+A row of a small site has the least, mean and largest value of all samples since the row before; of a large one, whose
+samples are not all read, it is one sample.
+"""
 
 from __future__ import annotations
 
@@ -26,6 +30,8 @@ CURVES = (
     "command",
 )
 """of a fan, in the order of the last axis, before its channels; NaN where nothing was measured or judged"""
+SERIES = ("deviation_rad_s", *CURVES, *(each.name for each in CHANNELS))
+"""the same with all channels and, first, how far the measured speed is above the twin's"""
 COLUMNS = (
     "command",
     "measured_speed_rad_s",
@@ -62,53 +68,136 @@ def channels_of(score: Score) -> tuple[str, ...]:
 
 
 class FanHistory:
-    """Of all fans of a site, in a ring for each tray."""
+    """Of all fans of a site, in a ring for each tray.
+
+    Attributes:
+        is_complete: each row stands for all samples since the one before.
+        step_ns: between two rows.
+    """
 
     def __init__(self, trays: Sequence[TrayConfig]) -> None:
-        step_s = FINE_STEP_S if sum(tray.fans for tray in trays) <= FINE_UP_TO else COARSE_STEP_S
-        self._rings = {tray.name: _Ring(tray.fans, step_s) for tray in trays}
+        self.is_complete = sum(tray.fans for tray in trays) <= FINE_UP_TO
+        self.step_ns = round((FINE_STEP_S if self.is_complete else COARSE_STEP_S) * NS_PER_S)
+        kind = _FineRing if self.is_complete else _Ring
+        self._rings = {tray.name: kind(tray.fans, self.step_ns) for tray in trays}
 
     def add(self, score: Score) -> None:
-        """Keep the last sample of a score with `COLUMNS`, if the one before is a step older. Time that goes back, as in
-        a replay that begins again, empties the ring."""
-        ring = self._rings[score.header.tray]
-        ring.have(channels_of(score))
-        ring.add(int(score.t_ns[-1]), values_of(score, ring.channels, -1))
+        """Keep a score with `COLUMNS`; where not all are kept, its last sample if the one before is a step older. Time
+        that goes back, as in a replay that begins again, empties the ring."""
+        self._rings[score.header.tray].add(score)
 
     def of(self, tray: str, fan: int, since_t_ns: int) -> Curves:
         """What is kept of a fan, oldest first."""
         return self._rings[tray].of(fan, since_t_ns)
 
+    def series(self, tray: str, fan: int) -> tuple[Array, Array, Array, Array]:
+        """All that is kept of a fan, oldest first: times (n,), and least, mean and largest values (n, len(SERIES))."""
+        return self._rings[tray].series(fan)
+
 
 class _Ring:
-    def __init__(self, fans: int, step_s: float) -> None:
-        self._step_ns = round(step_s * NS_PER_S)
-        self._points = round(HISTORY_S / step_s)
+    """Single samples."""
+
+    def __init__(self, fans: int, step_ns: int) -> None:
+        self._step_ns = step_ns
+        self._points = HISTORY_S * NS_PER_S // step_ns
         self._t_ns = np.zeros(self._points, np.int64)
         self._values = np.full((self._points, fans, len(CURVES)), np.nan, np.float32)
         self._count = 0
         """all that were added"""
+        self._began_t_ns: int | None = None
+        """time of the first score in the newest row"""
         self.channels: tuple[str, ...] = ()
 
-    def have(self, channels: tuple[str, ...]) -> None:
-        """Room for channels that are measured for the first time."""
-        new = tuple(name for name in channels if name not in self.channels)
+    def add(self, score: Score) -> None:
+        t_ns, new = int(score.t_ns[-1]), tuple(name for name in channels_of(score) if name not in self.channels)
         if new:
-            room = np.full((*self._values.shape[:2], len(new)), np.nan, np.float32)
-            self._values, self.channels = np.concatenate((self._values, room), axis=-1), (*self.channels, *new)
+            self.channels = (*self.channels, *new)
+            self.widen(len(new))
+        if self._count and t_ns < self._t_ns[(self._count - 1) % self._points]:
+            self._count, self._began_t_ns = 0, None
+        begins = self._began_t_ns is None or t_ns - self._began_t_ns >= self._step_ns
+        if begins:
+            self._count, self._began_t_ns = self._count + 1, t_ns
+        self.keep(score, (self._count - 1) % self._points, begins=begins)
 
-    def add(self, t_ns: int, values: Array) -> None:
-        newest_t_ns = int(self._t_ns[(self._count - 1) % self._points]) if self._count else None
-        if newest_t_ns is not None and t_ns < newest_t_ns:
-            self._count, newest_t_ns = 0, None
-        if newest_t_ns is None or t_ns - newest_t_ns >= self._step_ns:
-            self._t_ns[self._count % self._points], self._values[self._count % self._points] = t_ns, values
-            self._count += 1
+    def widen(self, channels: int) -> None:
+        """Room for channels that are measured for the first time."""
+        self._values = _widened(self._values, channels)
+
+    def keep(self, score: Score, row: int, *, begins: bool) -> None:
+        if begins:
+            self._t_ns[row], self._values[row] = score.t_ns[-1], values_of(score, self.channels, -1)
 
     def of(self, fan: int, since_t_ns: int) -> Curves:
-        order = np.arange(max(0, self._count - self._points), self._count) % self._points
+        order = self._order()
         order = order[self._t_ns[order] >= since_t_ns]
         return Curves(self._t_ns[order], self._values[order, fan], self.channels)
+
+    def series(self, fan: int) -> tuple[Array, Array, Array, Array]:
+        order = self._order()
+        values = in_series(self._values[order, fan], self.channels)
+        return self._t_ns[order], values, values, values
+
+    def _order(self) -> Array:
+        return np.arange(max(0, self._count - self._points), self._count) % self._points
+
+
+class _FineRing(_Ring):
+    """The mean of all samples as values, and the extremes."""
+
+    def __init__(self, fans: int, step_ns: int) -> None:
+        super().__init__(fans, step_ns)
+        shape = self._points, fans, 1 + len(CURVES)
+        self._low, self._high = np.full(shape, np.nan, np.float32), np.full(shape, np.nan, np.float32)
+        self._total, self._samples = np.zeros((2, fans, len(CURVES)))
+        """of the newest row"""
+
+    def widen(self, channels: int) -> None:
+        super().widen(channels)
+        self._low, self._high = _widened(self._low, channels), _widened(self._high, channels)
+        self._total, self._samples = (np.pad(each, ((0, 0), (0, channels))) for each in (self._total, self._samples))
+
+    def keep(self, score: Score, row: int, *, begins: bool) -> None:
+        values = values_of(score, self.channels, np.s_[:])
+        with_deviation = np.concatenate((_deviation(values), values), axis=-1)
+        low, high = np.fmin.reduce(with_deviation), np.fmax.reduce(with_deviation)
+        if begins:
+            self._total[:], self._samples[:] = 0.0, 0.0
+        else:
+            low, high = np.fmin(low, self._low[row]), np.fmax(high, self._high[row])
+        self._total += np.nan_to_num(values).sum(axis=0)
+        self._samples += np.isfinite(values).sum(axis=0)
+        with np.errstate(invalid="ignore"):
+            self._values[row] = self._total / np.where(self._samples, self._samples, np.nan)
+        self._t_ns[row], self._low[row], self._high[row] = score.t_ns[-1], low, high
+
+    def series(self, fan: int) -> tuple[Array, Array, Array, Array]:
+        order = self._order()
+        low, high = (_with_channels(each[order, fan], self.channels) for each in (self._low, self._high))
+        mean = in_series(self._values[order, fan], self.channels)
+        return self._t_ns[order], low, np.fmin(np.fmax(mean, low), high), high
+
+
+def _widened(values: Array, channels: int) -> Array:
+    room = np.full((*values.shape[:-1], channels), np.nan, np.float32)
+    return np.concatenate((values, room), axis=-1)
+
+
+def _deviation(values: Array) -> Array:
+    return values[..., :1] - values[..., 1:2]
+
+
+def in_series(values: Array, channels: Sequence[str]) -> Array:
+    """Curves and these channels (n, ...) as columns of `SERIES`."""
+    return _with_channels(np.concatenate((_deviation(values), values), axis=-1), channels)
+
+
+def _with_channels(values: Array, channels: Sequence[str]) -> Array:
+    """Columns of `SERIES`, of which those of other channels are NaN."""
+    found = np.full((len(values), len(SERIES)), np.nan, np.float32)
+    found[:, [*range(1 + len(CURVES)), *map(SERIES.index, channels)]] = values
+    return found
 
 
 def values_of(score: Score, channels: Sequence[str], at: Any) -> Array:

@@ -257,9 +257,19 @@ class SiteModel:
 
     def history(self, fan: Fan, since_t_ns: int) -> Curves:
         """The last hour of a fan."""
-        assert self._history is not None, "no curves are kept"
         with self._lock:
-            return self._history.of(fan.tray, fan.number, since_t_ns)
+            return self.kept.of(fan.tray, fan.number, since_t_ns)
+
+    @property
+    def kept(self) -> FanHistory:
+        """The last hour of all fans."""
+        assert self._history is not None, "no curves are kept"
+        return self._history
+
+    def series(self, fan: Fan) -> tuple[Array, Array, Array, Array]:
+        """The last hour of a fan with its extremes: `FanHistory.series`."""
+        with self._lock:
+            return self.kept.series(fan.tray, fan.number)
 
     def newest_t_ns(self, tray: str) -> int:
         """Time of the newest sample of a tray; 0: there was none."""

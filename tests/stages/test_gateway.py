@@ -11,6 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
@@ -19,14 +20,17 @@ from fantwin.pipeline.outputs.web import answers as typed
 from fantwin.pipeline.outputs.web.app import LARGEST_BODY_BYTES
 from fantwin.pipeline.outputs.web.config import GatewayConfig
 from fantwin.pipeline.recordings.clips.clip import Clip, ClipAlarm, clips_as_text
+from fantwin.pipeline.recordings.writing import RecordingWriter
 from fantwin.pipeline.site.fans_json import MOST_LIVE, fans_json
 from fantwin.pipeline.site.fleet import Fan
 from fantwin.pipeline.site.site_json import alarms_json, curves_json, fan_in_full, fleet_json, rates_json, site_json
 from fantwin.pipeline.site.site_model import SiteModel
 from fantwin.schemas.enums import Action, FanState, Severity, Transition
 from fantwin.schemas.header import Header
-from fantwin.schemas.messages import Diagnosis, ScorerSnapshot
+from fantwin.schemas.messages import Diagnosis, Raw, ScorerSnapshot
+from fantwin.schemas.topics import tray_key
 from fantwin.scoring.wear.recorded_wear import shown
+from tests.support.made_messages import filled
 from tests.support.running_chain import eventually
 from tests.support.running_core import FANS, SITE, TRAY
 from tests.support.running_gateway import Client, RunningGateway
@@ -346,6 +350,31 @@ def test_clips_of_alarms_are_listed_and_downloaded_and_nothing_else_of_the_disk_
     assert headers["content-length"] == str(size)
     for name in ("gone.mcap", "recording.json", "..%2Fsecret.json", "../secret.json", "%2Fetc%2Fpasswd", "x%00"):
         assert client.ask("GET", f"/api/v1/clips/{name}", headers=viewer)[0] == 404
+
+
+def test_a_fan_is_shown_over_any_range_from_the_recordings_of_this_host(opened, tmp_path):
+    (tmp_path / "runs").mkdir()
+    t_ns = NOW_NS + np.arange(3600) * 10**9
+    sent = filled(Raw, 3600, 4, host_receive_t_ns=t_ns, speed_rad_s=100.0, command=50.0, header=Header("a", 0, TRAY))
+    with RecordingWriter(tmp_path / "runs" / "recording.mcap", {"site": SITE, "trays": TRAY}) as writer:
+        writer.add_message(tray_key(SITE, TRAY, "raw"), sent, int(t_ns[-1]))
+    text = f'[[tray]]\nname = "{TRAY}"\nfans = 4\n[recorder]\n[gateway]\n'
+    client = Client(opened(tmp_path, configuration=text))
+    begin = NOW_NS / 1e9
+    path = f"/api/v1/fans/{TRAY}/1/series?from={begin}&to={begin + 3600}&points="
+    status, body, _ = client.ask("GET", f"{path}60")
+    assert (status, len(body["t_s"]), body["bucket_s"], body["speed_unit"]) == (200, 60, 60.0, "rpm")
+    assert typed.Series.model_validate(body).model_dump() == body
+    assert set(body["columns"]["measured"]["max"]) == {954.93}
+    status, table, headers = client.ask("GET", f"{path}2&format=csv")
+    assert (status, headers["content-type"]) == (200, "text/csv; charset=utf-8")
+    assert headers["content-disposition"] == f'attachment; filename="{TRAY}-fan1.csv"'
+    assert table.startswith("time,deviation_rpm_min,deviation_rpm_mean")
+    assert len(table.splitlines()) == 3
+    assert client.ask("GET", f"{path}4001")[0] == 422
+    assert client.ask("GET", f"/api/v1/fans/{TRAY}/1/series?from=2&to=1")[1] == {"error": "from: is not before to"}
+    status, unseen, _ = client.ask("GET", f"/api/v1/fans/{TRAY}/1/series")
+    assert (status, unseen["t_s"]) == (200, []), "nothing was ever heard"
 
 
 def test_a_stage_that_the_configuration_asks_for_and_that_never_came_is_shown_as_missing(opened, tmp_path):

@@ -209,6 +209,55 @@ class Curves(BaseModel):
     command: list[float | None]
 
 
+class Extremes(BaseModel):
+    """A column of `Series`: least, mean and largest value at each point; null: not known."""
+
+    min: list[float | None]
+    mean: list[float | None]
+    max: list[float | None]
+
+
+class Mark(BaseModel):
+    """A transition of the alarm of a fan, or an act of an operator on it."""
+
+    t_s: float
+    onset_t_ns: int
+    transition: str
+    severity: str
+    active: bool
+    message: str
+    operator_name: str
+    comment: str
+
+
+class CausesFrom(BaseModel):
+    """How probable each cause is from a time on, until the next; none: there is no alarm."""
+
+    t_s: float
+    probabilities: dict[str, float]
+
+
+class Series(BaseModel):
+    """A fan over a range of time. Points lie at `t_s`; where samples are missing there is one whose values are null.
+
+    columns: `deviation` (measured minus predicted), `measured`, `predicted`, `half_width` of the band, all in the unit
+    of the tray; `torque_balance_command`, `command`, `score` (1 is the limit), and the channels that are measured.
+    bucket_s: what a point stands for. note: what is missing, and why.
+    """
+
+    tray: str
+    fan: int
+    speed_unit: str
+    from_s: float
+    to_s: float
+    bucket_s: float
+    t_s: list[float]
+    columns: dict[str, Extremes]
+    marks: list[Mark]
+    causes: list[CausesFrom]
+    note: str
+
+
 class Transition(BaseModel):
     """A transition of an alarm. feedback: the last one on its alarm."""
 

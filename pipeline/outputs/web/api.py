@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -21,6 +23,7 @@ from fantwin.pipeline.outputs.web.live_feed import EventStream, LiveFeed, Shared
 from fantwin.pipeline.outputs.web.metrics import metrics_text
 from fantwin.pipeline.recordings.clips.clip import Clip, kept_clips
 from fantwin.pipeline.site.fan_history import HISTORY_S
+from fantwin.pipeline.site.fan_series import FanSeries
 from fantwin.pipeline.site.fans_json import fans_json
 from fantwin.pipeline.site.fleet import Fan, FanGroup
 from fantwin.pipeline.site.request_desk import RequestDesk, RequestForm
@@ -40,7 +43,11 @@ from fantwin.pipeline.site.site_model import SiteModel
 from fantwin.schemas.units import NS_PER_S
 
 MOST_LISTED = 500
+MOST_POINTS = 4000
+MOST_SERIES, MOST_SERIES_WAITING = 2, 64
+"""series that are read at once, and that wait for it"""
 CLIP_TYPE = "application/octet-stream"
+CSV_TYPE = "text/csv"
 METRICS_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 ALL_FANS = "all"
 
@@ -59,6 +66,7 @@ _RESPONSES: dict[int | str, dict[str, Any]] = {
 }
 _EVENTS: dict[int | str, dict[str, Any]] = {200: {"content": {"text/event-stream": {}}, "description": "live events"}}
 _FILE: dict[int | str, dict[str, Any]] = {200: {"content": {CLIP_TYPE: {}}, "description": "an MCAP file"}}
+_TABLE: dict[int | str, dict[str, Any]] = {200: {"content": {CSV_TYPE: {}}, "description": "JSON, or a table"}}
 _REFUSED: dict[int | str, dict[str, Any]] = {409: {"model": typed.Refused, "description": "the scorer has refused it"}}
 
 
@@ -72,9 +80,13 @@ class Api:
     desk: RequestDesk
     viewer_urls: Mapping[str, str]
     """by tray, of Rerun's viewer for browsers; none where it is not served"""
+    series: FanSeries
+    """reads recordings"""
     clip_folders: Sequence[Path] = ()
     """of the alarm clips of recorders on this host"""
     _shared: dict[str, SharedAnswer] = field(default_factory=dict[str, SharedAnswer], init=False)
+    _reads: asyncio.Semaphore = field(default_factory=lambda: asyncio.Semaphore(MOST_SERIES), init=False)
+    _waiting: set[object] = field(default_factory=set[object], init=False)
 
     def routes(self) -> APIRouter:
         """Which path answers what, as which type, and to whom."""
@@ -84,6 +96,7 @@ class Api:
         get("/fans", self.fans, response_model=typed.Fans)
         get("/fans/{tray}/{fan}", self.fan, response_model=typed.FanInFull)
         get("/fans/{tray}/{fan}/curves", self.curves, response_model=typed.Curves)
+        get("/fans/{tray}/{fan}/series", self.series_of, response_model=typed.Series, responses=_TABLE)
         get("/alarms", self.alarms, response_model=typed.Alarms)
         get("/alarms/history", self.alarm_history, response_model=typed.History)
         get("/alarm-rate", self.alarm_rate, response_model=typed.Rates)
@@ -120,6 +133,44 @@ class Api:
         found = self._fan(tray, fan)
         since_t_ns = self.model.newest_t_ns(tray) - seconds * NS_PER_S
         return curves_json(self.model.history(found, since_t_ns), self._tray(tray))
+
+    async def series_of(
+        self,
+        request: Request,
+        tray: str,
+        fan: int,
+        begin_s: Annotated[
+            float | None, Query(ge=0, le=4e9, alias="from", description="seconds since 1970; default: an hour")
+        ] = None,
+        end_s: Annotated[
+            float | None, Query(ge=0, le=4e9, alias="to", description="seconds since 1970; default: now")
+        ] = None,
+        points: Annotated[int, Query(ge=1, le=MOST_POINTS)] = 1000,
+        format: Literal["json", "csv"] = "json",
+    ) -> Response:
+        """A fan over any range of time, in at most so many points: of each the least, mean and largest value."""
+        found = self._fan(tray, fan)
+        end_ns = (self.model.newest_t_ns(tray) or time.time_ns()) + 1 if end_s is None else round(end_s * NS_PER_S)
+        begin_ns = end_ns - HISTORY_S * NS_PER_S if begin_s is None else round(begin_s * NS_PER_S)
+        if begin_ns >= end_ns:
+            raise HTTPException(422, "from: is not before to")
+        if len(self._waiting) >= MOST_SERIES_WAITING:
+            raise HTTPException(503, "too many ask for series: try again")
+        self._waiting.add(request)
+        try:
+            async with self._reads:
+                if await request.is_disconnected():
+                    return Response()
+                make = self.series.as_csv if format == "csv" else self.series.as_json
+                made = await asyncio.to_thread(make, found, max(begin_ns, 0), end_ns, points)
+        except UserError as error:
+            raise HTTPException(503, "the history cannot be read: see the problem of the gateway") from error
+        finally:
+            self._waiting.discard(request)
+        if isinstance(made, str):
+            headers = {"Content-Disposition": f'attachment; filename="{tray}-fan{fan}.csv"'}
+            return Response(made, media_type=CSV_TYPE, headers=headers)
+        return JSONResponse(made)
 
     async def alarms(self, request: Request, all: bool = False) -> Response:
         """The current alarms, or also those that are over."""

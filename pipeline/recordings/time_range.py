@@ -1,0 +1,84 @@
+"""The samples of a tray in a range of time, from the recordings of a run that still grows.
+
+Only the chunks of the range are opened, one at a time: a day is read in seconds, whatever the size of the recordings.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import suppress
+from pathlib import Path
+
+from fantwin.pipeline.recordings.indexed import IndexedRecording
+from fantwin.pipeline.recordings.parts import part_files
+from fantwin.pipeline.recordings.reading import read_metadata
+from fantwin.pipeline.recordings.records import ACTIVE_SUFFIX, CORRUPT_DATA_ERRORS, RecordingError, whole_number
+from fantwin.schemas.codec import CodecError, decode_together
+from fantwin.schemas.messages import Raw, Score
+from fantwin.schemas.units import NS_PER_S
+
+LATEST_NS = 60 * NS_PER_S
+"""a message of samples was received at most so long after them, and not before"""
+_KINDS: dict[str, type[Raw | Score]] = {"score": Score, "raw": Raw}
+"""the topics that have samples of people's interest, the better one first"""
+_ENDLESS_NS = (1 << 63) - 1
+
+
+class RecordedRange:
+    """The recordings of a run; used in several threads.
+
+    Attributes:
+        unread: files that could not be read in full, by name.
+    """
+
+    def __init__(self, recordings: Sequence[Path]) -> None:
+        """recordings: the first part of each, NAME.mcap."""
+        self._recordings = recordings
+        self._spans: dict[tuple[Path, int], tuple[int, int]] = {}
+        """of finished parts, by path and size: when their first and last messages were received"""
+
+    def blocks(
+        self, tray: str, begin_ns: int, end_ns: int, columns: Collection[str], unread: set[str]
+    ) -> Iterator[Score | Raw]:
+        """The scores of a tray, and where a part has none, its raw samples, in the order they were recorded.
+
+        The first and last messages may reach beyond the range. unread: gets the names of files that cannot be read in
+        full.
+        """
+        for path in self._parts(begin_ns, end_ns + LATEST_NS):
+            try:
+                indexed = IndexedRecording(path, tuple(_KINDS), tray)
+            except (OSError, RecordingError):
+                unread.add(path.name)
+                continue
+            topics = {topic for _, topic in indexed.channels.values()}
+            topic = next((name for name in _KINDS if name in topics), None)
+            for chunk in indexed.chunks if topic else ():
+                if chunk.message_end_time < begin_ns or chunk.message_start_time > end_ns + LATEST_NS:
+                    continue
+                try:
+                    found = indexed.envelopes(chunk)
+                    wanted = [each.payload for each in found if each.topic == topic and each.newest_t_ns >= begin_ns]
+                    yield from decode_together(_KINDS[topic or ""], wanted, columns)
+                except (OSError, CodecError, *CORRUPT_DATA_ERRORS):
+                    unread.add(path.name)
+
+    def _parts(self, begin_ns: int, end_ns: int) -> list[Path]:
+        """Those that may have messages received in the range, the oldest first."""
+        found: list[Path] = []
+        for recording in self._recordings:
+            with suppress(OSError):
+                for _, path in sorted(part_files(recording)):
+                    with suppress(OSError, RecordingError):
+                        first_ns, last_ns = self._span(path)
+                        found += [path] if first_ns <= end_ns and last_ns >= begin_ns else []
+        return found
+
+    def _span(self, path: Path) -> tuple[int, int]:
+        if path.name.endswith(ACTIVE_SUFFIX):
+            return whole_number(read_metadata(path).metadata.get("started_t_ns", "")) or 0, _ENDLESS_NS
+        key = path, path.stat().st_size
+        if key not in self._spans:
+            indexed = IndexedRecording(path)
+            self._spans[key] = indexed.first_ns, indexed.last_ns
+        return self._spans[key]

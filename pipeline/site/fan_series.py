@@ -1,0 +1,187 @@
+"""A fan over any range of days: what the gateway has kept of the last hour, and before that the recordings.
+
+Of each part of the range there are the least, mean and largest value. With it come the transitions of the fan's alarm,
+and how probable each cause was when.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from io import StringIO
+from typing import Any
+
+import numpy as np
+
+from fantwin.pipeline.recordings.time_range import RecordedRange
+from fantwin.pipeline.site.buckets import Buckets, Points
+from fantwin.pipeline.site.fan_history import COLUMNS, CURVES, SERIES, channels_of, in_series, values_of
+from fantwin.pipeline.site.fleet import Fan
+from fantwin.pipeline.site.site_model import SiteModel
+from fantwin.schemas.channels import BY_NAME, measured_columns
+from fantwin.schemas.messages import Alarm, Array, Raw, Score
+from fantwin.schemas.units import NS_PER_S, RAD_S_PER_UNIT
+from fantwin.scoring.alarms.current_alarms import current_alarm
+from fantwin.scoring.diagnosis.causes import short_name
+
+MOST_MARKS = 1000
+_BEFORE = 50
+"""transitions before the range that are looked at for the alarm at its beginning"""
+_SPEEDS = ("deviation_rad_s", *CURVES[:3])
+_NAMES = {
+    "deviation_rad_s": "deviation",
+    "measured_speed_rad_s": "measured",
+    "predicted_speed_rad_s": "predicted",
+    "band_half_width_rad_s": "half_width",
+}
+_READ = (*COLUMNS, "speed_rad_s")
+
+
+@dataclass(frozen=True)
+class FanSeries:
+    """What is known of one fan in a range of time, its end left out."""
+
+    model: SiteModel
+    recorded: RecordedRange | None
+    """None: no recorder of this host records the site"""
+
+    def points(self, fan: Fan, begin_ns: int, end_ns: int, points: int) -> tuple[Points, int, str]:
+        """The points, the width of the parts of the range in ns, and a note about what is missing."""
+        history = self.model.kept
+        t_ns, low, mean, high = self.model.series(fan)
+        live_ns = int(t_ns[0]) if len(t_ns) else end_ns
+        uses_live = live_ns < end_ns and len(t_ns) > 0 and int(t_ns[-1]) >= begin_ns
+        buckets = Buckets(begin_ns, end_ns, points, len(SERIES), history.step_ns if uses_live else 1)
+        if uses_live:
+            buckets.add(t_ns, mean, low, high)
+        recorded_ns = min(end_ns, live_ns) if uses_live and history.is_complete else end_ns
+        notes: list[str] = []
+        if begin_ns < recorded_ns:
+            if self.recorded is None:
+                notes.append("older times are not shown: no recorder of this host records them")
+            else:
+                notes += self._add_recorded(self.recorded, buckets, fan, begin_ns, recorded_ns)
+        return buckets.points(), buckets.width_ns, "; ".join(notes)
+
+    def _add_recorded(
+        self, recorded: RecordedRange, buckets: Buckets, fan: Fan, begin_ns: int, end_ns: int
+    ) -> list[str]:
+        unread: set[str] = set()
+        has_raw = False
+        tray = self.model.tray(fan.tray)
+        for block in recorded.blocks(fan.tray, begin_ns, end_ns, _READ, unread):
+            if tray and block.fans == tray.fans:
+                t_ns = np.asarray(block.t_ns if isinstance(block, Score) else block.host_receive_t_ns)
+                before = np.flatnonzero(t_ns < end_ns)
+                buckets.add(t_ns[before], _series_of(block, fan.number)[before])
+                has_raw |= isinstance(block, Raw)
+        notes = [f"{name} cannot be read in full" for name in sorted(unread)]
+        return (
+            [*notes, "of recorded times only what was measured: twin and score are not recorded"] if has_raw else notes
+        )
+
+    def as_json(self, fan: Fan, begin_ns: int, end_ns: int, points: int) -> dict[str, Any]:
+        """The points as columns by name, marks, and causes; speeds in the unit of the tray."""
+        found, width_ns, note = self.points(fan, begin_ns, end_ns, points)
+        scales = _scales(RAD_S_PER_UNIT[self._speed_unit(fan)])
+        kinds = {"min": found.low / scales, "mean": found.mean / scales, "max": found.high / scales}
+        has = np.isfinite(found.mean).any(axis=0)
+        columns = {
+            _NAMES.get(name, name): {kind: _or_null(values[:, at]) for kind, values in kinds.items()}
+            for at, name in enumerate(SERIES)
+            if has[at] or name not in BY_NAME
+        }
+        return {
+            "tray": fan.tray,
+            "fan": fan.number,
+            "speed_unit": self._speed_unit(fan),
+            "from_s": begin_ns / NS_PER_S,
+            "to_s": end_ns / NS_PER_S,
+            "bucket_s": width_ns / NS_PER_S,
+            "t_s": (found.t_ns / NS_PER_S).round(3).tolist(),
+            "columns": columns,
+            **self._alarms(fan, begin_ns, end_ns),
+            "note": note,
+        }
+
+    def as_csv(self, fan: Fan, begin_ns: int, end_ns: int, points: int) -> str:
+        """The points as a table, with the unit in the name of a column of speeds."""
+        found, _, _ = self.points(fan, begin_ns, end_ns, points)
+        unit = self._speed_unit(fan).replace("/", "_")
+        scales = _scales(RAD_S_PER_UNIT[self._speed_unit(fan)])
+        has = [at for at, name in enumerate(SERIES) if name not in BY_NAME or np.isfinite(found.mean[:, at]).any()]
+        text = StringIO()
+        rows = csv.writer(text, lineterminator="\n")
+        names = [f"{_NAMES[SERIES[at]]}_{unit}" if SERIES[at] in _NAMES else SERIES[at] for at in has]
+        rows.writerow(["time", *(f"{name}_{kind}" for name in names for kind in ("min", "mean", "max"))])
+        kinds = np.stack([found.low / scales, found.mean / scales, found.high / scales], axis=-1)[:, has]
+        for t_ns, values in zip(found.t_ns.tolist(), kinds.reshape(len(kinds), -1).tolist(), strict=True):
+            time = datetime.fromtimestamp(t_ns / NS_PER_S, UTC).isoformat(timespec="milliseconds")
+            rows.writerow([time, *("" if value != value else f"{value:.6g}" for value in values)])  # noqa: PLR0124  NaN
+        return text.getvalue()
+
+    def _speed_unit(self, fan: Fan) -> Any:
+        tray = self.model.tray(fan.tray)
+        assert tray, "only fans of the site are asked for"
+        return tray.speed_unit
+
+    def _alarms(self, fan: Fan, begin_ns: int, end_ns: int) -> dict[str, Any]:
+        """Marks, and the probabilities of causes as steps: each holds until the next; none: there is no alarm.
+
+        Raises:
+            UserError: the history cannot be read.
+        """
+        of_fan: dict[str, Any] = {"tray": fan.tray, "fan": fan.number}
+        past = self.model.past.between(0, begin_ns, _BEFORE, **of_fan, is_backwards=True)
+        marks = self.model.past.between(begin_ns, end_ns, MOST_MARKS, **of_fan)
+        before = current_alarm(list(reversed(past))) if past else None
+        causes = [_step(begin_ns, before.causes)] if before and before.newest.active and before.causes else []
+        for alarm in marks:
+            if alarm.causes and alarm.active:
+                causes.append(_step(alarm.t_ns, alarm.causes))
+            elif not alarm.active and causes and causes[-1]["probabilities"]:
+                causes.append(_step(alarm.t_ns, ()))
+        return {"marks": [_mark(alarm) for alarm in marks], "causes": causes}
+
+
+def _series_of(block: Score | Raw, fan: int) -> Array:
+    """Of one fan, (n, len(SERIES))."""
+    if isinstance(block, Score):
+        channels = channels_of(block)
+        return in_series(values_of(block, channels, np.s_[:, fan]), channels)
+    channels = measured_columns(block)
+    values = np.full((len(block.host_receive_t_ns), len(CURVES) + len(channels)), np.nan, np.float32)
+    measured = {"measured_speed_rad_s": block.speed_rad_s, "command": block.command}
+    for name, column in measured.items():
+        values[:, CURVES.index(name)] = column[:, fan]
+    for at, column in enumerate(channels.values(), len(CURVES)):
+        values[:, at] = column[:, fan]
+    return in_series(values, tuple(channels))
+
+
+def _scales(rad_s_per_unit: float) -> Array:
+    return np.array([rad_s_per_unit if name in _SPEEDS else 1.0 for name in SERIES])
+
+
+def _or_null(values: Array) -> list[float | None]:
+    return [None if value != value else float(f"{value:.5g}") for value in values.tolist()]  # noqa: PLR0124  NaN
+
+
+def _step(t_ns: int, causes: Sequence[Any]) -> dict[str, Any]:
+    probabilities = {short_name(each.cause): each.probability for each in causes}
+    return {"t_s": t_ns / NS_PER_S, "probabilities": probabilities}
+
+
+def _mark(alarm: Alarm) -> dict[str, Any]:
+    return {
+        "t_s": alarm.t_ns / NS_PER_S,
+        "onset_t_ns": alarm.onset_t_ns,
+        "transition": alarm.transition.name.lower(),
+        "severity": alarm.severity.name.lower(),
+        "active": alarm.active,
+        "message": alarm.message,
+        "operator_name": alarm.operator_name,
+        "comment": alarm.comment,
+    }

@@ -1,0 +1,169 @@
+"""A fan over any range of time, from the live history and from recordings: nothing odd is lost by decimation."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import replace
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fantwin.pipeline.config.settings import TrayConfig
+from fantwin.pipeline.recordings.indexed import IndexedRecording
+from fantwin.pipeline.recordings.time_range import RecordedRange
+from fantwin.pipeline.recordings.writing import RecordingWriter
+from fantwin.pipeline.site.alarm_history import AlarmHistory
+from fantwin.pipeline.site.fan_history import HISTORY_S
+from fantwin.pipeline.site.fan_series import FanSeries
+from fantwin.pipeline.site.fleet import Fan
+from fantwin.pipeline.site.site_model import SiteModel
+from fantwin.schemas.enums import Transition
+from fantwin.schemas.envelope import Envelope
+from fantwin.schemas.header import Header
+from fantwin.schemas.messages import Alarm, Diagnosis, Message, Raw, Score
+from fantwin.schemas.topics import tray_key
+from tests.support.made_messages import alarm, filled
+
+TRAY, FANS, SITE = "tray1", 2, "hall"
+FAN = Fan(TRAY, 1)
+START_NS = 1_790_000_000_000_000_000
+STEP_NS = 10_000_000
+BLOCK = 100
+SPIKE = 7.0
+"""V, in one sample of fan 1; otherwise the supply has 12 V"""
+
+
+def score(number: int, **given: Any) -> Score:
+    """A second of samples at 100 Hz; fan 1 runs 3 rad/s below its twin."""
+    t_ns = START_NS + (number * BLOCK + np.arange(BLOCK)) * STEP_NS
+    values: dict[str, Any] = {"measured_speed_rad_s": 297.0, "predicted_speed_rad_s": 300.0, "band_variance": 16.0}
+    values |= {"command": 50.0, "score": 0.5, "torque_balance_command": 0.1, "supply_voltage_v": 12.0, "state": 0}
+    header = Header("scorer-1", number, TRAY)
+    return filled(Score, BLOCK, FANS, header=header, period_ns=STEP_NS, t_ns=t_ns, **values, **given)
+
+
+def raw(number: int) -> Raw:
+    """The same as a source sent it."""
+    made = score(number)
+    given = {"command": 50.0, "speed_rad_s": 297.0, "supply_voltage_v": 12.0, "host_receive_t_ns": made.t_ns}
+    return filled(Raw, BLOCK, FANS, header=Header("acquisition-1", number, TRAY), **given)
+
+
+def with_spike(message: Any) -> Any:
+    message.supply_voltage_v[57, 1] = SPIKE
+    return message
+
+
+@pytest.fixture
+def model(tmp_path: Path) -> SiteModel:
+    trays = (TrayConfig(name=TRAY, fans=FANS, speed_unit="rad/s"),)
+    return SiteModel(SITE, trays, AlarmHistory(tmp_path / "alarms.sqlite"), keeps_curves=True)
+
+
+def record(folder: Path, *messages: Message, part: int = 1, finish: bool = True) -> RecordedRange:
+    """The messages in a part of a recording, flushed every ten; finish: the recorder has ended it."""
+    name = "recording.mcap" if part == 1 else f"recording-{part}.mcap"
+    writer = RecordingWriter(folder / name, {"site": SITE, "trays": TRAY, "recording": "recording.mcap"})
+    for number, message in enumerate(messages):
+        topic = "raw" if isinstance(message, Raw) else "score"
+        t_ns = message.host_receive_t_ns if isinstance(message, Raw) else message.t_ns  # type: ignore[union-attr]
+        writer.add(Envelope.of(tray_key(SITE, TRAY, topic), message, int(t_ns[-1])))
+        if number % 10 == 9:
+            writer.flush()
+    writer.flush()
+    if finish:
+        writer.finish()
+    return RecordedRange([folder / "recording.mcap"])
+
+
+def at(seconds: float) -> int:
+    return START_NS + round(seconds * 1e9)
+
+
+def test_one_odd_sample_survives_in_the_last_hour_and_a_gap_is_a_gap(model):
+    for number in (*range(60), *range(80, 120)):
+        made = score(number)
+        model.add_decoded_score(TRAY, with_spike(made) if number == 20 else made)
+    found = FanSeries(model, None).as_json(FAN, at(0.99), at(120), 20)
+    columns, t_s = found["columns"], np.array(found["t_s"]) - START_NS / 1e9
+    supply = columns["supply_voltage_v"]
+    assert min(value for value in supply["min"] if value is not None) == SPIKE
+    (spike,) = [point for point, value in enumerate(supply["min"]) if value == SPIKE]
+    assert abs(t_s[spike] - 20.57) <= found["bucket_s"]
+    assert (supply["max"][spike], SPIKE < supply["mean"][spike] < 12.0) == (12.0, True)
+    assert (columns["deviation"]["mean"][0], columns["half_width"]["max"][0]) == (-3.0, 4.0)
+    (hole,) = [point for point, value in enumerate(columns["measured"]["mean"]) if value is None]
+    assert 60 <= t_s[hole] <= 80, "no line is drawn where no samples came"
+    assert len(t_s) <= 21
+    assert found["note"] == ""
+
+
+def test_recordings_continue_the_past_with_every_odd_sample_also_in_the_part_that_is_being_written(model, tmp_path):
+    first = [with_spike(raw(number)) if number == 33 else raw(number) for number in range(100)]
+    record(tmp_path, *first)
+    recorded = record(tmp_path, *(raw(number) for number in range(150, 200)), part=2, finish=False)
+    late = 2 * HISTORY_S
+    model.add_decoded_score(TRAY, replace(score(0), t_ns=score(0).t_ns + late * 10**9))
+    found = FanSeries(model, recorded).as_json(FAN, at(0), at(late + 10), 400)
+    columns, t_s = found["columns"], np.array(found["t_s"]) - START_NS / 1e9
+    supply = np.array(columns["supply_voltage_v"]["min"], float)
+    assert np.nanmin(supply) == SPIKE
+    assert abs(t_s[np.nanargmin(supply)] - 33.57) <= found["bucket_s"]
+    holes = t_s[np.isnan(np.array(columns["measured"]["mean"], float))]
+    assert [100 <= holes[0] <= 150, 200 <= holes[1] <= late, len(holes)] == [True, True, 2]
+    assert columns["deviation"]["mean"][0] is None, "the twin is not recorded"
+    assert columns["deviation"]["mean"][-1] == -3.0, "the last hour knows it"
+    assert found["note"] == "of recorded times only what was measured: twin and score are not recorded"
+    rows = list(csv.DictReader(StringIO(FanSeries(model, recorded).as_csv(FAN, at(33), at(34), 4000))))
+    assert len(rows) == 100, "zoomed in, each sample"
+    (odd,) = [row for row in rows if float(row["supply_voltage_v_min"]) < 12]
+    assert (float(odd["supply_voltage_v_max"]), odd["measured_rad_s_mean"], odd["predicted_rad_s_mean"]) == (
+        SPIKE,
+        "297",
+        "",
+    )
+    assert odd["time"] == "2026-09-21T14:13:53.570+00:00"
+
+
+def test_recorded_scores_are_shown_with_their_twin_and_only_chunks_of_the_range_are_opened(
+    model, tmp_path, monkeypatch
+):
+    messages = [each for number in range(100) for each in (raw(number), score(number))]
+    recorded = record(tmp_path, *messages)
+    opened: list[int] = []
+    envelopes = IndexedRecording.envelopes
+    monkeypatch.setattr(IndexedRecording, "envelopes", lambda self, chunk: opened.append(1) or envelopes(self, chunk))
+    found = FanSeries(model, recorded).as_json(FAN, at(10), at(11), 1000)
+    assert (found["columns"]["deviation"]["mean"], found["note"]) == ([-3.0] * 100, "")
+    assert len(opened) <= 16, "a message may be received a minute late"
+    (tmp_path / "recording.mcap").write_bytes((tmp_path / "recording.mcap").read_bytes()[:-4000])
+    assert FanSeries(model, recorded).as_json(FAN, at(10), at(11), 10)["columns"]["measured"]["mean"]
+
+
+def test_without_recordings_the_answer_says_so(model):
+    assert "no recorder" in FanSeries(model, None).as_json(FAN, at(0), at(10), 10)["note"]
+
+
+def test_marks_are_the_alarm_and_what_operators_did_and_causes_hold_until_the_next_diagnosis(model):
+    def add(seconds: float, transition: Transition, *causes: tuple[str, float], **more: Any) -> Alarm:
+        diagnoses = tuple(Diagnosis(cause=name, probability=share) for name, share in causes)
+        fields = {"t_ns": at(seconds), "onset_t_ns": at(5), "transition": transition, "causes": diagnoses, **more}
+        made = alarm(FAN.number, tray=TRAY, sequence=round(seconds), **fields)
+        model.add_alarm(made)
+        return made
+
+    add(6, Transition.RAISED, ("drag", 0.6), ("drive", 0.4))
+    add(20, Transition.DIAGNOSED, ("drag", 0.9))
+    add(30, Transition.ACKNOWLEDGED, operator_name="ann", comment="seen")
+    add(40, Transition.CLEARED, active=False)
+    whole = FanSeries(model, None).as_json(FAN, at(0), at(60), 10)
+    assert [mark["transition"] for mark in whole["marks"]] == ["raised", "diagnosed", "acknowledged", "cleared"]
+    assert (whole["marks"][2]["operator_name"], whole["marks"][2]["comment"]) == ("ann", "seen")
+    steps = [(round(each["t_s"] - START_NS / 1e9), sorted(each["probabilities"].values())) for each in whole["causes"]]
+    assert steps == [(6, [0.4, 0.6]), (20, [0.9]), (40, [])]
+    inside = FanSeries(model, None).as_json(FAN, at(25), at(35), 10)
+    assert [sorted(each["probabilities"].values()) for each in inside["causes"]] == [[0.9]], "it began before the range"
+    assert FanSeries(model, None).as_json(Fan(TRAY, 0), at(0), at(60), 10)["marks"] == []
