@@ -598,6 +598,28 @@ class Note(_message.Message):
     text: str
     def __init__(self, tray: _Optional[str] = ..., text: _Optional[str] = ...) -> None: ...
 
+class FanLearning(_message.Message):
+    __slots__ = ("progress", "missing")
+    PROGRESS_FIELD_NUMBER: _ClassVar[int]
+    MISSING_FIELD_NUMBER: _ClassVar[int]
+    progress: float
+    missing: str
+    def __init__(self, progress: _Optional[float] = ..., missing: _Optional[str] = ...) -> None: ...
+
+class Learning(_message.Message):
+    __slots__ = ("tray", "what", "until_t_ns", "helps", "fans")
+    TRAY_FIELD_NUMBER: _ClassVar[int]
+    WHAT_FIELD_NUMBER: _ClassVar[int]
+    UNTIL_T_NS_FIELD_NUMBER: _ClassVar[int]
+    HELPS_FIELD_NUMBER: _ClassVar[int]
+    FANS_FIELD_NUMBER: _ClassVar[int]
+    tray: str
+    what: str
+    until_t_ns: int
+    helps: str
+    fans: _containers.RepeatedCompositeFieldContainer[FanLearning]
+    def __init__(self, tray: _Optional[str] = ..., what: _Optional[str] = ..., until_t_ns: _Optional[int] = ..., helps: _Optional[str] = ..., fans: _Optional[_Iterable[_Union[FanLearning, _Mapping]]] = ...) -> None: ...
+
 class AcceptedSamples(_message.Message):
     __slots__ = ("tray", "fans", "command_min", "command_max", "speed_max_rad_s", "named")
     TRAY_FIELD_NUMBER: _ClassVar[int]
@@ -631,7 +653,7 @@ class LatencyBucket(_message.Message):
     def __init__(self, upper_s: _Optional[float] = ..., count: _Optional[int] = ...) -> None: ...
 
 class Health(_message.Message):
-    __slots__ = ("header", "stage", "instance", "status", "t_ns", "uptime_s", "problem", "inputs", "outputs", "counters", "latency_p50_ms", "latency_p99_ms", "lost", "process_id", "waiting_for", "newest_input_t_ns", "newest_output_t_ns", "notes", "trays", "accepts", "is_last", "latencies", "latency_sum_s")
+    __slots__ = ("header", "stage", "instance", "status", "t_ns", "uptime_s", "problem", "inputs", "outputs", "counters", "latency_p50_ms", "latency_p99_ms", "lost", "process_id", "waiting_for", "newest_input_t_ns", "newest_output_t_ns", "notes", "trays", "accepts", "is_last", "latencies", "latency_sum_s", "learning")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     STAGE_FIELD_NUMBER: _ClassVar[int]
     INSTANCE_FIELD_NUMBER: _ClassVar[int]
@@ -655,6 +677,7 @@ class Health(_message.Message):
     IS_LAST_FIELD_NUMBER: _ClassVar[int]
     LATENCIES_FIELD_NUMBER: _ClassVar[int]
     LATENCY_SUM_S_FIELD_NUMBER: _ClassVar[int]
+    LEARNING_FIELD_NUMBER: _ClassVar[int]
     header: Header
     stage: str
     instance: str
@@ -678,4 +701,5 @@ class Health(_message.Message):
     is_last: bool
     latencies: _containers.RepeatedCompositeFieldContainer[LatencyBucket]
     latency_sum_s: float
-    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., stage: _Optional[str] = ..., instance: _Optional[str] = ..., status: _Optional[_Union[StageStatus, str]] = ..., t_ns: _Optional[int] = ..., uptime_s: _Optional[float] = ..., problem: _Optional[str] = ..., inputs: _Optional[_Iterable[_Union[Input, _Mapping]]] = ..., outputs: _Optional[_Iterable[_Union[Output, _Mapping]]] = ..., counters: _Optional[_Iterable[_Union[Counter, _Mapping]]] = ..., latency_p50_ms: _Optional[float] = ..., latency_p99_ms: _Optional[float] = ..., lost: _Optional[int] = ..., process_id: _Optional[int] = ..., waiting_for: _Optional[_Iterable[_Union[AwaitedInput, _Mapping]]] = ..., newest_input_t_ns: _Optional[int] = ..., newest_output_t_ns: _Optional[int] = ..., notes: _Optional[_Iterable[_Union[Note, _Mapping]]] = ..., trays: _Optional[str] = ..., accepts: _Optional[_Iterable[_Union[AcceptedSamples, _Mapping]]] = ..., is_last: _Optional[bool] = ..., latencies: _Optional[_Iterable[_Union[LatencyBucket, _Mapping]]] = ..., latency_sum_s: _Optional[float] = ...) -> None: ...
+    learning: _containers.RepeatedCompositeFieldContainer[Learning]
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., stage: _Optional[str] = ..., instance: _Optional[str] = ..., status: _Optional[_Union[StageStatus, str]] = ..., t_ns: _Optional[int] = ..., uptime_s: _Optional[float] = ..., problem: _Optional[str] = ..., inputs: _Optional[_Iterable[_Union[Input, _Mapping]]] = ..., outputs: _Optional[_Iterable[_Union[Output, _Mapping]]] = ..., counters: _Optional[_Iterable[_Union[Counter, _Mapping]]] = ..., latency_p50_ms: _Optional[float] = ..., latency_p99_ms: _Optional[float] = ..., lost: _Optional[int] = ..., process_id: _Optional[int] = ..., waiting_for: _Optional[_Iterable[_Union[AwaitedInput, _Mapping]]] = ..., newest_input_t_ns: _Optional[int] = ..., newest_output_t_ns: _Optional[int] = ..., notes: _Optional[_Iterable[_Union[Note, _Mapping]]] = ..., trays: _Optional[str] = ..., accepts: _Optional[_Iterable[_Union[AcceptedSamples, _Mapping]]] = ..., is_last: _Optional[bool] = ..., latencies: _Optional[_Iterable[_Union[LatencyBucket, _Mapping]]] = ..., latency_sum_s: _Optional[float] = ..., learning: _Optional[_Iterable[_Union[Learning, _Mapping]]] = ...) -> None: ...

@@ -77,6 +77,31 @@ class NamedFan:
 
 
 @dataclass(frozen=True, kw_only=True)
+class FanLearning:
+    """How far a fan is on the way to its first twin, 0 to 1. missing: what it has not done yet, in words."""
+
+    progress: float
+    missing: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Learning:
+    """What the first twin of a tray waits for.
+
+    Attributes:
+        tray: added by the runner of the stage.
+        until_t_ns: when it will be learned; 0: not known, as that depends on the fans.
+        helps: what would make it sooner, in words; empty: nothing would.
+    """
+
+    tray: str
+    what: str
+    until_t_ns: int
+    helps: str
+    fans: tuple[FanLearning, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
 class AcceptedSamples:
     """What an acquisition accepts of the clients that push samples of a tray; commands in the tray's unit."""
 
@@ -113,6 +138,7 @@ class Health:
         latencies: a histogram of all outputs of its session, whose latencies add up to latency_sum_s; a stage without
             outputs sends none.
         trays: names of its trays, separated by commas; empty: all of the site.
+        learning: of trays without a twin.
         is_last: the last message of its session, whatever its status.
     """
 
@@ -139,3 +165,4 @@ class Health:
     is_last: bool = False
     latencies: tuple[LatencyBucket, ...] = ()
     latency_sum_s: float = 0.0
+    learning: tuple[Learning, ...] = ()

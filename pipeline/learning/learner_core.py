@@ -8,6 +8,7 @@ the version in force: see `fantwin twins`.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 
 from fantwin.pipeline.errors import UserError
@@ -19,6 +20,7 @@ from fantwin.pipeline.learning.versions import TwinVersions, Version, VersionLis
 from fantwin.pipeline.recordings.dates import format_utc
 from fantwin.pipeline.runtime.stage import Core
 from fantwin.schemas.enums import Action
+from fantwin.schemas.health import Learning
 from fantwin.schemas.messages import Message, NewTwin, Raw, Request, Score
 from fantwin.schemas.units import NS_PER_S
 
@@ -120,6 +122,26 @@ class LearnerCore(Core):
             return found
         doing = "checking the fans" if self._schedule.work == "check" else "making the next version"
         return [*found, f"{doing}, for {work_s:.0f} s"]
+
+    def learning(self) -> Learning | None:
+        """What the first version waits for."""
+        if self._in_force is not None or self._last is not None:
+            return None
+        recorded_s, fans = min(self._history.seconds, FIRST_S), self._operation.done()
+        is_moved = not any(fan.missing for fan in fans)
+        left_s = FIRST_S - recorded_s
+        if self._learning.seconds is not None:
+            what, is_moved = "the first twin is being made", False
+        else:
+            what = f"{recorded_s / 60.0:.0f} of {FIRST_S / 60.0:g} minutes recorded"
+            what += "" if is_moved else "; the commands have not varied enough yet"
+        return Learning(
+            tray="",
+            what=what,
+            until_t_ns=self._history.newest_t_ns + round(left_s * NS_PER_S) if is_moved else 0,
+            helps=self._operation.how_to_move if any(fan.missing for fan in fans) else "",
+            fans=tuple(replace(fan, progress=min(fan.progress, recorded_s / FIRST_S)) for fan in fans),
+        )
 
     def problem(self) -> str:
         """Why nothing is learned, or that a version waits for the operator."""

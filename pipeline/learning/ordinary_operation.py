@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from fantwin.pipeline.config.settings import TrayConfig
+from fantwin.schemas.health import FanLearning
 from fantwin.schemas.messages import Raw
 from fantwin.schemas.units import NS_PER_S
 
@@ -60,13 +61,25 @@ class OrdinaryOperation:
 
     def missing(self) -> list[str]:
         """What each fan has not done yet, a few words for each that lacks something."""
-        visited = (self._seconds >= NEEDED_S).sum(axis=1)
+        return [f"{self._names.label(fan)}: {each.missing}" for fan, each in enumerate(self.done()) if each.missing]
+
+    def done(self) -> list[FanLearning]:
+        """How much of what is needed each fan has done, and what it has not done yet."""
+        visited = (self._seconds >= NEEDED_S).sum(axis=1).tolist()
         return [
-            f"{self._names.label(fan)}: {self._range_of(fan)}, {NEEDED_S:.0f} s each in {visited[fan]} tenths of "
-            f"{self._range} ({NEEDED_RANGES} needed), {self._changes[fan]} changes ({NEEDED_CHANGES} needed)"
-            for fan in range(len(visited))
-            if visited[fan] < NEEDED_RANGES or self._changes[fan] < NEEDED_CHANGES
+            FanLearning(
+                progress=min(of / NEEDED_RANGES, moved / NEEDED_CHANGES, 1.0), missing=self._missing(fan, of, moved)
+            )
+            for fan, (of, moved) in enumerate(zip(visited, self._changes.tolist(), strict=True))
         ]
+
+    def _missing(self, fan: int, visited: int, changes: int) -> str:
+        if visited >= NEEDED_RANGES and changes >= NEEDED_CHANGES:
+            return ""
+        return (
+            f"{self._range_of(fan)}, {NEEDED_S:.0f} s each in {visited} tenths of {self._range} "
+            f"({NEEDED_RANGES} needed), {changes} changes ({NEEDED_CHANGES} needed)"
+        )
 
     def held(self) -> list[str]:
         """Which fans never changed their command by more than a tenth of the range, a few words for each."""

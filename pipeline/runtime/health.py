@@ -14,7 +14,17 @@ from itertools import accumulate
 import numpy as np
 
 from fantwin.schemas.enums import StageStatus
-from fantwin.schemas.health import AcceptedSamples, AwaitedInput, Counter, Health, Input, LatencyBucket, Note, Output
+from fantwin.schemas.health import (
+    AcceptedSamples,
+    AwaitedInput,
+    Counter,
+    Health,
+    Input,
+    LatencyBucket,
+    Learning,
+    Note,
+    Output,
+)
 from fantwin.schemas.streams import stage_losses
 from fantwin.schemas.units import NS_PER_S
 
@@ -124,6 +134,7 @@ class HealthBuilder:
         now_ns: int,
         notes: Iterable[Note] = (),
         accepts: Iterable[AcceptedSamples] = (),
+        learning: Iterable[Learning] = (),
     ) -> Health:
         """The health message as of now."""
         problem = "; ".join(filter(None, problems))
@@ -157,4 +168,5 @@ class HealthBuilder:
             notes=tuple(notes),
             trays=",".join(self.trays),
             accepts=tuple(accepts),
+            learning=tuple(learning),
         )

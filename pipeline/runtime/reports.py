@@ -22,7 +22,7 @@ from fantwin.schemas.codec import encode
 from fantwin.schemas.enums import StageStatus
 from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.header import Header
-from fantwin.schemas.health import Health, Note
+from fantwin.schemas.health import Health, Learning, Note
 from fantwin.schemas.streams import stage_losses
 
 
@@ -124,8 +124,14 @@ class Reports:
             now_ns=HOST_CLOCK.now_ns(),
             notes=[*self._notes()] if with_counts else (),
             accepts=filter(None, (core.accepts() for core in cores)),
+            learning=[*self._learning()] if with_counts else (),
         )
         return replace(health, header=Header(self.producer, self.publisher.published, ""), is_last=is_last)
+
+    def _learning(self) -> Iterator[Learning]:
+        for name, parts in self.parts.items():
+            if learning := parts.core.learning():
+                yield replace(learning, tray=name)
 
     def _notes(self) -> Iterator[Note]:
         if note := self.receiver.note():

@@ -17,7 +17,7 @@ from fantwin.pipeline.config.shards import own_file
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.plugins import StageRow
 from fantwin.schemas.envelope import Envelope
-from fantwin.schemas.health import AcceptedSamples
+from fantwin.schemas.health import AcceptedSamples, Learning
 from fantwin.schemas.messages import Message, ScorerSnapshot
 from fantwin.schemas.topics import ALL_TRAYS, BY_NAME, makes_samples_of_samples
 
@@ -97,6 +97,10 @@ class Core(Protocol):
     def notes(self) -> Sequence[str]:
         """What the core works with and has done, a line each, for people; nothing that is wrong."""
         return ()
+
+    def learning(self) -> Learning | None:
+        """What the first twin of its tray waits for; None: there is one, or it learns none."""
+        return None
 
     def wants(self, tray: str) -> bool:
         """Whether the next message of a tray on an `undecoded` topic is needed: if not, it is not read, and is no loss.

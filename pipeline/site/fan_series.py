@@ -87,11 +87,9 @@ class FanSeries:
         found, width_ns, note = self.points(fan, begin_ns, end_ns, points)
         scales = _scales(RAD_S_PER_UNIT[self._speed_unit(fan)])
         kinds = {"min": found.low / scales, "mean": found.mean / scales, "max": found.high / scales}
-        has = np.isfinite(found.mean).any(axis=0)
         columns = {
             _NAMES.get(name, name): {kind: _or_null(values[:, at]) for kind, values in kinds.items()}
-            for at, name in enumerate(SERIES)
-            if has[at] or name not in BY_NAME
+            for at, name in _shown(found)
         }
         return {
             "tray": fan.tray,
@@ -111,12 +109,14 @@ class FanSeries:
         found, _, _ = self.points(fan, begin_ns, end_ns, points)
         unit = self._speed_unit(fan).replace("/", "_")
         scales = _scales(RAD_S_PER_UNIT[self._speed_unit(fan)])
-        has = [at for at, name in enumerate(SERIES) if name not in BY_NAME or np.isfinite(found.mean[:, at]).any()]
+        shown = _shown(found)
         text = StringIO()
         rows = csv.writer(text, lineterminator="\n")
-        names = [f"{_NAMES[SERIES[at]]}_{unit}" if SERIES[at] in _NAMES else SERIES[at] for at in has]
+        names = [f"{_NAMES[name]}_{unit}" if name in _NAMES else name for _, name in shown]
         rows.writerow(["time", *(f"{name}_{kind}" for name in names for kind in ("min", "mean", "max"))])
-        kinds = np.stack([found.low / scales, found.mean / scales, found.high / scales], axis=-1)[:, has]
+        kinds = np.stack([found.low / scales, found.mean / scales, found.high / scales], axis=-1)[
+            :, [at for at, _ in shown]
+        ]
         for t_ns, values in zip(found.t_ns.tolist(), kinds.reshape(len(kinds), -1).tolist(), strict=True):
             time = datetime.fromtimestamp(t_ns / NS_PER_S, UTC).isoformat(timespec="milliseconds")
             rows.writerow([time, *("" if value != value else f"{value:.6g}" for value in values)])  # noqa: PLR0124  NaN
@@ -159,6 +159,13 @@ def _series_of(block: Score | Raw, fan: int) -> Array:
     for at, column in enumerate(channels.values(), len(CURVES)):
         values[:, at] = column[:, fan]
     return in_series(values, tuple(channels))
+
+
+def _shown(points: Points) -> list[tuple[int, str]]:
+    """Number and name of each column, without channels that are not measured."""
+    return [
+        (at, name) for at, name in enumerate(SERIES) if name not in BY_NAME or np.isfinite(points.mean[:, at]).any()
+    ]
 
 
 def _scales(rad_s_per_unit: float) -> Array:

@@ -8,9 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.site.fan_history import CURVES
 from fantwin.pipeline.site.fleet import FanGroup, FanNow
 from fantwin.pipeline.site.site_model import SiteModel
+from fantwin.schemas.health import Learning
 from fantwin.schemas.messages import Array
 from fantwin.schemas.units import RAD_S_PER_UNIT
 from fantwin.scoring.alarms.alarm_text import deviation_in
@@ -32,6 +34,7 @@ def fans_json(model: SiteModel, fans: Sequence[FanNow]) -> list[dict[str, Any]]:
     """Fans of the site in this order."""
     rows, units = _rows(model), {tray.name: str(tray.speed_unit) for tray in model.trays}
     alarms = {(each.newest.header.tray, each.newest.fan): each for each in model.current_alarms()}
+    learning = {name: _of_learning(each, model.tray(name)) for name, each in model.learning().items()}
     found: list[dict[str, Any]] = []
     for now in fans:
         tray, number = now.fan
@@ -53,6 +56,7 @@ def fans_json(model: SiteModel, fans: Sequence[FanNow]) -> list[dict[str, Any]]:
                 "command": command,
                 "deviation_percent": deviation,
                 **_of_alarm(alarms.get((tray, number)), number),
+                "learning": learning[tray][number] if tray in learning else None,
             }
         )
     return found
@@ -78,6 +82,25 @@ def _rows(model: SiteModel) -> Mapping[str, Sequence[Row]]:
             columns = measured / per_unit[tray.tray], command, 100.0 * (measured - predicted) / usual
             found[tray.tray] = list(zip(*map(_known, columns), strict=True))
     return found
+
+
+def _of_learning(learning: Learning, tray: TrayConfig | None) -> Sequence[dict[str, Any] | None]:
+    """Of each fan; none of a tray that is configured otherwise."""
+    fans = tray.fans if tray else 0
+    if tray is None or len(learning.fans) != fans:
+        return [None] * fans
+    sweep = "" if tray.source.why_no_commands else f"fantwin command --tray {tray.name} --sweep"
+    return [
+        {
+            "progress": round(fan.progress, 4),
+            "what": learning.what,
+            "missing": fan.missing,
+            "until_t_ns": learning.until_t_ns,
+            "helps": learning.helps if fan.missing else "",
+            "command": sweep if fan.missing else "",
+        }
+        for fan in learning.fans
+    ]
 
 
 def _known(values: Array) -> list[float | None]:

@@ -43,4 +43,13 @@ def readable_alarm(alarm: Alarm) -> Alarm:
 def readable_health(health: Health) -> Health:
     """The health with a problem and notes that are safe to show."""
     notes = tuple(replace(note, text=one_line(note.text)) for note in health.notes)
-    return replace(health, problem=one_line(health.problem), notes=notes)
+    learning = tuple(
+        replace(
+            each,
+            what=one_line(each.what),
+            helps=one_line(each.helps),
+            fans=tuple(replace(fan, missing=one_line(fan.missing)) for fan in each.fans),
+        )
+        for each in health.learning
+    )
+    return replace(health, problem=one_line(health.problem), notes=notes, learning=learning)

@@ -27,7 +27,7 @@ from fantwin.pipeline.site.stage_states import HeardHealth, StageState, stage_st
 from fantwin.schemas.codec import CodecError, decode
 from fantwin.schemas.enums import Feedback, InvalidReason, StageStatus, Transition
 from fantwin.schemas.envelope import Envelope
-from fantwin.schemas.health import Health
+from fantwin.schemas.health import Health, Learning
 from fantwin.schemas.messages import Alarm, Array, ModelCard, Score, ScorerSnapshot
 from fantwin.scoring.alarms.current_alarms import CurrentAlarm
 from fantwin.scoring.calibration.calibration import ObservedRate, declared_per_day
@@ -327,6 +327,13 @@ class SiteModel:
         if wear is not None and len(wear["fans"]) == self._by_name[tray].fans:
             with self._lock:
                 self._wear[tray] = (snapshot.t_ns, wear_rows(tray, snapshot.t_ns, wear, self._by_name[tray].names))
+
+    def learning(self) -> dict[str, Learning]:
+        """What the first twin of each tray that has none waits for."""
+        before_s = self._now_s() - SILENT_AFTER_S
+        with self._lock:
+            heard = [each.health for each in self._stages.values() if each.heard_s >= before_s]
+        return {each.tray: each for health in heard for each in health.learning if not health.is_last}
 
     def wear(self, fan: Fan) -> Sequence[Mapping[str, Any]]:
         """The wear of a fan as of the last snapshot of its scorer, one row; empty: none is known."""

@@ -27,10 +27,11 @@ from fantwin.pipeline.site.site_json import alarms_json, curves_json, fan_in_ful
 from fantwin.pipeline.site.site_model import SiteModel
 from fantwin.schemas.enums import Action, FanState, Severity, Transition
 from fantwin.schemas.header import Header
+from fantwin.schemas.health import FanLearning, Learning
 from fantwin.schemas.messages import Diagnosis, Raw, ScorerSnapshot
 from fantwin.schemas.topics import tray_key
 from fantwin.scoring.wear.recorded_wear import shown
-from tests.support.made_messages import filled
+from tests.support.made_messages import filled, health
 from tests.support.running_chain import eventually
 from tests.support.running_core import FANS, SITE, TRAY
 from tests.support.running_gateway import Client, RunningGateway
@@ -118,6 +119,27 @@ def test_every_answer_has_the_type_that_the_description_declares_and_leaves_noth
             assert content.get("schema") or kind != "application/json", path
     form = described["components"]["schemas"]["RequestForm"]
     assert (form["additionalProperties"], "shelve" in form["properties"]["action"]["enum"]) == (False, True)
+
+
+def test_a_fan_without_a_twin_says_what_is_learned_how_far_and_what_would_help(gateway):
+    gateway.feed(score())
+    fans = (FanLearning(progress=0.25, missing="1 change (10 needed)"), *[FanLearning(progress=0.5, missing="")] * 3)
+    waits = Learning(tray=TRAY, what="5 of 10 minutes\nrecorded", until_t_ns=0, helps="`sweep` moves it", fans=fans)
+    gateway.feed(health("learner", learning=(waits,)))
+    of_fans = {each["fan"]: each["learning"] for each in Client(gateway).ask("GET", "/api/v1/fans")[1]["fans"]}
+    assert of_fans[0] == {
+        "progress": 0.25,
+        "what": "5 of 10 minutes recorded",
+        "missing": "1 change (10 needed)",
+        "until_t_ns": 0,
+        "helps": "`sweep` moves it",
+        "command": "fantwin command --tray tray1 --sweep",
+    }
+    assert (of_fans[1]["progress"], of_fans[1]["helps"], of_fans[1]["command"]) == (0.5, "", "")
+    gateway.feed(health("learner", learning=(replace(waits, fans=fans[:1]),)))
+    assert Client(gateway).ask("GET", f"/api/v1/fans/{TRAY}/0")[1]["learning"] is None, "it is configured otherwise"
+    gateway.feed(health("learner"))
+    assert Client(gateway).ask("GET", f"/api/v1/fans/{TRAY}/0")[1]["learning"] is None, "it has a twin now"
 
 
 def test_live_events_bring_an_alarm_and_the_samples_of_the_fan_that_is_looked_at(gateway):

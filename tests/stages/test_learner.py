@@ -21,6 +21,19 @@ def _first_after_five_minutes(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(f"fantwin.pipeline.learning.{module}.FIRST_S", 300.0)
 
 
+def test_a_tray_that_moves_enough_says_when_its_first_version_is_due(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr("fantwin.pipeline.learning.learner_core.FIRST_S", 600.0)
+    monkeypatch.setattr("fantwin.pipeline.learning.learning_schedule.FIRST_S", 600.0)
+    learner = Learner(tmp_path)
+    learner.run(400)
+    waits = learner.core.learning()
+    assert waits is not None
+    assert (waits.fans[0].missing, waits.helps) == ("", "")
+    assert waits.fans[0].progress == learner.history.seconds / 600.0
+    due_s = (waits.until_t_ns - START_NS) / NS_PER_S
+    assert abs(due_s - (learner.now_s + 600.0 - learner.history.seconds)) <= 1.0
+
+
 def test_the_first_version_waits_for_enough_running_and_enough_movement(tmp_path: Path) -> None:
     learner = Learner(tmp_path)
     learner.run(600, moves=False)
@@ -29,8 +42,17 @@ def test_the_first_version_waits_for_enough_running_and_enough_movement(tmp_path
     assert note.startswith(
         "no twin yet, nothing is judged; 10 min recorded (5 needed); not moved enough yet: fan 0: command 0.5,"
     )
+    waits = learner.core.learning()
+    assert waits is not None
+    assert (waits.what, waits.until_t_ns, waits.fans[0].progress) == (
+        "5 of 5 minutes recorded; the commands have not varied enough yet",
+        0,
+        0.0,
+    ), "nobody knows when the fan will have moved enough"
+    assert (waits.fans[0].missing[:12], waits.helps) == ("command 0.5,", "`fantwin command --sweep` moves the fans")
     learner.run(600)
     assert learner.put_in_force == ["tray1-1"]
+    assert learner.core.learning() is None
     (note,) = learner.core.notes()
     assert note == (
         "tray1-1 is in force; at 1,000 rpm it finds a drop of 40 rpm within a minute; declared: 1 false alarm per "

@@ -8,7 +8,17 @@ from hypothesis import strategies as st
 
 from fantwin.schemas.fields import LARGEST_ENUM_VALUE, Column, OpenEnum, columns, other_fields
 from fantwin.schemas.header import Header, InputPosition
-from fantwin.schemas.health import AcceptedSamples, AwaitedInput, Counter, Input, LatencyBucket, Note, Output
+from fantwin.schemas.health import (
+    AcceptedSamples,
+    AwaitedInput,
+    Counter,
+    FanLearning,
+    Input,
+    LatencyBucket,
+    Learning,
+    Note,
+    Output,
+)
 from fantwin.schemas.messages import FURTHEST_T_NS, LARGEST_PERIOD_NS, Diagnosis, Message, StatedTacho
 
 TIME_NS = st.integers(1 - FURTHEST_T_NS, FURTHEST_T_NS - 1)
@@ -38,6 +48,7 @@ SCALARS: dict[str, st.SearchStrategy[Any]] = {
     "process_id": UINT32,
     "format": UINT32,
     "fans": UINT32,
+    "until_t_ns": TIME_NS,
     "pulses": UINT32,
     "lost": UINT64,
     "fan": st.integers(0, 2**31 - 1),
@@ -50,6 +61,12 @@ OF_TYPE: dict[Any, st.SearchStrategy[Any]] = {
     bytes: st.binary(max_size=20),
 }
 
+RECORDS = (
+    *(Counter, Input, Output, Diagnosis, AwaitedInput, Note, AcceptedSamples, StatedTacho, LatencyBucket),
+    *(FanLearning, Learning),
+)
+"""of which a message holds several"""
+
 
 def scalar(name: str, hint: Any) -> st.SearchStrategy[Any]:
     if hint is Header:
@@ -58,7 +75,7 @@ def scalar(name: str, hint: Any) -> st.SearchStrategy[Any]:
         return SCALARS[name]
     if isinstance(hint, type) and issubclass(hint, OpenEnum):
         return st.integers(0, LARGEST_ENUM_VALUE).map(hint)
-    for record in (Counter, Input, Output, Diagnosis, AwaitedInput, Note, AcceptedSamples, StatedTacho, LatencyBucket):
+    for record in RECORDS:
         if hint == tuple[record, ...]:
             values = {name: scalar(name, hint) for name, hint in other_fields(record).items()}
             return st.lists(st.builds(record, **values), max_size=3).map(tuple)

@@ -70,6 +70,20 @@ class Site(BaseModel):
     level_at_limit: int
 
 
+class Learning(BaseModel):
+    """What the first twin of a fan waits for. progress: 0 to 1. until_t_ns: 0: that depends on the fan.
+
+    missing: what the fan has not done yet; helps: what would move it; command: what to type for that. Empty: nothing.
+    """
+
+    progress: float
+    what: str
+    missing: str
+    until_t_ns: int
+    helps: str
+    command: str
+
+
 class Fan(BaseModel):
     """A fan in a list; null: not known now.
 
@@ -94,6 +108,7 @@ class Fan(BaseModel):
     deviation: str
     cause: str
     probability: float | None
+    learning: Learning | None
 
 
 class Fans(BaseModel):

@@ -23,7 +23,7 @@ from fantwin.pipeline.site.site_model import SiteModel
 from fantwin.schemas.enums import Transition
 from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.header import Header
-from fantwin.schemas.messages import Alarm, Diagnosis, Message, Raw, Score
+from fantwin.schemas.messages import Alarm, Diagnosis, Raw, Score
 from fantwin.schemas.topics import tray_key
 from tests.support.made_messages import alarm, filled
 
@@ -63,13 +63,13 @@ def model(tmp_path: Path) -> SiteModel:
     return SiteModel(SITE, trays, AlarmHistory(tmp_path / "alarms.sqlite"), keeps_curves=True)
 
 
-def record(folder: Path, *messages: Message, part: int = 1, finish: bool = True) -> RecordedRange:
+def record(folder: Path, *messages: Raw | Score, part: int = 1, finish: bool = True) -> RecordedRange:
     """The messages in a part of a recording, flushed every ten; finish: the recorder has ended it."""
     name = "recording.mcap" if part == 1 else f"recording-{part}.mcap"
     writer = RecordingWriter(folder / name, {"site": SITE, "trays": TRAY, "recording": "recording.mcap"})
     for number, message in enumerate(messages):
         topic = "raw" if isinstance(message, Raw) else "score"
-        t_ns = message.host_receive_t_ns if isinstance(message, Raw) else message.t_ns  # type: ignore[union-attr]
+        t_ns = np.asarray(message.host_receive_t_ns if isinstance(message, Raw) else message.t_ns)
         writer.add(Envelope.of(tray_key(SITE, TRAY, topic), message, int(t_ns[-1])))
         if number % 10 == 9:
             writer.flush()
