@@ -15,6 +15,9 @@ from fantwin.scoring.saved import Saved
 
 BAND_SIGMAS = 2.0
 NONE, WARMING_UP = np.uint8(InvalidReason.NONE), np.uint8(InvalidReason.WARMING_UP)
+STANDS_BELOW_RAD_S = 1.0
+"""A fan in alarm that reads less is not shown as one that is well again: at a low command, what it lacks may be within
+the limit for a while."""
 UNKNOWN, NORMAL, SUSPECT, ALARM, RETURNING = map(
     int, (FanState.UNKNOWN, FanState.NORMAL, FanState.SUSPECT, FanState.ALARM, FanState.RETURNING)
 )
@@ -70,7 +73,8 @@ def score_of(item: Prediction, of: ScoreColumns, reads_balance: Array, unseen_ra
     band = BAND_SIGMAS * np.hypot(item.sigma_rad_s, unseen_rad_s)
     half_range = item.reading_range_rad_s if len(item.reading_range_rad_s) else np.zeros(valid.shape)
     state = np.where(of.score > of.SUSPECT_FROM, SUSPECT, NORMAL)
-    state = np.where(of.is_active, np.where(of.is_returning, RETURNING, ALARM), state)
+    is_returning = of.is_returning & ~(np.abs(item.measured_speed_rad_s) < STANDS_BELOW_RAD_S)
+    state = np.where(of.is_active, np.where(is_returning, RETURNING, ALARM), state)
     state = np.where(valid, state, UNKNOWN)
     for reason, of_idle in IDLE_STATES:
         state = np.where((item.invalid_reason == reason) & ~valid, of_idle, state)
