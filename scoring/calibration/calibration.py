@@ -41,6 +41,10 @@ def daily_interval(count: float, fan_hours: float) -> tuple[float, float]:
     return float(low) / fan_hours * HOURS_PER_DAY, float(high) / fan_hours * HOURS_PER_DAY
 
 
+ENOUGH_EXPECTED, ENOUGH_RATIO = 3.0, 10.0
+"""of `says_something`"""
+
+
 @dataclass(frozen=True)
 class ObservedRate:
     """The alarms that were raised while fans were judged, and for how long they were.
@@ -68,6 +72,19 @@ class ObservedRate:
     def interval_95(self, alarms: int) -> tuple[float, float]:
         """The exact 95 % interval of the rate of independent alarms (Garwood), per fan and day."""
         return daily_interval(alarms, self.fan_hours)
+
+    @property
+    def says_something(self) -> bool:
+        """Whether fans were judged for long enough to compare the rate with the declared one.
+
+        So many false alarms were to be expected, or the interval ends within ten times the declared rate. Where none is
+        declared, a day of one fan is enough.
+        """
+        if self.declared_per_day is None or not self.fan_hours:
+            return self.fan_hours >= HOURS_PER_DAY
+        expected = self.declared_per_day * self.fan_hours / HOURS_PER_DAY
+        _, upper = self.interval_95(self.false_alarms)
+        return expected >= ENOUGH_EXPECTED or upper < ENOUGH_RATIO * self.declared_per_day
 
     @property
     def text(self) -> str:
@@ -98,6 +115,7 @@ class ObservedRate:
             "with_unmarked_per_day": self.per_day(possible) if known else None,
             "with_unmarked_interval_95": self.interval_95(possible) if known else None,
             "declared_per_day": self.declared_per_day,
+            "enough": self.says_something,
             "text": self.text,
         }
 

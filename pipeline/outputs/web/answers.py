@@ -299,7 +299,10 @@ class History(BaseModel):
 
 
 class Rate(BaseModel):
-    """The observed rate of false alarms per fan and day, beside the declared one; null where no fan was judged."""
+    """The observed rate of false alarms per fan and day, beside the declared one; null where no fan was judged.
+
+    enough: fans were judged for long enough to compare the two.
+    """
 
     since_t_ns: int
     fan_hours: float
@@ -311,6 +314,7 @@ class Rate(BaseModel):
     with_unmarked_per_day: float | None
     with_unmarked_interval_95: tuple[float, float] | None
     declared_per_day: float | None
+    enough: bool
     text: str
 
 

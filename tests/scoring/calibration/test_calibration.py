@@ -55,6 +55,22 @@ def test_only_false_alarms_count_and_those_that_nobody_marked_are_counted_apart(
     assert (shown["true_alarms"], shown["declared_per_day"]) == (5, 0.03)
 
 
+@pytest.mark.parametrize(
+    ("hours", "false", "declared", "enough"),
+    [
+        (0.29, 0, 8.0, False),  # 0 to 310 per day: nothing is said
+        (9.0, 0, 8.0, True),  # three were to be expected
+        (240.0, 0, 0.05, True),  # at most 0.37 per day, and less than ten times 0.05
+        (240.0, 2, 0.05, False),
+        (23.0, 0, None, False),
+        (24.0, 0, None, True),
+        (0.0, 0, 8.0, False),
+    ],
+)
+def test_a_rate_says_nothing_before_it_can_be_compared(hours, false, declared, enough) -> None:
+    assert rate(false, hours=hours, declared=declared).as_json()["enough"] is enough
+
+
 def test_where_no_time_is_known_there_is_no_rate() -> None:
     found = rate(1, hours=0.0, declared=None)
     assert found.text == "1 false alarm, and how long fans were judged is not known; no rate is declared"
