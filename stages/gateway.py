@@ -139,6 +139,7 @@ def build(context: Context) -> BuiltStage:
     from fantwin.pipeline.outputs.web.access import Access  # noqa: PLC0415
     from fantwin.pipeline.outputs.web.api import Api  # noqa: PLC0415
     from fantwin.pipeline.outputs.web.app import MOST_CONNECTIONS, application  # noqa: PLC0415
+    from fantwin.pipeline.site.tokens import Tokens  # noqa: PLC0415
     from fantwin.pipeline.site.users import Users  # noqa: PLC0415
 
     alarms = AlarmHistory(context.own_file(FILE))
@@ -162,7 +163,8 @@ def build(context: Context) -> BuiltStage:
     if config.certificate and config.key:
         certificate = context.resolve(config.certificate)
         tls, shown = server_context(certificate, context.resolve(config.key)), read_certificate(certificate)
-    access = Access(config, Users(context.resolve(config.users)) if config.users else None)
+    known = context.resolve(config.users) if config.users else None
+    access = Access(config, Users(known) if known else None, Tokens(known) if known else None)
     listening = listen(config.host, config.port + context.shard_number - 1, "gateway")
     urls = viewer_urls(viewers) if viewers else {}
     app = application(Api(model, access, feed, desk, urls, series, clip_folders), config)
@@ -173,6 +175,7 @@ def build(context: Context) -> BuiltStage:
 def check(context: Context) -> list[str]:
     """Problems with the gateway: its port is taken by another program, or a file cannot be read."""
     from fantwin.pipeline.certificates import check_pair, require_valid  # noqa: PLC0415  slow to import
+    from fantwin.pipeline.site.tokens import read_tokens, tokens_file  # noqa: PLC0415
     from fantwin.pipeline.site.users import read_users  # noqa: PLC0415
 
     config: GatewayConfig = context.config
@@ -182,6 +185,7 @@ def check(context: Context) -> list[str]:
         attempts.append(lambda: require_valid(check_pair(*files)))
     if config.users:
         attempts.append(partial(read_users, context.resolve(config.users)))
+        attempts.append(partial(read_tokens, tokens_file(context.resolve(config.users))))
     if not context.is_running and "port" in config.model_fields_set:
         attempts.append(lambda: listen(config.host, config.port + context.shard_number - 1, "gateway").close())
     return refusals(*attempts)

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from jsonschema import Draft202012Validator
 from prometheus_client.parser import text_string_to_metric_families
 
 from fantwin.pipeline.config.settings import TrayConfig
@@ -112,11 +113,17 @@ def test_every_answer_has_the_type_that_the_description_declares_and_leaves_noth
         assert Client(gateway).ask("GET", f"/api/v1{path}")[1] == json.loads(json.dumps(expected)), path
     assert typed.Fans.model_validate(made["/fans"]).model_dump(mode="json") == made["/fans"], "it is not checked there"
     described = Client(gateway).ask("GET", "/api/v1/openapi.json")[1]
-    for path, methods in described["paths"].items():
-        for operation in methods.values():
-            (kind, content), *_ = operation["responses"]["200"]["content"].items()
-            assert operation["description"]
-            assert content.get("schema") or kind != "application/json", path
+    operations = [operation for methods in described["paths"].values() for operation in methods.values()]
+    for operation in operations:
+        assert operation["description"]
+        for response in operation["responses"].values():
+            assert response["content"], operation["operationId"]
+            assert all(content.get("schema") for content in response["content"].values()), operation["operationId"]
+    names = [operation["operationId"] for operation in operations]
+    assert (len(set(names)), described["servers"]) == (len(names), [{"url": "/"}])
+    assert set(described["components"]["securitySchemes"]) == {"HTTPBearer", "APIKeyCookie"}
+    for schema in described["components"]["schemas"].values():
+        Draft202012Validator.check_schema(schema)
     form = described["components"]["schemas"]["RequestForm"]
     assert (form["additionalProperties"], "shelve" in form["properties"]["action"]["enum"]) == (False, True)
 

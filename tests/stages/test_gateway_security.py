@@ -8,7 +8,7 @@ import json
 import ssl
 import threading
 from collections.abc import Callable
-from datetime import timedelta
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
@@ -19,6 +19,7 @@ from starlette.requests import Request
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.outputs.web.live_feed import SharedAnswer
 from fantwin.pipeline.site import security_log
+from fantwin.pipeline.site.tokens import new_token, read_tokens, tokens_file, write_tokens
 from fantwin.pipeline.site.users import UserRole
 from tests.support.running_core import TRAY
 from tests.support.running_gateway import Client, RunningGateway
@@ -117,6 +118,61 @@ def test_a_new_password_and_another_login_end_the_session_of_before(gateway, use
     make_users(users, OTHER_PASSWORD, ann=UserRole.OPERATOR)
     assert again.ask("POST", ACT, ASKED)[0] == 401
     assert len(gateway.sent) == 1
+
+
+def token(users: Path, name: str = "grafana", role: UserRole = UserRole.VIEWER, **left: float) -> dict[str, str]:
+    """The header of a program whose token is added to the file."""
+    path, expires = tokens_file(users), datetime.now(UTC) + timedelta(**left) if left else None
+    text, made = new_token(name, role, expires)
+    write_tokens(path, {**read_tokens(path), name: made})
+    assert text not in path.read_text(encoding="utf-8")
+    return {"Authorization": f"Bearer {text}"}
+
+
+@pytest.mark.parametrize(
+    ("role", "left", "reads", "acts"),
+    [
+        (UserRole.VIEWER, {}, 200, 403),
+        (UserRole.OPERATOR, {"days": 1}, 200, 200),
+        (UserRole.OPERATOR, {"days": -1}, 401, 401),
+    ],
+    ids=["viewer", "operator", "ended"],
+)
+def test_a_program_reads_and_acts_by_the_role_of_its_token_without_a_session(
+    gateway, users, monkeypatch, role, left, reads, acts
+):
+    monkeypatch.setattr("fantwin.pipeline.outputs.web.config.GatewayConfig.is_loopback", False)
+    gateway.feed(score(), alarm())
+    program = token(users, role=role, **left)
+    assert Client(gateway).ask("GET", "/api/v1/fans")[0] == 401, "nobody reads without one"
+    for path in ("/api/v1/fans", "/metrics"):
+        assert Client(gateway).ask("GET", path, headers=program)[0] == reads
+    assert Client(gateway).ask("POST", ACT, ASKED, headers=program)[0] == acts
+    assert [each.operator_name for each in gateway.sent] == (["grafana"] if acts == 200 else [])
+    foreign = {**program, "Origin": "http://evil.example", "Sec-Fetch-Site": "cross-site"}
+    assert Client(gateway).ask("POST", ACT, ASKED, headers=foreign)[0] == 403, "no page of another site acts with it"
+
+
+def test_a_token_that_is_removed_or_made_up_is_refused_even_where_nobody_logs_in_and_guesses_must_wait(
+    gateway, users, capfd, monkeypatch
+):
+    monkeypatch.setattr("fantwin.pipeline.outputs.web.live_feed.CHECKED_EVERY_S", 0.0)
+    gateway.feed(score())
+    program, other = token(users), token(users, "other")
+    stream = events(gateway, **program)
+    assert stream.readline() == b"event: fleet\n"
+    write_tokens(tokens_file(users), {"other": read_tokens(tokens_file(users))["other"]})
+    while stream.readline():
+        gateway.feed(alarm())  # live events end with it
+    answers = [Client(gateway).ask("GET", "/api/v1/site", headers=program) for _ in range(6)]
+    refused = [status for status, _, _ in answers]
+    assert refused == sorted(refused) and refused[0] == 401 and refused[-1] == 429
+    assert int(answers[-1][2]["retry-after"]) > 0
+    assert Client(gateway).ask("GET", "/api/v1/site", headers=other)[0] == 200, "the right one need not wait"
+    assert {"what": "token refused", "path": "/api/v1/site", "address": "127.0.0.1"}.items() <= said(capfd)[-1].items()
+    tokens_file(users).chmod(0o644)
+    assert Client(gateway).ask("GET", "/api/v1/site", headers=other)[0] in (401, 429)
+    assert "no token is accepted" in gateway.problem()
 
 
 @pytest.mark.parametrize(

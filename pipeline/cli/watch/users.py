@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping
+from datetime import UTC, datetime, timedelta
 from enum import StrEnum
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -14,32 +17,40 @@ from fantwin.pipeline.config.loading import load_config
 from fantwin.pipeline.errors import UsageError, UserError
 from fantwin.pipeline.outputs.opcua.config import OpcuaConfig
 from fantwin.pipeline.outputs.web.config import GatewayConfig
+from fantwin.pipeline.site.tokens import Token, new_token, read_tokens, tokens_file, write_tokens
 from fantwin.pipeline.site.users import NAME, User, UserRole, checked_password, hasher, read_users, write_users
 
 
 class UserAction(StrEnum):
     """The actions, as they are typed."""
 
+    LIST = "list"
     ADD = "add"
     REMOVE = "remove"
-    LIST = "list"
+    ADD_TOKEN = "add-token"
+    REMOVE_TOKEN = "remove-token"
 
 
 def users(
     action: Annotated[UserAction, typer.Argument(metavar="ACTION", help=f"{', '.join(UserAction)}.")] = UserAction.LIST,
     name: Annotated[str | None, typer.Argument(help="Letters, digits, `.`, `_`, `@` and `-`.")] = None,
     role: Annotated[str, typer.Option(help="viewer: may only view; operator: may also act.")] = "viewer",
+    days: Annotated[float | None, typer.Option(min=0.01, help="With add-token: it ends after this time.")] = None,
     config: ConfigOption = DEFAULT_CONFIG,
     overrides: SetOption = None,
     json_output: JsonOption = False,
 ) -> None:
-    """List the users who may log in to the operators' page and over OPC UA; add or remove one.
+    """List the users who may log in to the operators' page and over OPC UA, and the tokens of programs that use the
+    page's API; add or remove one.
 
     `add` asks for the password, or reads it from a pipe. For an existing user, it changes the password and the role.
+    `add-token` prints a token, once; a program sends it as `Authorization: Bearer TOKEN`.
 
     Example: fantwin users add ann --role operator
 
     Example: fantwin users remove ann
+
+    Example: fantwin users add-token grafana --days 365
     """
     settings = load_config(config, overrides or (), stages=("gateway", "opcua"))
     gateway, opcua = settings.sections["gateway"], settings.sections["opcua"]
@@ -49,14 +60,23 @@ def users(
     if named is None:
         raise UserError(f'{config}: neither [gateway] nor [opcua] names a file of users: add users = "users.toml"')
     path = settings.folder / named
+    if days is not None and action != UserAction.ADD_TOKEN:
+        raise UsageError("--days is of a token: it needs add-token")
     found = read_users(path) if path.exists() else {}
+    tokens = read_tokens(tokens_file(path))
     if action == UserAction.LIST:
-        listed = [{"name": user.name, "role": str(user.role)} for user in found.values()]
-        lines = [f"{user.name}  {user.role}" for user in found.values()]
-        show(listed, *(lines or [f"{path}: no users: add one with `fantwin users add NAME`"]), json_output=json_output)
+        _list(path, found, tokens, json_output=json_output)
         return
     if name is None:
         raise UsageError(f"name a user: fantwin users {action} NAME")
+    if action in (UserAction.ADD_TOKEN, UserAction.REMOVE_TOKEN):
+        if action == UserAction.ADD_TOKEN and name in found:
+            raise UserError(f"{path}: {name} is a user: give the token another name, which is shown where it acts")
+        done = _change_tokens(tokens_file(path), tokens, action, name, role, days)
+        show(done, *(str(each) for each in done.values()), json_output=json_output)
+        return
+    if action == UserAction.ADD and name in tokens:
+        raise UserError(f"{tokens_file(path)}: {name} is a token: give the user another name")
     if action == UserAction.REMOVE:
         if found.pop(name, None) is None:
             raise UserError(f"{path}: no user {name!r}: there is {', '.join(found) or 'none'}")
@@ -68,14 +88,50 @@ def users(
     show({"name": name, "done": done}, f"{path}: {name}: {done}", json_output=json_output)
 
 
-def _asked_for(name: str, role: str) -> User:
+def _list(path: Path, users: Mapping[str, User], tokens: Mapping[str, Token], *, json_output: bool) -> None:
+    ends = {name: token.expires.isoformat() if token.expires else None for name, token in tokens.items()}
+    listed = [{"kind": "user", "name": user.name, "role": str(user.role)} for user in users.values()]
+    of_programs = [
+        {"kind": "token", "name": name, "role": str(token.role), "expires": ends[name]}
+        for name, token in tokens.items()
+    ]
+    lines = [f"{user.name}  {user.role}" for user in users.values()]
+    for name, token in tokens.items():
+        lines.append(f"{name}  {token.role}  token, {f'until {ends[name]}' if ends[name] else 'without an end'}")
+    nobody = [f"{path}: no users: add one with `fantwin users add NAME`"]
+    show([*listed, *of_programs], *(lines or nobody), json_output=json_output)
+
+
+def _change_tokens(
+    path: Path, tokens: dict[str, Token], action: UserAction, name: str, role: str, days: float | None
+) -> dict[str, str]:
+    """What was done, for people and machines: a new token, or that one was removed."""
+    if action == UserAction.REMOVE_TOKEN:
+        if tokens.pop(name, None) is None:
+            raise UserError(f"{path}: no token {name!r}: there is {', '.join(tokens) or 'none'}")
+        done = {"done": f"{name}: removed"}
+    else:
+        expires = datetime.now(UTC).replace(microsecond=0) + timedelta(days=days) if days is not None else None
+        text, tokens[name] = new_token(name, _role(name, role), expires)
+        done = {"token": text}
+    write_tokens(path, tokens)
+    return done
+
+
+def _role(name: str, role: str) -> UserRole:
+    """The role that is named, for a valid name."""
     if not NAME.fullmatch(name):
         raise UsageError(f"{name!r} is not a valid name: use up to 64 letters, digits, `.`, `_`, `@` and `-`")
     roles = [each.value for each in UserRole]
     if role not in roles:
         raise UsageError(f"--role {role}: {' or '.join(roles)}")
+    return UserRole(role)
+
+
+def _asked_for(name: str, role: str) -> User:
+    named = _role(name, role)
     if sys.stdin.isatty():
         password = typer.prompt("Password", hide_input=True, confirmation_prompt=True)
     else:
         password = sys.stdin.readline().rstrip("\n")
-    return User(name, UserRole(role), hasher().hash(checked_password(password, name)))
+    return User(name, named, hasher().hash(checked_password(password, name)))

@@ -24,6 +24,7 @@ from fastapi import HTTPException, Request
 
 from fantwin.pipeline.outputs.web.config import GatewayConfig
 from fantwin.pipeline.site.security_log import LoginFailures, SecurityLog
+from fantwin.pipeline.site.tokens import Tokens
 from fantwin.pipeline.site.users import NAME, User, UserRole, Users
 
 IDLE_S = 30 * 60.0
@@ -99,6 +100,8 @@ MOST_LOGINS = 16
 """that wait for their password to be checked, which takes memory and time"""
 _OWN_SITE = {"same-origin"}
 _OF_PROXIES = ("forwarded", "x-forwarded-for", "x-forwarded-host", "x-real-ip", "via")
+_ANY_TOKEN = ""
+"""stands for the name of a user where wrong tokens are counted: no user has it"""
 _ASK_FOR_PASSWORD = {"WWW-Authenticate": 'Basic realm="fantwin"'}
 
 
@@ -115,10 +118,16 @@ class Visitor:
 class Access:
     """The rules of one gateway."""
 
-    def __init__(self, config: GatewayConfig, users: Users | None, log: SecurityLog | None = None) -> None:
-        """users: None where a proxy knows them, or nobody may act."""
+    def __init__(
+        self,
+        config: GatewayConfig,
+        users: Users | None,
+        tokens: Tokens | None = None,
+        log: SecurityLog | None = None,
+    ) -> None:
+        """users, tokens: None where a proxy knows the users, or nobody may act."""
         self._config = config
-        self._users = users
+        self._users, self._tokens = users, tokens
         self.sessions = LoginSessions()
         self.log = log or SecurityLog()
         self._failures = LoginFailures()
@@ -132,8 +141,8 @@ class Access:
 
     @property
     def problem(self) -> str:
-        """What is wrong with the file of users; empty if nothing is."""
-        return self._users.problem if self._users else ""
+        """What is wrong with the files of users and tokens; empty if nothing is."""
+        return "; ".join(each.problem for each in (self._users, self._tokens) if each and each.problem)
 
     @property
     def cookie_name(self) -> str:
@@ -147,9 +156,16 @@ class Access:
         return {"key": self.cookie_name, "httponly": True, "samesite": "strict", "secure": is_secure}
 
     def visitor(self, request: Request) -> Visitor:
-        """Who sends a request."""
+        """Who sends a request.
+
+        Raises:
+            HTTPException: 401 or 429, a program sends a token that is none.
+        """
         if self._config.user_header:
             return self._of_proxy(request)
+        kind, _, token = request.headers.get("authorization", "").partition(" ")
+        if self._tokens is not None and kind.lower() == "bearer":
+            return self._of_token(self._tokens, token.strip(), request)
         cookie = request.cookies.get(self.cookie_name, "")
         session = self.sessions.of(cookie) if cookie else None
         user = self._users.of(session.user) if session and self._users else None
@@ -169,6 +185,13 @@ class Access:
         if not visitor.may_read:
             raise HTTPException(401, "log in first")
         return visitor
+
+    def may_still_read(self, request: Request) -> bool:
+        """Whether who has begun a long answer may go on."""
+        try:
+            return self.visitor(request).may_read
+        except HTTPException:
+            return False
 
     async def operator(self, request: Request) -> Visitor:
         """Who sends a request that changes something.
@@ -219,7 +242,7 @@ class Access:
             else:
                 await self._verified(self._users, *_name_and_password(encoded), request)
         except HTTPException as error:
-            if self.has_login and error.status_code == 401:
+            if self.has_login and error.status_code == 401 and kind.lower() != "bearer":
                 error.headers = _ASK_FOR_PASSWORD
             raise
 
@@ -249,6 +272,18 @@ class Access:
             raise HTTPException(401, "wrong name or password")
         self._failures.succeed(name, where["address"])
         return user
+
+    def _of_token(self, tokens: Tokens, text: str, request: Request) -> Visitor:
+        """A program with a token; a session that it has beside it does not count."""
+        found = tokens.of(text)
+        if found is not None:
+            return Visitor(found.name, may_read=True, may_act=found.role == UserRole.OPERATOR)
+        where = address_of(request)
+        wait_s = self._failures.begin(_ANY_TOKEN, where["address"])
+        self.log.add("token refused", path=request.url.path, **where)
+        if wait_s:
+            raise HTTPException(429, "too many wrong tokens: try again later", {"Retry-After": f"{wait_s:.0f}"})
+        raise HTTPException(401, "no such token, or it has ended", {"WWW-Authenticate": "Bearer"})
 
     def _who_acts(self, request: Request) -> str:
         """What somebody without a name must do to act."""

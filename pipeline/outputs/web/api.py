@@ -13,6 +13,7 @@ from typing import Annotated, Any, Literal
 from fastapi import APIRouter, Depends, HTTPException, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import FileResponse, JSONResponse
+from fastapi.security import APIKeyCookie, HTTPBearer
 
 from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.errors import UserError
@@ -64,9 +65,15 @@ _PROBLEMS = {
 _RESPONSES: dict[int | str, dict[str, Any]] = {
     code: {"model": typed.Problem, "description": why} for code, why in _PROBLEMS.items()
 }
-_EVENTS: dict[int | str, dict[str, Any]] = {200: {"content": {"text/event-stream": {}}, "description": "live events"}}
-_FILE: dict[int | str, dict[str, Any]] = {200: {"content": {CLIP_TYPE: {}}, "description": "an MCAP file"}}
-_TABLE: dict[int | str, dict[str, Any]] = {200: {"content": {CSV_TYPE: {}}, "description": "JSON, or a table"}}
+_EVENTS: dict[int | str, dict[str, Any]] = {
+    200: {"content": {"text/event-stream": {"schema": {"type": "string"}}}, "description": "live events"}
+}
+_FILE: dict[int | str, dict[str, Any]] = {
+    200: {"content": {CLIP_TYPE: {"schema": {"type": "string", "format": "binary"}}}, "description": "an MCAP file"}
+}
+_TABLE: dict[int | str, dict[str, Any]] = {
+    200: {"content": {CSV_TYPE: {"schema": {"type": "string"}}}, "description": "JSON, or a table"}
+}
 _REFUSED: dict[int | str, dict[str, Any]] = {409: {"model": typed.Refused, "description": "the scorer has refused it"}}
 
 
@@ -91,7 +98,10 @@ class Api:
     def routes(self) -> APIRouter:
         """Which path answers what, as which type, and to whom."""
         router = APIRouter(responses=_RESPONSES)
-        get = partial(router.add_api_route, methods=["GET"], dependencies=[Depends(self.access.reader)])
+        token = Depends(HTTPBearer(auto_error=False, description="of `fantwin users add-token`"))
+        session = Depends(APIKeyCookie(name=self.access.cookie_name, auto_error=False, description="of `/login`"))
+        shown = [token, session]  # for openapi.json; `Access` decides
+        get = partial(router.add_api_route, methods=["GET"], dependencies=[Depends(self.access.reader), *shown])
         get("/site", self.site, response_model=typed.Site)
         get("/fans", self.fans, response_model=typed.Fans)
         get("/fans/{tray}/{fan}", self.fan, response_model=typed.FanInFull)
@@ -104,13 +114,14 @@ class Api:
         get("/clips/{name}", self.clip, response_class=FileResponse, responses=_FILE)
         get("/stages", self.stages, response_model=typed.Stages)
         get("/events", self.events, response_class=EventStream, responses=_EVENTS)
-        router.add_api_route("/me", self.me, response_model=typed.Me)
+        router.add_api_route("/me", self.me, response_model=typed.Me, dependencies=shown)
         post = partial(router.add_api_route, methods=["POST"])
         own = [Depends(require_own_page)]
         post("/login", self.log_in, response_model=typed.Session, dependencies=own)
         post("/logout", self.log_out, dependencies=own)
         act = {"response_model": typed.ScorerAnswers, "responses": _REFUSED}
-        post("/fans/{tray}/{fan}/requests", self.act, dependencies=[Depends(self.access.operator)], **act)
+        acts = [Depends(self.access.operator), *shown]
+        post("/fans/{tray}/{fan}/requests", self.act, dependencies=acts, **act)
         return router
 
     async def site(self) -> JSON:
@@ -219,7 +230,7 @@ class Api:
             looked_at = self._fan(tray, int(number) if number.isdecimal() and len(number) < 6 else -1)
         first = encoded("fleet", fleet_json(self.model))
         return EventStream(
-            self.feed.events(first, looked_at, lambda: self.access.visitor(request).may_read),
+            self.feed.events(first, looked_at, partial(self.access.may_still_read, request)),
             headers={"X-Accel-Buffering": "no"},  # of a proxy
         )
 

@@ -51,6 +51,8 @@ def application(api: Api, config: GatewayConfig) -> ASGIApp:
         openapi_url=f"{PREFIX}/openapi.json",
         docs_url=None,  # its scripts come from other servers
         redoc_url=None,
+        servers=[{"url": "/"}],
+        generate_unique_id_function=lambda route: route.name,
         max_body_size=LARGEST_BODY_BYTES,
         telemetry={"tracing": False, "metrics": False, "logs": False, "auto_configure": False},
         middleware=[

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import time
 from pathlib import Path
 
 import pytest
 from argon2 import PasswordHasher
 
 from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.site.tokens import Tokens
 from fantwin.pipeline.site.users import Users
 from tests.support.fantwin_command import fantwin
 
@@ -39,7 +41,7 @@ def test_users_are_added_changed_listed_and_removed_and_only_the_owner_reads_the
     assert path.stat().st_mode & 0o777 == 0o600
     assert PASSWORD not in path.read_text()
     listed = json.loads(fantwin("users", "-c", config, "--json").stdout)
-    assert listed == [{"name": "ann", "role": "viewer"}, {"name": "vic", "role": "viewer"}]
+    assert listed == [{"kind": "user", "name": name, "role": "viewer"} for name in ("ann", "vic")]
     users = Users(path)
     assert users.verified("ann", PASSWORD) is None
     assert users.verified("ann", OTHER_PASSWORD) is not None
@@ -53,3 +55,24 @@ def test_users_are_added_changed_listed_and_removed_and_only_the_owner_reads_the
 def test_a_password_that_is_too_short_is_refused_and_changes_nothing(config):
     assert "12 to 128" in str(fantwin("users", "add", "ann", "-c", config, typed="short\n").exception)
     assert not (config.parent / "users.toml").exists()
+
+
+def test_a_token_is_shown_once_listed_with_its_end_and_removed(config):
+    done = fantwin("users", "add-token", "grafana", "-c", config, "--role", "operator", "--days", "30", "--json")
+    text = json.loads(done.stdout)["token"]
+    path = config.parent / "users.tokens.toml"
+    assert path.stat().st_mode & 0o777 == 0o600
+    assert text not in path.read_text()
+    tokens = Tokens(config.parent / "users.toml")
+    (found,) = filter(None, [tokens.of(text)])
+    assert (found.name, found.role) == ("grafana", "operator")
+    assert Tokens(config.parent / "users.toml", lambda: time.time() + 31 * 86_400).of(text) is None
+    (listed,) = json.loads(fantwin("users", "-c", config, "--json").stdout)
+    assert (listed["kind"], listed["name"], listed["expires"][:2]) == ("token", "grafana", "20")
+    assert "grafana  operator  token, until 20" in fantwin("users", "-c", config).stdout
+    assert "is a token" in str(fantwin("users", "add", "grafana", "-c", config, typed=f"{PASSWORD}\n").exception)
+    assert fantwin("users", "remove-token", "grafana", "-c", config).exit_code == 0
+    assert tokens.of(text) is None, "from the next request on"
+    path.write_text('[grafana]\nrole = "root"\n')
+    path.chmod(0o600)
+    assert "[grafana] is no token" in str(fantwin("users", "-c", config).exception)
