@@ -30,7 +30,8 @@ CURVES = (
     "command",
 )
 """of a fan, in the order of the last axis, before its channels; NaN where nothing was measured or judged"""
-SERIES = ("deviation_rad_s", *CURVES, *(each.name for each in CHANNELS))
+DEVIATION = "deviation_rad_s"
+SERIES = (DEVIATION, *CURVES, *(each.name for each in CHANNELS))
 """the same with all channels and, first, how far the measured speed is above the twin's"""
 COLUMNS = (
     "command",

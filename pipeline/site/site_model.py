@@ -335,6 +335,11 @@ class SiteModel:
             heard = [each.health for each in self._stages.values() if each.heard_s >= before_s]
         return {each.tray: each for health in heard for each in health.learning if not health.is_last}
 
+    def every_wear(self) -> Sequence[Mapping[str, Any]]:
+        """The wear of all fans of which it is known, one row each."""
+        with self._lock:
+            return [row for _, rows in self._wear.values() for row in rows]
+
     def wear(self, fan: Fan) -> Sequence[Mapping[str, Any]]:
         """The wear of a fan as of the last snapshot of its scorer, one row; empty: none is known."""
         with self._lock:

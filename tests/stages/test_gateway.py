@@ -191,6 +191,10 @@ def test_metrics_are_those_of_prometheus_and_an_alarm_counts_once_in_each_severi
     found = samples()
     assert found["fantwin_fan_speed_rpm", "0", None] == pytest.approx(1000.0, rel=1e-6)
     assert found["fantwin_fan_score_ratio", "0", None] == 0.5
+    assert found["fantwin_fan_command", "0", None] == 0.5
+    assert found["fantwin_fan_deviation_rpm", "0", None] == pytest.approx(-10.0, abs=0.01)
+    assert found["fantwin_build_info", None, None] == 1.0
+    assert ("fantwin_fan_deviation_rpm", "3", None) not in found
     assert ("fantwin_fan_score_ratio", "3", None) not in found, "an unjudged fan has none"
     assert found["fantwin_fan_scored", "3", None] == 0.0
     assert found["fantwin_alarms_total", None, "alarm"] == 1.0
@@ -343,6 +347,8 @@ def test_a_fan_shows_its_wear_its_advice_and_where_rerun_is(opened, tmp_path):
     (row,) = worn["wear"]
     assert (row["parameter"], row["change"], row["error"], row["limit"]) == ("speed", -0.2, 0.01, 0.1)
     assert (row["t_ns"], row["days"]) == (NOW_NS - 5, None)
+    metric = 'fantwin_fan_wear_ratio{fan="2",site="hall",tray="tray1"} -0.2'
+    assert metric in client.ask("GET", "/metrics")[1].splitlines()
     assert "filter" in worn["alarm"]["advice"]
     assert client.ask("GET", f"/api/v1/fans/{TRAY}/1")[1]["wear"] == []
     (tray,) = client.ask("GET", "/api/v1/site")[1]["trays"]

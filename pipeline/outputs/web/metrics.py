@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
+from importlib.metadata import version
 from itertools import pairwise
 
 import numpy as np
@@ -21,7 +22,7 @@ from prometheus_client.exposition import generate_latest
 from prometheus_client.registry import Collector
 from prometheus_client.utils import floatToGoString
 
-from fantwin.pipeline.site.fan_history import CURVES
+from fantwin.pipeline.site.fan_history import DEVIATION, SERIES, in_series
 from fantwin.pipeline.site.fleet import Fan
 from fantwin.pipeline.site.site_model import SiteModel
 from fantwin.pipeline.site.stage_states import AT_WORK, StageState, Word
@@ -54,6 +55,9 @@ class SiteMetrics(Collector):
         pages = GaugeMetricFamily("fantwin_gateway_pages", "Pages that receive live events.", labels=["site"])
         pages.add_metric([self._model.site], self._readers)
         yield pages
+        build = GaugeMetricFamily("fantwin_build_info", "1; the version of fantwin.", labels=["site", "version"])
+        build.add_metric([self._model.site, version("fantwin")], 1.0)
+        yield build
 
     def _of_alarms(self) -> Iterable[Metric]:
         of_fan = [*_FAN, "name", "severity"]
@@ -129,7 +133,7 @@ def metrics_text(model: SiteModel, readers: int) -> bytes:
     registry = CollectorRegistry(auto_describe=False)
     registry.register(SiteMetrics(model, readers))
     ProcessCollector(registry=registry)
-    return "".join(_of_fans(model)).encode() + generate_latest(registry)
+    return "".join((*_of_fans(model), *_of_wear(model))).encode() + generate_latest(registry)
 
 
 def _of_fans(model: SiteModel) -> Iterator[str]:
@@ -142,19 +146,20 @@ def _of_fans(model: SiteModel) -> Iterator[str]:
         for tray in model.trays
     }
     heard = [tray for tray in model.trays_now() if tray.is_heard]
+    columns = {tray.tray: in_series(tray.values, tray.channels).astype(np.float64) for tray in heard}
     for name, about, curve, per_unit, digits in (
         ("fantwin_fan_speed_rpm", "Measured speed.", "measured_speed_rad_s", _PER_RPM, 2),
         ("fantwin_fan_predicted_speed_rpm", "Speed of the healthy twin.", "predicted_speed_rad_s", _PER_RPM, 2),
+        ("fantwin_fan_deviation_rpm", "Measured speed minus that of the twin.", DEVIATION, _PER_RPM, 2),
+        ("fantwin_fan_command", "Command given, in the unit of the tray.", "command", 1.0, 4),
         ("fantwin_fan_score_ratio", "Score relative to its limit.", "score", 1.0, 4),
         *((f"fantwin_fan_{each.name}", f"Measured {each.label}.", each.name, 1.0, 4) for each in CHANNELS),
     ):
-        known = {tray.tray: (*CURVES, *tray.channels) for tray in heard}
-        having = [tray for tray in heard if curve in known[tray.tray]]
-        if having or curve in CURVES:
+        having = [tray for tray in heard if curve in SERIES[: -len(CHANNELS)] or curve in tray.channels]
+        if having or curve in SERIES[: -len(CHANNELS)]:
             yield _head(name, about)
         for tray in having:
-            column = tray.values[:, known[tray.tray].index(curve)]
-            values = (column.astype(np.float64) / per_unit).round(digits).tolist()
+            values = (columns[tray.tray][:, SERIES.index(curve)] / per_unit).round(digits).tolist()
             yield from (
                 f"{name}{label} {floatToGoString(value)}\n"
                 for label, value in zip(labels[tray.tray], values, strict=True)
@@ -183,6 +188,17 @@ def _escaped(label: str, value: str) -> str:
     """A label before others; nothing without a value, which to Prometheus is the same."""
     text = value.replace("\\", r"\\").replace('"', r"\"")
     return f'{label}="{text}",' if value else ""
+
+
+def _of_wear(model: SiteModel) -> Iterator[str]:
+    yield _head(
+        "fantwin_fan_wear_ratio", "Slow change of the speed since the fan was new or serviced, as a share of it."
+    )
+    for row in model.every_wear():
+        name = _escaped("name", model.about(Fan(row["tray"], row["fan"])).name)
+        labels = f'fan="{row["fan"]}",{name}site="{model.site}",tray="{row["tray"]}"'
+        if row["change"] is not None and math.isfinite(row["change"]):
+            yield f"fantwin_fan_wear_ratio{{{labels}}} {floatToGoString(round(row['change'], 6))}\n"
 
 
 def _head(name: str, about: str) -> str:
