@@ -23,7 +23,7 @@ from fantwin.pipeline.outputs.mqtt.topics import Topics
 from fantwin.pipeline.runtime.stage import BuiltStage, Context, Stage
 from fantwin.pipeline.site.alarm_history import FILE, AlarmHistory
 from fantwin.pipeline.site.fleet import Fan
-from fantwin.pipeline.site.other_stages import expected_stages
+from fantwin.pipeline.site.other_stages import expected_stages, page_address
 from fantwin.pipeline.site.request_desk import RequestDesk
 from fantwin.pipeline.site.site_core import SiteCore
 from fantwin.pipeline.site.site_json import alarm_json, stages_json, transition_json
@@ -47,6 +47,10 @@ CHANGES_PERIOD_NS = NS_PER_S // 2
 SITE_PERIOD_NS = 5 * NS_PER_S
 
 
+def _devices(context: Context, topics: Topics) -> Mapping[str, str]:
+    return HomeAssistant(context.config, topics, context.trays, page_address(context)).messages()
+
+
 class MqttCore(SiteCore):
     """Knows what the broker should have, and what it has."""
 
@@ -66,7 +70,7 @@ class MqttCore(SiteCore):
         self._outbox = Outbox()
         self._history, self._queue = alarms, TransitionQueue(alarms, MOST_WAITING)
         self._requests = Requests(topics, model.trays, config.accept, desk)
-        self._devices = HomeAssistant(config, topics, model.trays).messages() if config.home_assistant else {}
+        self._devices = _devices(context, topics) if config.home_assistant else {}
         self._numbers: dict[int, int] = {}
         """transitions under way: by the number of the message, that of the transition"""
         self._changed_alarms: set[Fan] = set()

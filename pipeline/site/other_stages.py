@@ -1,9 +1,11 @@
-"""What other stages have on this host by the same configuration: recordings, and Rerun's viewer."""
+"""What other stages have by the same configuration: recordings, the operators' page, and Rerun's viewer."""
 
 from __future__ import annotations
 
+import socket
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 from urllib.parse import quote
 
 from fantwin.pipeline.config.loading import parse_config
@@ -14,7 +16,8 @@ from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.runtime.stage import Context
 from fantwin.pipeline.site.loopback import LOOPBACK
 
-VIEWER = "viewer"
+GATEWAY, VIEWER = "gateway", "viewer"
+_ANY_HOST = ("0.0.0.0", "::")
 
 
 def configured(context: Context, *stages: str) -> Config | None:
@@ -39,6 +42,25 @@ def recordings_of(config: Config) -> Sequence[Path]:
     """The first part of the recording of each recorder of the site, as far as they are on this host."""
     file: Path = config.sections[RECORDER].file  # pyright: ignore[reportAttributeAccessIssue]
     return [config.run_folder / own_file(shard.name, file) for shard in shards_of(RECORDER, config)]
+
+
+def page_address(context: Context) -> str:
+    """The address of the operators' page, as far as the configuration says it; empty: there is none.
+
+    A page on loopback is reached by the name of its proxy if it has one, otherwise on this host only.
+    """
+    config = configured(context, GATEWAY)
+    if config is None:
+        return ""
+    section: Any = config.sections[GATEWAY]
+    names = [name for name in section.hosts if name not in ("*", "localhost", "127.0.0.1", "[::1]")]
+    if section.is_loopback and names:
+        return f"https://{names[0]}/"
+    numbers = {tray: shard.number for shard in shards_of(GATEWAY, config) for tray in shard.trays}
+    port = section.port + min((numbers[tray.name] for tray in context.trays if tray.name in numbers), default=1) - 1
+    host = socket.getfqdn() if section.host in _ANY_HOST else section.host
+    host = f"[{host}]" if ":" in host else host
+    return f"{'https' if section.certificate else 'http'}://{host}:{port}/"
 
 
 def viewer_urls(config: Config) -> Mapping[str, str]:

@@ -78,6 +78,7 @@ def test_states_alarms_and_status_are_retained(tmp_path, broker, listener, start
         "name": "",
         "place": "",
         "state": "normal",
+        "group": "normal",
         "in_alarm": False,
         "judged": True,
         "score": 0.5,

@@ -10,7 +10,7 @@ from fantwin.pipeline.site.fleet import Fan, FanGroup, FanNow
 from fantwin.pipeline.site.site_model import SiteModel, TrayNow
 from fantwin.schemas.units import RAD_S_PER_UNIT
 
-AT_ONCE = ("state", "in_alarm", "judged")
+AT_ONCE = ("state", "group", "in_alarm", "judged")
 """what of a state is published at once when it changes"""
 
 
@@ -51,6 +51,7 @@ class FanStates:
             "name": now.about.name,
             "place": now.about.place,
             "state": now.state,
+            "group": str(now.group),
             "in_alarm": now.group == FanGroup.ALARM,
             "judged": judged,
             "score": _number(now.score),

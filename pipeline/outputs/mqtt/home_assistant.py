@@ -15,7 +15,7 @@ from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.outputs.mqtt.config import MqttConfig
 from fantwin.pipeline.outputs.mqtt.outbox import text_of
 from fantwin.pipeline.outputs.mqtt.topics import Topics
-from fantwin.pipeline.site.fleet import Fan
+from fantwin.pipeline.site.fleet import Fan, FanGroup
 from fantwin.schemas.topics import ALL_TRAYS
 
 ACKNOWLEDGE = "acknowledge"
@@ -24,13 +24,16 @@ DISCOVERY_PREFIX = "homeassistant"
 SITE_DEVICE = "site"
 ONLINE, OFFLINE = "online", "offline"
 _QOS = 1
+_OPTIONS = [group.replace("_", " ") for group in FanGroup]
 
 
 class HomeAssistant:
     """The devices of the fans of the trays that the configuration names."""
 
-    def __init__(self, config: MqttConfig, topics: Topics, trays: Sequence[TrayConfig]) -> None:
+    def __init__(self, config: MqttConfig, topics: Topics, trays: Sequence[TrayConfig], page: str = "") -> None:
+        """page: address of the operators' page; empty: there is none."""
         self._topics = topics
+        self._link = {"configuration_url": page} if page else {}
         self._can_acknowledge = ACKNOWLEDGE in config.accept
         self._availability = {
             "availability_topic": topics.status,
@@ -84,13 +87,20 @@ class HomeAssistant:
             "json_attributes_topic": self._topics.alarm(fan),
             "json_attributes_template": "{{ (value_json or {}) | tojson }}",
         }
-        in_unit = {"unit_of_measurement": tray.speed_unit}
+        in_unit, diagnostic = {"unit_of_measurement": tray.speed_unit}, {"entity_category": "diagnostic"}
         entities = {
             "problem": problem,
-            "state": self._value(name, topic, "state", "State", "mdi:fan"),
+            "state": {
+                **self._value(name, topic, "group", "State", "mdi:fan", device_class="enum", options=_OPTIONS),
+                "value_template": "{{ value_json.group | replace('_', ' ') }}",
+                "json_attributes_topic": topic,
+                "json_attributes_template": "{{ {'in words': value_json.state, 'since': value_json.since} | tojson }}",
+            },
             "speed": number("speed", "Speed", "mdi:fan", 0, **in_unit),
-            "predicted_speed": number("predicted_speed", "Speed of the healthy twin", "mdi:fan-auto", 0, **in_unit),
-            "score": number("score", "Score (1 is at the limit)", "mdi:gauge", 2),
+            "predicted_speed": number(
+                "predicted_speed", "Speed of the healthy twin", "mdi:fan-auto", 0, **in_unit, **diagnostic
+            ),
+            "score": number("score", "Score (1 is at the limit)", "mdi:gauge", 2, **diagnostic),
         }
         if self._can_acknowledge:
             entities[ACKNOWLEDGE] = {
@@ -108,7 +118,7 @@ class HomeAssistant:
 
     def _device(self, name: str, about: dict[str, Any], entities: dict[str, Any]) -> dict[str, Any]:
         return {
-            "device": {"identifiers": [f"{self._node}-{name}"], "manufacturer": "fantwin", **about},
+            "device": {"identifiers": [f"{self._node}-{name}"], "manufacturer": "fantwin", **self._link, **about},
             "origin": {"name": "fantwin", "sw_version": version("fantwin")},
             "components": entities,
             "qos": _QOS,

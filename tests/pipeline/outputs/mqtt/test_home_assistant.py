@@ -7,11 +7,13 @@ import re
 from typing import Any
 
 import pytest
+from jinja2 import Environment
 
 from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.outputs.mqtt.config import MqttConfig
 from fantwin.pipeline.outputs.mqtt.home_assistant import HomeAssistant
 from fantwin.pipeline.outputs.mqtt.topics import Topics
+from fantwin.pipeline.site.fleet import FanGroup
 
 TRAYS = (TrayConfig(name="tray1", fans=2, speed_unit="rpm"), TrayConfig(name="tray-2", fans=3, speed_unit="rad/s"))
 TOPIC = re.compile(r"homeassistant/device/([a-zA-Z0-9_-]+)/([a-zA-Z0-9_-]+)/config")
@@ -82,6 +84,23 @@ def test_entities_have_a_unit_and_are_unavailable_when_the_stage_is_gone_but_for
         assert entity["availability_topic"] == "fantwin/hall/status"
         assert (entity["payload_available"], entity["payload_not_available"]) == ("online", "offline")
     assert "availability_topic" not in devices_of()["site"]["components"]["running"]
+
+
+def test_the_state_is_one_of_the_groups_what_few_need_is_diagnostic_and_each_device_leads_to_the_page():
+    fan = devices_of()["tray-2-1"]["components"]
+    assert (fan["state"]["device_class"], fan["state"]["options"]) == (
+        "enum",
+        ["alarm", "suspect", "not judged", "silenced", "at rest", "normal"],
+    )
+    template = Environment().from_string(fan["state"]["value_template"])
+    shown = {template.render(value_json={"group": str(group)}) for group in FanGroup}
+    assert shown == set(fan["state"]["options"]), "Home Assistant refuses any other"
+    diagnostic = {name for name, entity in fan.items() if entity.get("entity_category") == "diagnostic"}
+    assert diagnostic == {"score", "predicted_speed"}
+    (config, topics) = MqttConfig(url="mqtt://broker", home_assistant=("tray-2",)), Topics("hall")
+    texts = HomeAssistant(config, topics, TRAYS, "https://fans.plant.example/").messages().values()
+    assert {json.loads(each)["device"]["configuration_url"] for each in texts} == {"https://fans.plant.example/"}
+    assert "configuration_url" not in devices_of()["site"]["device"], "without a page there is no link"
 
 
 def test_only_the_fans_of_named_trays_are_devices():
