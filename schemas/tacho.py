@@ -123,7 +123,11 @@ def _as_sequence(value: Any) -> Any:
     return (value,) if isinstance(value, Tacho | Mapping) else value
 
 
-Tachos: TypeAlias = Annotated[tuple[Tacho, ...], Field(min_length=1), BeforeValidator(_as_sequence)]
+Tachos: TypeAlias = Annotated[
+    tuple[Tacho, ...],
+    Field(min_length=1),
+    BeforeValidator(_as_sequence, json_schema_input_type=Tacho | tuple[Tacho, ...]),
+]
 """The tachos of several fans: one that all have in common, or one for each. A single one may be written by itself."""
 
 INSTANTANEOUS: tuple[Tacho, ...] = (Tacho(),)

@@ -20,6 +20,7 @@ from typer.main import get_command
 
 from fantwin.pipeline.cli.main import COMMANDS, PANELS, app, function_of
 from fantwin.pipeline.cli.simulation.scenario import ClockScenario, FileScenario, Scenario, SurroundingsScenario
+from fantwin.pipeline.config.json_schema import schema_text
 from fantwin.pipeline.config.reference_page import table
 from fantwin.pipeline.config.registry import STAGES
 from fantwin.schemas.topics import KIB, MIB, TOPICS
@@ -147,6 +148,7 @@ def _bytes(size: int) -> str:
     return f"{size // MIB} MiB" if size % MIB == 0 else f"{size // KIB} KiB"
 
 
+SCHEMA = "fantwin.schema.json"
 MADE: dict[str, Callable[[str], str]] = {
     "commands.md": lambda _: page(),
     "messages.md": with_topics,
@@ -155,5 +157,6 @@ MADE: dict[str, Callable[[str], str]] = {
 }
 
 if __name__ == "__main__":
+    (PAGES / SCHEMA).write_text(schema_text(), encoding="utf-8")
     for name, made in MADE.items():
         (PAGES / name).write_text(made((PAGES / name).read_text(encoding="utf-8")), encoding="utf-8")

@@ -135,7 +135,7 @@ def _values(value: Schema) -> str:
     """What a key may be: its types, and their bounds."""
     options = _options(value)
     bounds = [f"{words} {_number(each[name])}" for each in options for name, words in _BOUNDS.items() if name in each]
-    return ", ".join([" or ".join(map(_type_words, options)), *bounds])
+    return ", ".join([" or ".join(dict.fromkeys(map(_type_words, options))), *bounds])
 
 
 def _options(value: Schema) -> list[Schema]:

@@ -135,7 +135,7 @@ class BusConfig(Section):
     mode: Literal["peer", "client"] = Field(
         default="peer", description="peer: processes meet without a router; client: all go through `fantwin router`"
     )
-    endpoint: Annotated[str, BeforeValidator(_joined)] = Field(
+    endpoint: Annotated[str, BeforeValidator(_joined, json_schema_input_type=str | tuple[str, ...])] = Field(
         default="tcp/127.0.0.1:7447",
         description="where peers meet, or for clients the address of the router; or a list of routers: a client uses "
         "the first that answers, and another when that one is gone",

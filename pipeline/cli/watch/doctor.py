@@ -55,13 +55,15 @@ class Task(StrEnum):
     CHECK = "check"
     NOTIFY = "notify"
     SELFTEST = "selftest"
+    SCHEMA = "schema"
 
 
 def doctor(
     task: Annotated[
         Task,
         typer.Argument(
-            help="Check installation and configuration, notify by test messages, or selftest fantwin itself."
+            help="Check installation and configuration, notify by test messages, selftest fantwin itself, or print the "
+            "schema of the configuration."
         ),
     ] = Task.CHECK,
     targets: Annotated[
@@ -94,13 +96,16 @@ def doctor(
     check listens to the line of each tray and names what does not fit: rate, commands, speeds, fans, unit, tachos.
     notify sends a message to the targets of the notifier, and says which ones accepted it. selftest kills, freezes and
     floods the stages of a simulated site with its own port and folder, in about three minutes, and leaves running sites
-    alone.
+    alone. schema prints a JSON schema, by which editors complete a fantwin.toml that begins with
+    `#:schema ./fantwin.schema.json`.
 
     Exit code 1 if there is a problem to fix, a message that was not accepted, or a promise that was not kept.
 
     Example: fantwin doctor -c fantwin.toml
 
     Example: fantwin doctor selftest kill hang
+
+    Example: fantwin doctor schema > fantwin.schema.json
     """
     if output and task is not Task.SELFTEST:
         raise UsageError(f"-o is for selftest: leave it out with {task}")
@@ -110,6 +115,10 @@ def doctor(
         run_selftest(targets or (), output, json_output=json_output)
     elif task is Task.NOTIFY:
         send_test_messages(config or DEFAULT_CONFIG, overrides or (), targets or (), json_output=json_output)
+    elif task is Task.SCHEMA:
+        from fantwin.pipeline.config.json_schema import schema_text  # noqa: PLC0415  imports all stages
+
+        typer.echo(schema_text(), nl=False)
     else:
         found = list(_findings(config, overrides, listen_s, trays or []))
         good, problems = ([line for ok, line in found if ok is wanted] for wanted in (True, False))
