@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import signal
 import sys
@@ -60,7 +61,6 @@ app = typer.Typer(
     epilog="Exit codes: 0 success; 1 failed, and one line says why; 2 wrong usage; 3 finished with a bad result: data "
     "were lost or could not be read in full, or a declared rate was not kept; 4 bad recordings were skipped; 130 "
     "interrupted by Ctrl-C.",
-    add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
 )
@@ -132,10 +132,20 @@ def expand_variadic(words: Sequence[str]) -> list[str]:
     return expanded
 
 
+def _words_to_complete() -> list[str]:
+    """The command line so far, from the shell that asks how it may go on; empty: it does not ask."""
+    if "_FANTWIN_COMPLETE" not in os.environ:
+        return []
+    line = os.environ.get("_TYPER_COMPLETE_ARGS") or os.environ.get("COMP_WORDS", "")
+    return [*line.split(), *([""] if line.endswith(" ") else [])]
+
+
 def main() -> None:
     """Entry point: runs a command, turns a `UserError` and a lack of memory into one line and an exit code."""
     words = expand_variadic(sys.argv[1:])
     named = next((word for word in words if word != "--"), "")
+    if completed := _words_to_complete():
+        named = completed[1] if len(completed) > 2 else ""
     if named in COMMANDS:
         _register([named])  # a stage's process imports its own command only
     else:

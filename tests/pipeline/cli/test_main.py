@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import sys
@@ -168,3 +169,21 @@ def test_row_15_a_lack_of_memory_is_one_line(monkeypatch, capsys):
         command_line.main()
     assert ended.value.code == 1
     assert capsys.readouterr().err == "fantwin: not enough memory for this; use smaller files, or a machine with more\n"
+
+
+@pytest.mark.parametrize(
+    ("line", "offered", "not_offered"),
+    [
+        ("fantwin al", {"alarms"}, {"up"}),
+        ("fantwin alarms --hi", {"--history"}, {"--json"}),
+        ("fantwin doctor --li", {"--listen-s"}, set()),
+    ],
+)
+def test_a_shell_completes_commands_and_their_options(line, offered, not_offered) -> None:
+    asked = {"_FANTWIN_COMPLETE": "complete_bash", "COMP_WORDS": line, "COMP_CWORD": str(len(line.split()) - 1)}
+    program = "import sys; sys.argv = ['fantwin']; from fantwin.pipeline.cli.main import main; main()"
+    command, environment = [sys.executable, "-c", program], {**os.environ, **asked}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60, check=True)
+    found = set(done.stdout.split())
+    assert offered <= found, done.stderr
+    assert found.isdisjoint(not_offered)
