@@ -63,6 +63,7 @@ class Transition(OpenEnum):
     DATA_RESTORED = 14
     MARKED_TRUE = 15
     MARKED_FALSE = 16
+    COMMENTED = 17
 
 
 class Action(OpenEnum):
@@ -77,6 +78,7 @@ class Action(OpenEnum):
     COMMISSION = 6
     TRUE_ALARM = 7
     FALSE_ALARM = 8
+    COMMENT = 9
 
 
 class Feedback(OpenEnum):

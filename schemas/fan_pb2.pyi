@@ -58,6 +58,7 @@ class Transition(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     TRANSITION_DATA_RESTORED: _ClassVar[Transition]
     TRANSITION_MARKED_TRUE: _ClassVar[Transition]
     TRANSITION_MARKED_FALSE: _ClassVar[Transition]
+    TRANSITION_COMMENTED: _ClassVar[Transition]
 
 class Action(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
@@ -70,6 +71,7 @@ class Action(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     ACTION_COMMISSION: _ClassVar[Action]
     ACTION_TRUE_ALARM: _ClassVar[Action]
     ACTION_FALSE_ALARM: _ClassVar[Action]
+    ACTION_COMMENT: _ClassVar[Action]
 
 class Feedback(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
@@ -136,6 +138,7 @@ TRANSITION_DATA_LOST: Transition
 TRANSITION_DATA_RESTORED: Transition
 TRANSITION_MARKED_TRUE: Transition
 TRANSITION_MARKED_FALSE: Transition
+TRANSITION_COMMENTED: Transition
 ACTION_NONE: Action
 ACTION_ACKNOWLEDGE: Action
 ACTION_SHELVE: Action
@@ -145,6 +148,7 @@ ACTION_IN_SERVICE: Action
 ACTION_COMMISSION: Action
 ACTION_TRUE_ALARM: Action
 ACTION_FALSE_ALARM: Action
+ACTION_COMMENT: Action
 FEEDBACK_NONE: Feedback
 FEEDBACK_TRUE_ALARM: Feedback
 FEEDBACK_FALSE_ALARM: Feedback

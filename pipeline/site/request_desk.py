@@ -31,6 +31,7 @@ OperatorAction = Literal[
     "commission",
     "true_alarm",
     "false_alarm",
+    "comment",
 ]
 OneLine = Annotated[str, AfterValidator(one_line)]
 
@@ -41,7 +42,7 @@ class RequestForm(BaseModel):
     Attributes:
         action: what is asked.
         duration_s: how long to shelve, s; 0: until the alarm clears. Only for shelve.
-        comment: why, for the record; false_alarm needs it.
+        comment: why, for the record; false_alarm and comment need it.
         onset_t_ns: for true_alarm and false_alarm, onset of the alarm that is meant, to within a second; 0: the last
             one of the fan.
     """
@@ -57,6 +58,8 @@ class RequestForm(BaseModel):
     def _check(self) -> Self:
         if self.action == "false_alarm" and not self.comment.strip():
             raise ValueError("a false alarm needs a reason: give a comment")
+        if self.action == "comment" and not self.comment.strip():
+            raise ValueError("there is no comment")
         if self.onset_t_ns and self.message_action not in GIVES_FEEDBACK:
             raise ValueError("onset_t_ns is for true_alarm and false_alarm only")
         return self

@@ -179,7 +179,7 @@ class FanCondition:
         """
         if action in GIVES_FEEDBACK:
             return self._take_feedback(action, operator_name, comment, onset_t_ns)
-        refusal = self._refusal(action, now_t_ns, duration_ns)
+        refusal = self._refusal(action, now_t_ns, duration_ns, comment)
         if refusal:
             return Transition.REFUSED, refusal
         timed = action == Action.SHELVE and duration_ns  # other actions ignore the duration, which may be NaN
@@ -194,6 +194,7 @@ class FanCondition:
             Action.OUT_OF_SERVICE: (Transition.OUT_OF_SERVICE, {"out_of_service": True}),
             Action.IN_SERVICE: (Transition.IN_SERVICE, {"out_of_service": False}),
             Action.COMMISSION: (Transition.COMMISSIONING, {}),
+            Action.COMMENT: (Transition.COMMENTED, {}),
         }
         transition, changed = granted[action]
         self.alarm_state = replace(self.alarm_state, **changed, comment=comment or self.alarm_state.comment)
@@ -225,7 +226,7 @@ class FanCondition:
             )
         return transition, ""
 
-    def _refusal(self, action: Action, now_t_ns: int, duration_ns: float) -> str:
+    def _refusal(self, action: Action, now_t_ns: int, duration_ns: float, comment: str) -> str:
         """Why the request must be refused; empty if it is granted."""
         now = self.alarm_state
         once = now.shelved_until_t_ns == UNTIL_IT_CLEARS_T_NS and duration_ns == 0
@@ -245,6 +246,10 @@ class FanCondition:
             Action.OUT_OF_SERVICE: ((now.out_of_service, "it is out of service already"),),
             Action.IN_SERVICE: ((not now.out_of_service, "it is in service already"),),
             Action.COMMISSION: (),
+            Action.COMMENT: (
+                (not raised, "no alarm has been raised"),
+                (not comment.strip(), "there is no comment"),
+            ),
             Action.NONE: ((True, "no action is named"),),
         }
         return next((reason for applies, reason in reasons.get(action, unknown) if applies), "")

@@ -44,6 +44,7 @@ TRANSITIONS = {
     Transition.DATA_RESTORED: "judged again, on new samples",
     Transition.MARKED_TRUE: "marked as a true alarm",
     Transition.MARKED_FALSE: "marked as a false alarm",
+    Transition.COMMENTED: "commented on",
 }
 """transitions whose line depends on nothing else"""
 SIGMAS = 2.0

@@ -25,6 +25,7 @@ ALARM = f"{FAN}/Alarm"
 SERVER = "ns=0;i=2253"
 TIMED_SHELVE, ONE_SHOT_SHELVE, UNSHELVE = "ns=0;i=2949", "ns=0;i=2948", "ns=0;i=2947"
 REMOVE_FROM_SERVICE = "ns=0;i=17869"
+DISABLE = "ns=0;i=9028"
 CONDITION_TYPE, REFRESH = "ns=0;i=2782", "ns=0;i=3875"
 
 
@@ -52,6 +53,7 @@ class Scorer:
                 not self.state.get("shelved_until_t_ns"),
             ),
             Action.OUT_OF_SERVICE: (Transition.OUT_OF_SERVICE, {"out_of_service": True}, False),
+            Action.COMMENT: (Transition.COMMENTED, {}, not request.comment),
         }[request.action]
         if is_refused:
             transition, changed = Transition.REFUSED, {}
@@ -163,9 +165,12 @@ def test_an_alarm_comes_is_refreshed_acknowledged_confirmed_and_shelved(opcua, n
     assert client("acknowledge", condition=ALARM, event=raised["EventId"], comment="again") == (
         "BadConditionBranchAlreadyAcked"
     )
-    assert client("comment", condition=ALARM, event=raised["EventId"], comment="no such request") == (
-        "BadNotImplemented"
-    )
+    assert client("comment", condition=ALARM, event="00" * 16, comment="x") == "BadEventIdUnknown"
+    assert client("comment", condition=ALARM, event=raised["EventId"], comment="the part is ordered") == "Good"
+    commented = comes("the comment", lambda each: each["Comment"] == "the part is ordered")
+    assert (commented["ClientUserId"], commented["AckedState.Id"]) == (OPERATOR, True), "nothing else has changed"
+    assert client("comment", condition=ALARM, event=raised["EventId"], comment="") == "BadInvalidState"
+    assert client("call", object=ALARM, method=DISABLE) == "BadNotImplemented"
 
     assert client("call", object=f"{ALARM}/ShelvingState", method=TIMED_SHELVE, inputs=[60_000]) == "Good"
     assert scorer.asked[-1].duration_s == 60.0

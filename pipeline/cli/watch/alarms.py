@@ -45,6 +45,7 @@ class OperatorAction(StrEnum):
     COMMISSION = "commission"
     TRUE_ALARM = "true-alarm"
     FALSE_ALARM = "false-alarm"
+    COMMENT = "comment"
 
     @property
     def action(self) -> Action:

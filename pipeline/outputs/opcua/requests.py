@@ -34,7 +34,7 @@ class ConditionMethod:
 EVENT_ID, COMMENT, SHELVING_TIME = "EventId", "Comment", "ShelvingTime"
 METHODS = (
     ConditionMethod("Acknowledge", Action.ACKNOWLEDGE, (EVENT_ID, COMMENT)),
-    ConditionMethod("AddComment", None, (EVENT_ID, COMMENT)),
+    ConditionMethod("AddComment", Action.COMMENT, (EVENT_ID, COMMENT)),
     ConditionMethod("Enable", None, refusal="BadConditionAlreadyEnabled"),
     ConditionMethod("Disable", None),
     ConditionMethod("RemoveFromService", Action.OUT_OF_SERVICE),

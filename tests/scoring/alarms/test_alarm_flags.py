@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
-from fantwin.schemas.enums import Severity
+from fantwin.schemas.enums import Action, Severity, Transition
 from fantwin.schemas.messages import Alarm
 from fantwin.scoring.alarms.alarm_state import (
     UNTIL_IT_CLEARS_T_NS,
     AlarmState,
+    FanCondition,
     is_listed,
     is_presented,
     is_retained,
@@ -52,3 +55,14 @@ def test_a_state_and_its_message_agree_on_retained_silenced_presented_and_listed
 
 def test_an_alarm_that_was_never_raised_is_on_no_list():
     assert not is_listed(AlarmState())
+
+
+def test_a_comment_changes_nothing_else_and_needs_an_alarm_and_words():
+    condition = FanCondition()
+    asked = (Action.COMMENT, 7, 0.0, "ann")
+    assert condition.request(*asked, "seen") == (Transition.REFUSED, "no alarm has been raised")
+    condition.update(active=True, severity=Severity.ALARM, onset_t_ns=3)
+    before = condition.alarm_state
+    assert condition.request(*asked, " ") == (Transition.REFUSED, "there is no comment")
+    assert condition.request(*asked, "the part is ordered") == (Transition.COMMENTED, "")
+    assert condition.alarm_state == replace(before, comment="the part is ordered")
