@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import http.client
 import json
 import math
@@ -19,7 +18,6 @@ from prometheus_client.parser import text_string_to_metric_families
 from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.outputs.web import answers as typed
 from fantwin.pipeline.outputs.web.app import LARGEST_BODY_BYTES
-from fantwin.pipeline.outputs.web.config import GatewayConfig
 from fantwin.pipeline.recordings.clips.clip import Clip, ClipAlarm, clips_as_text
 from fantwin.pipeline.recordings.writing import RecordingWriter
 from fantwin.pipeline.site.fans_json import MOST_LIVE, fans_json
@@ -268,24 +266,6 @@ def test_every_answer_forbids_foreign_scripts_and_the_cookie_is_for_the_server_o
         assert "default-src 'none'" in headers["content-security-policy"], path
         assert headers["x-content-type-options"] == "nosniff"
     assert client.ask("GET", "/page/../app.py")[0] == 404
-
-
-def test_prometheus_sends_the_password_of_a_user_and_gets_nothing_else_with_it(opened, tmp_path, users, monkeypatch):
-    gateway = opened(tmp_path, granted, users=users)
-    monkeypatch.setattr(GatewayConfig, "is_loopback", False)  # from here on, as if others could reach it
-
-    def basic(words: str) -> dict[str, str]:
-        return {"Authorization": f"Basic {base64.b64encode(words.encode()).decode()}"}
-
-    client, right = Client(gateway), basic(f"vic:{PASSWORD}")
-    status, _, headers = client.ask("GET", "/metrics")
-    assert (status, headers["www-authenticate"]) == (401, 'Basic realm="fantwin"')
-    status, text, _ = client.ask("GET", "/metrics", None, right)
-    assert (status, "fantwin_gateway_pages" in text) == (200, True)
-    assert client.ask("GET", "/api/v1/fans", None, right)[0] == 401, "a browser sends it to every path"
-    assert client.ask("GET", "/metrics", None, {"Authorization": "Basic ÿÿ"})[0] == 401
-    wrong = [client.ask("GET", "/metrics", None, basic("vic:wrong wrong wrong"))[0] for _ in range(6)]
-    assert wrong == [401] * 5 + [429], "who guesses must wait"
 
 
 def test_a_proxy_names_the_user_and_others_cannot(opened, tmp_path):

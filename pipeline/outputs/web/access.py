@@ -13,7 +13,6 @@ import hmac
 import ipaddress
 import secrets
 import time
-from base64 import b64decode
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -102,7 +101,6 @@ _OWN_SITE = {"same-origin"}
 _OF_PROXIES = ("forwarded", "x-forwarded-for", "x-forwarded-host", "x-real-ip", "via")
 _ANY_TOKEN = ""
 """stands for the name of a user where wrong tokens are counted: no user has it"""
-_ASK_FOR_PASSWORD = {"WWW-Authenticate": 'Basic realm="fantwin"'}
 
 
 @dataclass(frozen=True)
@@ -228,24 +226,6 @@ class Access:
         self.sessions.end(request.cookies.get(self.cookie_name, ""))
         return self.sessions.begin(user.name, user.password_hash)
 
-    async def require_scraper(self, request: Request) -> None:
-        """Let whoever may read have the metrics, and a program that sends name and password of a user each time (HTTP
-        Basic).
-
-        Raises:
-            HTTPException: 401, 429 or 503, he may not.
-        """
-        kind, _, encoded = request.headers.get("authorization", "").partition(" ")
-        try:
-            if self._users is None or kind.lower() != "basic":
-                await self.reader(request)
-            else:
-                await self._verified(self._users, *_name_and_password(encoded), request)
-        except HTTPException as error:
-            if self.has_login and error.status_code == 401 and kind.lower() != "bearer":
-                error.headers = _ASK_FOR_PASSWORD
-            raise
-
     async def _verified(self, users: Users, name: str, password: str, request: Request) -> User:
         """The user with this name and password. To check one takes long; the server goes on meanwhile.
 
@@ -312,15 +292,6 @@ class Access:
         if len(names) != 1 or not NAME.fullmatch(names[0]):
             return Visitor("", may_read=False, may_act=False)
         return Visitor(names[0], may_read=True, may_act=names[0] in self._config.operators)
-
-
-def _name_and_password(encoded: str) -> tuple[str, str]:
-    """Those of HTTP Basic. HTTPException 401: there are none."""
-    try:
-        name, _, password = b64decode(encoded, validate=True).decode().partition(":")
-    except ValueError as error:
-        raise HTTPException(401, "no valid name and password") from error
-    return name, password
 
 
 def address_of(request: Request) -> dict[str, str]:

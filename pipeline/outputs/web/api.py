@@ -236,7 +236,7 @@ class Api:
 
     async def metrics(self, request: Request) -> Response:
         """Metrics in the text format of Prometheus."""
-        await self.access.require_scraper(request)
+        await self.access.reader(request)
         return Response(await run_in_threadpool(metrics_text, self.model, self.feed.readers), media_type=METRICS_TYPE)
 
     async def me(self, request: Request) -> typed.Me:
