@@ -9,10 +9,20 @@ from collections.abc import Collection, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 
+from mcap.opcode import Opcode
+
 from fantwin.pipeline.recordings.indexed import IndexedRecording
 from fantwin.pipeline.recordings.parts import part_files
 from fantwin.pipeline.recordings.reading import read_metadata
-from fantwin.pipeline.recordings.records import ACTIVE_SUFFIX, CORRUPT_DATA_ERRORS, RecordingError, whole_number
+from fantwin.pipeline.recordings.records import (
+    ACTIVE_SUFFIX,
+    CORRUPT_DATA_ERRORS,
+    MESSAGE,
+    RECORD,
+    RecordingError,
+    chunk_at,
+    whole_number,
+)
 from fantwin.schemas.codec import CodecError, decode_together
 from fantwin.schemas.messages import Raw, Score
 from fantwin.schemas.units import NS_PER_S
@@ -24,12 +34,21 @@ _KINDS: dict[str, type[Raw | Score]] = {"score": Score, "raw": Raw}
 _ENDLESS_NS = (1 << 63) - 1
 
 
-class RecordedRange:
-    """The recordings of a run; used in several threads.
+def _payloads(data: bytes, channels: Collection[int], begin_ns: int) -> Iterator[bytes]:
+    """The messages of these channels in a chunk whose newest sample is not older; nothing else of them is looked at."""
+    at, end = 0, len(data)
+    while at < end:
+        opcode, length = RECORD.unpack_from(data, at)
+        at += RECORD.size
+        if opcode == Opcode.MESSAGE:
+            channel, _, _, newest_t_ns = MESSAGE.unpack_from(data, at)
+            if channel in channels and newest_t_ns >= begin_ns:
+                yield data[at + MESSAGE.size : at + length]
+        at += length
 
-    Attributes:
-        unread: files that could not be read in full, by name.
-    """
+
+class RecordedRange:
+    """The recordings of a run; used in several threads."""
 
     def __init__(self, recordings: Sequence[Path]) -> None:
         """recordings: the first part of each, NAME.mcap."""
@@ -52,14 +71,15 @@ class RecordedRange:
                 unread.add(path.name)
                 continue
             topics = {topic for _, topic in indexed.channels.values()}
-            topic = next((name for name in _KINDS if name in topics), None)
+            topic = next((name for name in _KINDS if name in topics), "")
+            channels = {number for number, (_, each) in indexed.channels.items() if each == topic}
             for chunk in indexed.chunks if topic else ():
                 if chunk.message_end_time < begin_ns or chunk.message_start_time > end_ns + LATEST_NS:
                     continue
                 try:
-                    found = indexed.envelopes(chunk)
-                    wanted = [each.payload for each in found if each.topic == topic and each.newest_t_ns >= begin_ns]
-                    yield from decode_together(_KINDS[topic or ""], wanted, columns)
+                    with indexed.file.open("rb") as file:
+                        found = list(_payloads(chunk_at(file, chunk), channels, begin_ns))
+                    yield from decode_together(_KINDS[topic], found, columns)
                 except (OSError, CodecError, *CORRUPT_DATA_ERRORS):
                     unread.add(path.name)
 

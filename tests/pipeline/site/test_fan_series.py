@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from fantwin.pipeline.config.settings import TrayConfig
-from fantwin.pipeline.recordings.indexed import IndexedRecording
+from fantwin.pipeline.recordings import time_range
+from fantwin.pipeline.recordings.records import chunk_at
 from fantwin.pipeline.recordings.time_range import RecordedRange
 from fantwin.pipeline.recordings.writing import RecordingWriter
 from fantwin.pipeline.site.alarm_history import AlarmHistory
@@ -134,8 +135,7 @@ def test_recorded_scores_are_shown_with_their_twin_and_only_chunks_of_the_range_
     messages = [each for number in range(100) for each in (raw(number), score(number))]
     recorded = record(tmp_path, *messages)
     opened: list[int] = []
-    envelopes = IndexedRecording.envelopes
-    monkeypatch.setattr(IndexedRecording, "envelopes", lambda self, chunk: opened.append(1) or envelopes(self, chunk))
+    monkeypatch.setattr(time_range, "chunk_at", lambda *place: opened.append(1) or chunk_at(*place))
     found = FanSeries(model, recorded).as_json(FAN, at(10), at(11), 1000)
     assert (found["columns"]["deviation"]["mean"], found["note"]) == ([-3.0] * 100, "")
     assert len(opened) <= 16, "a message may be received a minute late"
