@@ -39,22 +39,18 @@ class Buckets:
         """Add samples, t_ns (n,) and values (n, columns); low, high: where each stands for several."""
         if len(t_ns) > 1:
             self._period_ns = max(self._period_ns, int(np.median(np.diff(t_ns))))
-        within = (t_ns >= self._begin_ns) & (t_ns < self._end_ns)
-        if not within.any():
-            return
-        t_ns = t_ns[within]
         order = np.argsort(t_ns, kind="stable")
+        order = order[(t_ns[order] >= self._begin_ns) & (t_ns[order] < self._end_ns)]
+        if not len(order):
+            return
         offset_ns = t_ns[order] - self._begin_ns
         part = offset_ns // self.width_ns
         firsts = np.flatnonzero(np.diff(part, prepend=-1))
         at = part[firsts]
-
-        def of(values: Array | None) -> Array:
-            return (mean if values is None else values)[within][order]
-
-        self._low[at] = np.fmin(self._low[at], np.fmin.reduceat(of(low), firsts, axis=0))
-        self._high[at] = np.fmax(self._high[at], np.fmax.reduceat(of(high), firsts, axis=0))
-        values = of(mean)
+        values = mean[order]
+        lowest, highest = (values if each is None else each[order] for each in (low, high))
+        self._low[at] = np.fmin(self._low[at], np.fmin.reduceat(lowest, firsts, axis=0))
+        self._high[at] = np.fmax(self._high[at], np.fmax.reduceat(highest, firsts, axis=0))
         self._total[at] += np.add.reduceat(np.nan_to_num(values), firsts, axis=0)
         self._count[at] += np.add.reduceat(np.isfinite(values).astype(np.int64), firsts, axis=0)
         self._offset_ns[at] += np.add.reduceat(offset_ns.astype(np.float64), firsts)
