@@ -144,7 +144,8 @@ def main() -> None:
     """Entry point: runs a command, turns a `UserError` and a lack of memory into one line and an exit code."""
     words = expand_variadic(sys.argv[1:])
     named = next((word for word in words if word != "--"), "")
-    if completed := _words_to_complete():
+    completed = _words_to_complete()
+    if completed:
         named = completed[1] if len(completed) > 2 else ""
     if named in COMMANDS:
         _register([named])  # a stage's process imports its own command only
@@ -153,7 +154,7 @@ def main() -> None:
     if signal.getsignal(signal.SIGINT) is signal.SIG_DFL:  # commands clean up when they are interrupted
         signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
-        if words:
+        if words or completed:
             app(words)
         else:
             from fantwin.pipeline.cli.watch.next_step import show_next_step  # noqa: PLC0415

@@ -36,6 +36,12 @@ def schema_text() -> str:
     tray, serial = made[TrayConfig.__name__], made[source_config("serial").__name__]["properties"]
     for key in TrayConfig.short_form_keys:
         tray["properties"][key] = serial[key]
+    number = tray["properties"]["fans"]
+    names = {"type": "array", "minItems": 1, "items": {"type": "string"}}
+    about_fans = {key: number.pop(key) for key in ("title", "description")}
+    tray["properties"]["fans"] = {**about_fans, "anyOf": [number, names]}
+    tray["required"].remove("fans")
+    tray["anyOf"] = [{"required": ["fans"]}, {"required": ["fan"]}]
     about = "The configuration of a fantwin site: docs/reference/configuration.md."
     return json.dumps({"$schema": DIALECT, **whole, "title": "fantwin.toml", "description": about}, indent=1) + "\n"
 

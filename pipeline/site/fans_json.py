@@ -44,8 +44,8 @@ def fans_json(model: SiteModel, fans: Sequence[FanNow]) -> list[dict[str, Any]]:
             {
                 "tray": tray,
                 "fan": number,
-                "name": "",
-                "place": "",
+                "name": now.about.name,
+                "place": now.about.place,
                 "state": now.state,
                 "group": str(now.group),
                 "score": None if math.isnan(now.score) else round(now.score, 4),

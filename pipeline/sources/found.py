@@ -28,6 +28,12 @@ class Found:
     missing: tuple[str, ...] = ()
 
     @property
+    def fans(self) -> int:
+        """The number of fans of the tray."""
+        fans = self.tray.get("fans", self.tray.get("fan", ()))
+        return fans if isinstance(fans, int) else len(fans)
+
+    @property
     def toml(self) -> str:
         """The [[tray]], with what to know as comments; empty if it cannot be one."""
         if not self.tray:
@@ -51,4 +57,6 @@ def as_toml(value: object) -> str:
     """A value of a configuration as TOML writes it."""
     if isinstance(value, Mapping):
         return f"{{ {', '.join(f'{key} = {as_toml(each)}' for key, each in value.items())} }}"
-    return json.dumps(value)  # texts, numbers, booleans and lists of numbers are alike in both
+    if isinstance(value, list):
+        return f"[{', '.join(map(as_toml, value))}]"
+    return json.dumps(value, ensure_ascii=False)  # texts, numbers and booleans are alike in both

@@ -108,7 +108,7 @@ def init(
     lines = [
         *(f"{each.title}: {line}" for each in trays for line in (*each.notes, *each.missing)),
         *(f"left out: {line}" for line in left_out),
-        *(f"{config}: written, tray {each.tray['name']}, fans {each.tray['fans']}" for each in trays),
+        *(f"{config}: written, tray {each.tray['name']}, fans {each.fans}" for each in trays),
         *(f"{chosen.logs}: {each.format}, {len(each.files)} files" for each in found_logs),
         *(f"next: {line}" for line in following),
     ]
@@ -144,7 +144,7 @@ def _asked(root: Path) -> Chosen:
     ports, others = serial_ports()
     hwmon = writable = False
     for each in chips:
-        typer.echo(f"{each.title}: {'; '.join(each.notes[: int(str(each.tray['fans']))])}")
+        typer.echo(f"{each.title}: {'; '.join(each.notes[: each.fans])}")
     if chips:
         hwmon = typer.confirm("Watch these fans of this computer?", default=True)
     if hwmon:

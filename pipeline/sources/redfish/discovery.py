@@ -43,9 +43,11 @@ def discover_controller(url: str, password_file: Path | None, folder: Path) -> F
     if lacking := [fan.name for fan in fans if math.isnan(fan.command)]:
         where = f"no command at {config.command} of {', '.join(lacking)}"
         missing = [f"{where}: say with source.command where it is; without commands no twin can be learned"]
+    are_named = len({fan.called.casefold() for fan in fans} - {""}) == len(fans)
+    named = {"fan": [{"name": fan.called, "place": fan.place} for fan in fans]}
     keys = {
         "name": config.host if re.fullmatch(r"[0-9a-f.:]+", config.host) else config.host.partition(".")[0],
-        "fans": len(fans),
+        **(named if are_named else {"fans": len(fans)}),
         "speed_unit": "rpm",
         "speed_max": HIGHEST_RPM,
         "command_max": 100,

@@ -33,9 +33,11 @@ _NAMES = ("Name", "FanName", "MemberId", "Id")
 
 
 class FanThere(NamedTuple):
-    """A fan of the controller and what it reads now; NaN where it gives none."""
+    """A fan of the controller and what it reads now; NaN where it gives none. called, place: what people see."""
 
     name: str
+    called: str
+    place: str
     rpm: float
     command: float
 
@@ -112,7 +114,10 @@ class RedfishSource(PollingSource):
     def fans_there(self) -> list[FanThere]:
         """The fans of the controller, in its order; `connect` comes first."""
         found = [(next((str(fan[key]) for key in _NAMES if fan.get(key)), ""), fan) for fan in self._fan_objects()]
-        return [FanThere(name, _rpm(fan), _number(fan, self._config.command)) for name, fan in found]
+        return [
+            FanThere(name, _name(fan), _place(fan), _rpm(fan), _number(fan, self._config.command))
+            for name, fan in found
+        ]
 
     def disconnect(self) -> None:
         """Log out."""

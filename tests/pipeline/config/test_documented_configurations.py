@@ -56,7 +56,7 @@ def test_the_schema_for_editors_is_that_of_the_models_and_knows_all_shipped_conf
 @pytest.mark.parametrize(
     ("text", "where"),
     [
-        ('[[tray]]\nname = "a"\nfan = 2\n', ["tray", 0]),
+        ('[[tray]]\nname = "a"\nport = "x"\n', ["tray", 0]),
         ('[[tray]]\nname = "a"\nfans = 0\n', ["tray", 0, "fans"]),
         ('[[tray]]\nname = "a"\nfans = 1\nsource = { kind = "hwmom" }\n', ["tray", 0, "source"]),
         ('[[tray]]\nname = "a"\nfans = 1\nsource = { kind = "hwmon", port = "x" }\n', ["tray", 0, "source"]),
