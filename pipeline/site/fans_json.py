@@ -10,7 +10,7 @@ import numpy as np
 
 from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.site.fan_history import CURVES
-from fantwin.pipeline.site.fleet import FanGroup, FanNow
+from fantwin.pipeline.site.fleet import Fan, FanGroup, FanNow
 from fantwin.pipeline.site.site_model import SiteModel
 from fantwin.schemas.health import Learning
 from fantwin.schemas.messages import Array
@@ -20,26 +20,31 @@ from fantwin.scoring.alarms.current_alarms import CurrentAlarm
 from fantwin.scoring.diagnosis.causes import CANNOT_TELL, likely_causes
 
 MOST_LIVE = 256
-"""fans whose speeds are in each live event of the fleet; those of a larger site are asked for"""
-_MEASURED, _PREDICTED, _COMMAND = map(CURVES.index, ("measured_speed_rad_s", "predicted_speed_rad_s", "command"))
+"""fans whose speeds are in each live event of the fleet; of a larger site only those of fans in alarm"""
+MOST_LIVE_ALARMS = 40
+SPARK_S, SPARK_CURVES = 60, ("t_s", "measured", "predicted", "half_width")
+_MEASURED, _PREDICTED, _HALF_WIDTH, _COMMAND = map(
+    CURVES.index, ("measured_speed_rad_s", "predicted_speed_rad_s", "band_half_width_rad_s", "command")
+)
 _LEAST_PREDICTED_RAD_S = 1.0
 """a deviation in percent of a lower speed says nothing"""
-_UNKNOWN = (None, None, None)
+_UNKNOWN = (None, None, None, None, None)
 
-Row = tuple[float | None, float | None, float | None]
-"""speed in the unit of the tray, command, and deviation of the speed from the twin in percent; None: not known"""
+Row = tuple[float | None, float | None, float | None, float | None, float | None]
+"""speed in the unit of the tray, command, deviation of the speed from the twin in percent, speed of the twin,
+half width of its band; None: not known"""
 
 
 def fans_json(model: SiteModel, fans: Sequence[FanNow]) -> list[dict[str, Any]]:
     """Fans of the site in this order."""
     rows, units = _rows(model), {tray.name: str(tray.speed_unit) for tray in model.trays}
     alarms = {(each.newest.header.tray, each.newest.fan): each for each in model.current_alarms()}
-    learning = {name: _of_learning(each, model.tray(name)) for name, each in model.learning().items()}
+    learning = learning_json(model)
     found: list[dict[str, Any]] = []
     for now in fans:
         tray, number = now.fan
         of_tray = rows.get(tray)
-        speed, command, deviation = of_tray[number] if of_tray else _UNKNOWN
+        speed, command, deviation, *_ = of_tray[number] if of_tray else _UNKNOWN
         found.append(
             {
                 "tray": tray,
@@ -62,13 +67,24 @@ def fans_json(model: SiteModel, fans: Sequence[FanNow]) -> list[dict[str, Any]]:
     return found
 
 
-def live_values(model: SiteModel) -> dict[str, list[float | None]] | None:
-    """Columns of `Row` of all fans, in the order of the cells; None: there are too many."""
+def live_fans(model: SiteModel) -> list[Fan]:
+    """The fans whose speeds are live: all, or in a larger site those in alarm with the highest scores."""
     if sum(tray.fans for tray in model.trays) > MOST_LIVE:
-        return None
-    rows = _rows(model)
-    of_fans = [row for tray in model.trays for row in rows.get(tray.name) or [_UNKNOWN] * tray.fans]
-    return {name: [row[at] for row in of_fans] for at, name in enumerate(("speed", "command", "deviation_percent"))}
+        return model.in_alarm()[:MOST_LIVE_ALARMS]
+    return [Fan(tray.name, number) for tray in model.trays for number in range(tray.fans)]
+
+
+def live_values(model: SiteModel) -> dict[str, Any]:
+    """Columns of `Row`, and the index of each fan's cell."""
+    fans, begin = live_fans(model), 0
+    rows = _rows(model) if fans else {}
+    begins: dict[str, int] = {}
+    for tray in model.trays:
+        begins[tray.name], begin = begin, begin + tray.fans
+    of_fans = [rows[fan.tray][fan.number] if fan.tray in rows else _UNKNOWN for fan in fans]
+    names = ("speed", "command", "deviation_percent", "twin", "half_width")
+    columns = {name: [row[at] for row in of_fans] for at, name in enumerate(names)}
+    return {"fans": [begins[fan.tray] + fan.number for fan in fans], **columns}
 
 
 def _rows(model: SiteModel) -> Mapping[str, Sequence[Row]]:
@@ -77,11 +93,20 @@ def _rows(model: SiteModel) -> Mapping[str, Sequence[Row]]:
     found: dict[str, Sequence[Row]] = {}
     for tray in model.trays_now():
         if tray.is_heard:
-            measured, predicted, command = (tray.values[:, at] for at in (_MEASURED, _PREDICTED, _COMMAND))
+            measured, predicted, half_width, command = (
+                tray.values[:, at] for at in (_MEASURED, _PREDICTED, _HALF_WIDTH, _COMMAND)
+            )
             usual = np.where(predicted >= _LEAST_PREDICTED_RAD_S, predicted, np.nan)
-            columns = measured / per_unit[tray.tray], command, 100.0 * (measured - predicted) / usual
+            deviation = 100.0 * (measured - predicted) / usual
+            speeds = (each / per_unit[tray.tray] for each in (predicted, half_width))
+            columns = measured / per_unit[tray.tray], command, deviation, *speeds
             found[tray.tray] = list(zip(*map(_known, columns), strict=True))
     return found
+
+
+def learning_json(model: SiteModel) -> dict[str, Sequence[dict[str, Any] | None]]:
+    """By tray, what the first twin of each of its fans waits for; empty: every tray has a twin."""
+    return {name: _of_learning(each, model.tray(name)) for name, each in model.learning().items()}
 
 
 def _of_learning(learning: Learning, tray: TrayConfig | None) -> Sequence[dict[str, Any] | None]:

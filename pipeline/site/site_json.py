@@ -12,7 +12,7 @@ import numpy as np
 from fantwin.pipeline.config.settings import FanConfig, TrayConfig
 from fantwin.pipeline.recordings.clips.clip import Clip
 from fantwin.pipeline.site.fan_history import Curves
-from fantwin.pipeline.site.fans_json import fans_json, live_values
+from fantwin.pipeline.site.fans_json import SPARK_CURVES, SPARK_S, fans_json, learning_json, live_fans, live_values
 from fantwin.pipeline.site.fleet import SHOWN_CLASSES, Fan
 from fantwin.pipeline.site.site_model import SiteModel
 from fantwin.pipeline.site.stage_states import StageState
@@ -20,7 +20,7 @@ from fantwin.schemas.channels import CHANNELS
 from fantwin.schemas.enums import Feedback, Transition
 from fantwin.schemas.messages import Alarm, Array, ModelCard
 from fantwin.schemas.twin_card import CardError, TwinCard
-from fantwin.schemas.units import RAD_S_PER_UNIT
+from fantwin.schemas.units import NS_PER_S, RAD_S_PER_UNIT
 from fantwin.scoring.alarms.alarm_state import is_listed
 from fantwin.scoring.alarms.current_alarms import CurrentAlarm
 from fantwin.scoring.calibration.calibration import together
@@ -66,7 +66,9 @@ def site_json(model: SiteModel, viewer_urls: Mapping[str, str]) -> dict[str, Any
 
 
 def fleet_json(model: SiteModel) -> dict[str, Any]:
-    """All fans at a glance: class and level of each cell, a byte each, in base64; of a small site also the speeds."""
+    """All fans at a glance: class and level of each cell, a byte each, in base64; speeds of the live fans; and what the
+    first twins wait for.
+    """
     classes, score = model.fans_now()
     level = np.where(np.isnan(score), NO_LEVEL, (np.nan_to_num(score, posinf=9.0) * 100).clip(0, LEVELS))
     return {
@@ -74,6 +76,7 @@ def fleet_json(model: SiteModel) -> dict[str, Any]:
         "levels": _packed(level.astype(np.uint8)),
         "counts": model.counts(),
         "values": live_values(model),
+        "learning": learning_json(model),
     }
 
 
@@ -122,6 +125,20 @@ def curves_json(curves: Curves, tray: TrayConfig) -> dict[str, Any]:
     names = ("measured", "predicted", "half_width", "torque_balance_command", "score", "command")
     columns = {name: _or_null(values[:, number]) for number, name in enumerate((*names, *curves.channels))}
     return {"speed_unit": tray.speed_unit, "t_s": (curves.t_ns / 1e9).round(3).tolist(), **columns}
+
+
+def sparks_json(model: SiteModel) -> dict[str, Any]:
+    """The last minute of the fans whose speeds are live, a sample a second: speed, twin and half width of its band."""
+    sparks: list[dict[str, Any]] = []
+    for fan in live_fans(model):
+        tray, since_t_ns = model.tray(fan.tray), model.newest_t_ns(fan.tray) - SPARK_S * NS_PER_S
+        assert tray, "live fans are of known trays"
+        curves = model.history(fan, since_t_ns)
+        _, each_second = np.unique(curves.t_ns // NS_PER_S, return_index=True)
+        thinned = Curves(curves.t_ns[each_second], curves.values[each_second], curves.channels)
+        found = curves_json(thinned, tray)
+        sparks.append({"tray": fan.tray, "fan": fan.number, **{name: found[name] for name in SPARK_CURVES}})
+    return {"fans": sparks}
 
 
 def alarm_json(current: CurrentAlarm, about: FanConfig) -> dict[str, Any]:
@@ -183,6 +200,7 @@ def transition_json(number: int, alarm: Alarm, feedback: Feedback = Feedback.NON
         "operator_name": alarm.operator_name,
         "comment": alarm.comment,
         "feedback": feedback.name.lower(),
+        "causes": [{"cause": short_name(each.cause), "probability": each.probability} for each in alarm.causes],
     }
 
 

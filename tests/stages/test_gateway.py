@@ -22,7 +22,15 @@ from fantwin.pipeline.recordings.clips.clip import Clip, ClipAlarm, clips_as_tex
 from fantwin.pipeline.recordings.writing import RecordingWriter
 from fantwin.pipeline.site.fans_json import MOST_LIVE, fans_json
 from fantwin.pipeline.site.fleet import Fan
-from fantwin.pipeline.site.site_json import alarms_json, curves_json, fan_in_full, fleet_json, rates_json, site_json
+from fantwin.pipeline.site.site_json import (
+    alarms_json,
+    curves_json,
+    fan_in_full,
+    fleet_json,
+    rates_json,
+    site_json,
+    sparks_json,
+)
 from fantwin.pipeline.site.site_model import SiteModel
 from fantwin.schemas.enums import Action, FanState, Severity, Transition
 from fantwin.schemas.header import Header
@@ -105,6 +113,7 @@ def test_every_answer_has_the_type_that_the_description_declares_and_leaves_noth
         f"/fans/{TRAY}/2": fan_in_full(model, Fan(TRAY, 2)),
         f"/fans/{TRAY}/2/curves": curves_json(model.history(Fan(TRAY, 2), 0), tray),
         "/alarms": alarms_json(model, everything=False),
+        "/sparks": sparks_json(model),
         "/alarm-rate": rates_json(model),
     }
     for path, expected in made.items():
@@ -162,12 +171,17 @@ def test_live_events_bring_an_alarm_and_the_samples_of_the_fan_that_is_looked_at
     fleet = event("fleet")
     assert fleet["counts"] == {"in_alarm": 0, "suspect": 0, "not_judged": 1, "silenced": 0}
     assert fleet["values"] == {
+        "fans": [0, 1, 2, 3],
         "speed": [1000.0] * 4,
         "command": [0.5] * 4,
         "deviation_percent": [-0.9901, -0.9901, -0.9901, None],
+        "twin": [1010.0, 1010.0, 1010.0, None],
+        "half_width": [20.0, 20.0, 20.0, None],
     }
     large = SiteModel(SITE, (TrayConfig(name=TRAY, fans=MOST_LIVE + 1),))
-    assert fleet_json(large)["values"] is None, "a large site sends two bytes a fan, and answers with the speeds"
+    assert fleet_json(large)["values"]["fans"] == [], "of a large site only fans in alarm have their speeds sent"
+    large.add_alarm(alarm())
+    assert fleet_json(large)["values"]["fans"] == [2]
     gateway.feed(score(1.0))
     assert event("samples")["measured"] == [1000.0] * 5
     gateway.feed(alarm())

@@ -273,8 +273,25 @@ class Series(BaseModel):
     note: str
 
 
+class Spark(BaseModel):
+    """The last minute of a fan, a sample a second: speeds in the unit of the tray; null: not known."""
+
+    tray: str
+    fan: int
+    t_s: list[float]
+    measured: list[float | None]
+    predicted: list[float | None]
+    half_width: list[float | None]
+
+
+class Sparks(BaseModel):
+    """The last minute of all fans; of a large site, of those in alarm."""
+
+    fans: list[Spark]
+
+
 class Transition(BaseModel):
-    """A transition of an alarm. feedback: the last one on its alarm."""
+    """A transition of an alarm. feedback: the last one on its alarm. causes: the most probable first."""
 
     number: int
     t_ns: int
@@ -289,6 +306,7 @@ class Transition(BaseModel):
     operator_name: str
     comment: str
     feedback: str
+    causes: list[Cause]
 
 
 class History(BaseModel):

@@ -37,6 +37,7 @@ from fantwin.pipeline.site.site_json import (
     fleet_json,
     rates_json,
     site_json,
+    sparks_json,
     stages_json,
     transition_json,
 )
@@ -107,6 +108,7 @@ class Api:
         get("/fans/{tray}/{fan}", self.fan, response_model=typed.FanInFull)
         get("/fans/{tray}/{fan}/curves", self.curves, response_model=typed.Curves)
         get("/fans/{tray}/{fan}/series", self.series_of, response_model=typed.Series, responses=_TABLE)
+        get("/sparks", self.sparks, response_model=typed.Sparks)
         get("/alarms", self.alarms, response_model=typed.Alarms)
         get("/alarms/history", self.alarm_history, response_model=typed.History)
         get("/alarm-rate", self.alarm_rate, response_model=typed.Rates)
@@ -182,6 +184,10 @@ class Api:
             headers = {"Content-Disposition": f'attachment; filename="{tray}-fan{fan}.csv"'}
             return Response(made, media_type=CSV_TYPE, headers=headers)
         return JSONResponse(made)
+
+    async def sparks(self, request: Request) -> Response:
+        """The last minute of all fans; of a large site, of those in alarm."""
+        return await self._answer("sparks", partial(sparks_json, self.model)).to(request)
 
     async def alarms(self, request: Request, all: bool = False) -> Response:
         """The current alarms, or also those that are over."""

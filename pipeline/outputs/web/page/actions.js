@@ -1,6 +1,7 @@
 // What an operator does: log in, and ask a scorer something about a fan.
 
-import { element, fanLabel, notice } from "./dom.js";
+import { element, notice } from "./dom.js";
+import { inFull } from "./names.js";
 import { learnWhoIAm, me, Refused, send } from "./server.js";
 
 export const ACTIONS = {
@@ -11,18 +12,22 @@ export const ACTIONS = {
   in_service: { title: "In service", about: "The fan is back in service." },
   true_alarm: { title: "True alarm", about: "Something was wrong with the fan." },
   false_alarm: { title: "False alarm", about: "Nothing was wrong with the fan. Calibration may learn from it.", needsReason: true },
+  comment: { title: "Comment", about: "A comment for the history; nothing else changes.", needsReason: true },
   commission: { title: "Commission", about: "The fan was replaced or repaired: forget what was learned of it, and end its alarm." },
 };
 const SHELVED_FOR = [["30 minutes", 1800], ["2 hours", 7200], ["8 hours", 28800], ["1 day", 86400], ["7 days", 604800], ["until it clears", 0]];
 
-// Those that make sense in the state of an alarm.
+const IN_SIGHT = 3;
+
+// Those that make sense in the state of an alarm, what matters most first.
 export function possible(alarm) {
   if (!alarm) return ["out_of_service", "commission"];
   return [
     alarm.retained && !alarm.acknowledged ? "acknowledge" : "",
     alarm.shelved_until_t_ns ? "unshelve" : "shelve",
-    alarm.out_of_service ? "in_service" : "out_of_service",
     ...feedbackOn(alarm),
+    "comment",
+    alarm.out_of_service ? "in_service" : "out_of_service",
     "commission",
   ].filter(Boolean);
 }
@@ -34,9 +39,19 @@ export function feedbackOn(alarm) {
 
 export function buttons(tray, fan, alarm) {
   if (!me.may_act) return element("p", { class: "muted" }, hint());
-  return element("div", { class: "actions" }, ...possible(alarm).map((action, number) => element("button", {
-    type: "button", class: number === 0 && action === "acknowledge" ? "primary" : "", onclick: () => askFor(action, tray, fan, alarm),
-    "data-action": action }, ACTIONS[action].title)));
+  const button = (action) => element("button", { type: "button", class: action === "acknowledge" ? "primary" : "", title: ACTIONS[action].about,
+    onclick: () => askFor(action, tray, fan, alarm), "data-action": action }, ACTIONS[action].title);
+  const all = possible(alarm).map(button), inSight = alarm ? IN_SIGHT : 0;
+  return element("div", { class: "actions" }, ...all.slice(0, inSight), menu(alarm ? "More" : "Service", all.slice(inSight)));
+}
+
+// Buttons that are seldom needed. It closes when another place is used.
+function menu(title, choices) {
+  if (!choices.length) return "";
+  const root = element("details", { class: "menu", onfocusout: (event) => { if (!root.contains(event.relatedTarget)) root.open = false; },
+    onclick: (event) => { if (event.target.matches("div button")) root.open = false; } },
+  element("summary", { class: "button", "data-action": "menu" }, title), element("div", { class: "group" }, ...choices));
+  return root;
 }
 
 // To acknowledge all alarms of a tray at once, where there are several.
@@ -61,14 +76,14 @@ function acknowledgeAll(tray, count) {
 
 function hint() {
   if (me.name) return `${me.name} may view but not act.`;
-  return me.has_login ? "Log in to act." : "To act from this page, set a file of users in the configuration: [gateway] users";
+  return me.has_login ? "Log in to act." : "Nobody can act from this page: it needs users ([gateway] users in the configuration).";
 }
 
 export function askFor(action, tray, fan, alarm = null) {
   const { title, about, lasts, needsReason } = ACTIONS[action];
   const duration = lasts ? element("select", { id: "duration" }, ...SHELVED_FOR.map(([text, s]) => element("option", { value: s }, text))) : null;
   const comment = element("input", { id: "comment", maxlength: 500, autocomplete: "off", required: needsReason });
-  dialog(`${title}: ${fanLabel({ tray, fan })}`, element("div", {}, element("p", {}, about),
+  dialog(`${title}: ${inFull(tray, fan)}`, element("div", {}, element("p", {}, about),
     duration && element("label", { for: "duration" }, "How long"), duration ?? "",
     element("label", { for: "comment" }, "Reason (for the record)"), comment), title, async () => {
     const body = { action, comment: comment.value };

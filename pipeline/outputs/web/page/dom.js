@@ -1,16 +1,5 @@
 // Elements and texts. What comes from outside is only ever set as text, never as markup.
 
-let trays = new Map();
-export const knowTrays = (site) => { trays = new Map(site.trays.map((tray) => [tray.name, tray])); };
-
-// A fan as people call it: its name comes first.
-export function fanLabel({ tray, fan }) {
-  const name = trays.get(tray)?.names[fan];
-  return name ? `${name} (${tray} fan ${fan})` : `${tray} fan ${fan}`;
-}
-
-export const fanPlace = ({ tray, fan }) => trays.get(tray)?.places[fan] ?? "";
-
 export function element(tag, attributes = {}, ...children) {
   const made = document.createElement(tag);
   for (const [name, value] of Object.entries(attributes)) {
@@ -20,6 +9,11 @@ export function element(tag, attributes = {}, ...children) {
   }
   made.append(...children.filter((child) => child !== null && child !== undefined && child !== ""));
   return made;
+}
+
+// A text that has not changed is not set again: that would cost a layout.
+export function setText(shown, text) {
+  if (shown.textContent !== text) shown.textContent = text;
 }
 
 const ms = (t_ns) => t_ns / 1e6;
@@ -41,8 +35,10 @@ export function clock(t_ns) {
   return at.toDateString() === new Date().toDateString() ? time(at) : stamp(t_ns);
 }
 
-function ageText(t_ns) {
-  const seconds = Math.max(0, Math.round((Date.now() - ms(t_ns)) / 1000));
+export const ageText = (t_ns) => lengthText((Date.now() - ms(t_ns)) / 1000);
+
+export function lengthText(length_s) {
+  const seconds = Math.max(0, Math.round(length_s));
   for (const [unit, size] of [["d", 86400], ["h", 3600], ["min", 60]]) {
     if (seconds >= 2 * size) return `${Math.floor(seconds / size)} ${unit}`;
   }
@@ -56,8 +52,7 @@ export function age(t_ns) {
 
 setInterval(() => {
   for (const shown of document.querySelectorAll("time[data-since]")) {
-    const text = ageText(Number(shown.dataset.since));
-    if (shown.textContent !== text) shown.textContent = text;
+    setText(shown, ageText(Number(shown.dataset.since)));
   }
 }, 1000);
 

@@ -1,16 +1,21 @@
 // The page: which view is shown, and what reaches it.
 
-import { AlarmsView, HistoryView } from "./alarms.js";
+import { AlarmsView } from "./alarms.js";
 import { logOut, showLogin } from "./actions.js";
 import { learnClips } from "./clips.js";
-import { element, knowTrays, notice } from "./dom.js";
-import { FanView } from "./one_fan.js";
-import { address, bytes, Overview } from "./overview.js";
+import { element, notice } from "./dom.js";
+import { FanView } from "./fan.js";
+import { HistoryView } from "./history.js";
+import { learnNames } from "./names.js";
+import { notifyOf } from "./notify.js";
+import { address, Overview } from "./overview.js";
 import { StagesView } from "./stages.js";
+import { bytes } from "./states.js";
 import { ask, Events, learnWhoIAm, me, Refused } from "./server.js";
 
 const content = document.getElementById("content");
 const alarms = new Map();
+const news = new Map();  // alarms that have come since the state was asked for, which its answer may not have
 const CLIPS_MS = 20000;
 let site = null, view = null, fleet = null, stages = [], shownHash = null, alarmsDue = 0, lastFan = "", userShown = "";
 
@@ -25,12 +30,15 @@ const events = new Events({
   },
   alarm: (alarm) => {
     const name = `${alarm.tray}/${alarm.fan}`;
-    if (view instanceof Overview && alarm.active && alarm.presented && !alarms.get(name)?.active) view.raise(indexOf(alarm.tray, alarm.fan));
+    const isRaised = alarm.active && alarm.presented && !alarms.get(name)?.active;
     alarms.set(name, alarm);
+    news.set(name, alarm);
+    if (isRaised) notifyOf(alarm);
+    if (isRaised && view instanceof Overview) view.raise(indexOf(alarm.tray, alarm.fan), alarm);
     showAlarms(alarm);
     showCount();
   },
-  stages: (data) => { stages = data.stages; if (view instanceof StagesView) view.update(stages); },
+  stages: (data) => { stages = data.stages; showStages(); },
   samples: (data) => { if (view instanceof FanView) view.add(data); },
   missed: () => { learnState(); view?.begin?.(); },
 });
@@ -38,7 +46,7 @@ let wasConnected = false, wasLost = false;
 
 function showConnection(isThere) {
   const shown = document.getElementById("connection");
-  shown.textContent = isThere ? "● live" : "✖ no connection: the data shown are old";
+  shown.textContent = isThere ? "● live" : "✖ no connection: these data are old";
   shown.className = isThere ? "muted" : "lost";
   if (isThere && !wasConnected) learnState();
   if (isThere && wasLost) view?.begin?.();
@@ -49,14 +57,16 @@ function showConnection(isThere) {
 async function learnState() {
   try {
     await learnWhoIAm();
+    news.clear();
     const [found, now] = await Promise.all([ask("/alarms"), ask("/stages"), learnClips()]);
     alarms.clear();
     found.alarms.forEach((alarm) => alarms.set(`${alarm.tray}/${alarm.fan}`, alarm));
+    news.forEach((alarm, name) => alarms.set(name, alarm));
     stages = now.stages;
     showUser();
     showAlarms(null);
     showCount();
-    if (view instanceof StagesView) view.update(stages);
+    showStages();
   } catch (failure) {
     if (failure instanceof Refused && failure.status === 401) start();
   }
@@ -73,7 +83,13 @@ function showSummary() {
   document.title = in_alarm ? `(${in_alarm}) ${site.site} - fantwin` : `${site.site} - fantwin`;
 }
 
+function showStages() {
+  if (view instanceof StagesView) view.update(stages);
+  if (view instanceof Overview) view.panel.setStages(stages);
+}
+
 function showAlarms(changed) {
+  if (view instanceof Overview) (changed ? [changed] : [...alarms.values()]).forEach((alarm) => view.showAlarm(alarm));
   if (view instanceof AlarmsView) view.update();
   if (view instanceof HistoryView) view.update();
   if (view instanceof FanView && (!changed || (changed.tray === view.tray && changed.fan === view.fan))) {
@@ -130,10 +146,10 @@ function showView() {
   else if (kind === "history") view = new HistoryView();
   else if (kind === "stages") view = new StagesView();
   else if (kind === "fan") view = { root: element("p", {}, `There is no fan ${fan ?? ""} of ${tray ?? ""}. `, element("a", { href: address }, "All fans")) };
-  else view = new Overview(site, new URLSearchParams(filters));
+  else view = new Overview(site, new URLSearchParams(filters), alarms);
   content.replaceChildren(view.root);
   if ((view instanceof Overview || view instanceof FanView) && fleet) view.update(fleet);
-  if (view instanceof StagesView) view.update(stages);
+  showStages();
   const current = isFan || !["alarms", "history", "stages"].includes(kind) ? "fans" : kind;
   for (const link of document.querySelectorAll("nav a")) {
     if (link.getAttribute("href") === `#/${current}`) link.setAttribute("aria-current", "page");
@@ -164,7 +180,7 @@ async function start() {
       return;
     }
     site = await ask("/site");
-    knowTrays(site);
+    learnNames(site);
     document.getElementById("site").textContent = site.site;
     showView();
     await learnState();

@@ -1,196 +1,242 @@
-// Every fan of the site as a cell, in groups, the worst group first. A cell moves only when its group changes, so that
-// thousands of fans cost nothing while they are well.
+// Every fan of the site: as cards, by tray or by place, the worst first; or, where there are many, as tiles in one row a
+// tray, which never move, with those in alarm as cards above them.
 
-import { element, fanLabel } from "./dom.js";
+import { FanCard } from "./card.js";
+import { element, setText } from "./dom.js";
+import { LearningPanel, learningText } from "./learning.js";
+import { hashOf, hasPlaces, placeOf, where } from "./names.js";
+import { ABOUT, bytes, GROUPS, groupNumber, NO_LEVEL } from "./states.js";
+import { FanTile } from "./tile.js";
+import { ask, learn } from "./server.js";
 
-const GROUPS = [
-  { name: "alarm", title: "In alarm", mark: "✖" },
-  { name: "suspect", title: "Suspect", mark: "▲" },
-  { name: "not_judged", title: "Not judged", mark: "?" },
-  { name: "silenced", title: "In a silenced alarm", mark: "◌" },
-  { name: "at_rest", title: "Stopped or starting", mark: "■" },
-  { name: "normal", title: "Normal", mark: "●" },
-];
-const LARGE_UP_TO = 64;
-const LARGE_GROUPS = 2;
-const SLICE = 1250;
-// levels of cells, as pipeline/site/site_json.py makes them
-export const HIGHEST_LEVEL = 250;
-export const NO_LEVEL = 255;
-const NORMAL = GROUPS.length - 1;
+const CARDS_UP_TO = 150;
+const SLICE = 1250;  // tiles that are drawn in a frame
+const LEAST_SPARK = 44, MOST_SPARK = 440, SPARE = 18, LEAST_CARD = 240;  // pixels
+const RANK = { alarm: 0, suspect: 1, learning: 2, not_judged: 2 };  // of a card within its section
+const ALARM = groupNumber("alarm"), NOT_JUDGED = groupNumber("not_judged"), LEARNING = groupNumber("learning");
 
 // Of the view as it was chosen last: its address has the filters.
 export let address = "#/fans";
 
-// A level, which ends at HIGHEST_LEVEL.
-export const levelText = (level) => `${level >= HIGHEST_LEVEL ? "≥ " : ""}${level} %`;
-
-export const bytes = (base64) => Uint8Array.from(atob(base64), (letter) => letter.charCodeAt(0));
-
 export class Overview {
-  // filters: of the address.
-  constructor(site, filters) {
-    this.site = site;
+  // filters: of the address. alarms: those that the page knows, by name.
+  constructor(site, filters, alarms) {
+    Object.assign(this, { site, alarms, classes: null, levels: null, next: 0, waiting: 0, frame: 0, learning: {}, above: new Map() });
     this.fans = site.trays.flatMap((tray) => Array.from({ length: tray.fans }, (_, fan) => ({ tray: tray.name, fan })));
-    this.groupOfClass = site.groups.map((name) => GROUPS.findIndex((group) => group.name === name));
-    Object.assign(this, { cells: [], classes: null, levels: null, next: 0, waiting: 0, frame: 0 });
-    this.step = this.fans.length <= LARGE_UP_TO ? 5 : 10;  // of the score shown, in per cent of its limit
-    this.root = this.build();
-    for (const [name, choice] of [["tray", this.tray], ["state", this.state]]) {
-      if ([...choice.options].some((option) => option.value === filters.get(name))) choice.value = filters.get(name);
-    }
+    this.isDense = this.fans.length > CARDS_UP_TO;
+    this.groupOfClass = site.groups.map(groupNumber);
+    this.state = filters.get("state") ?? "";
+    this.root = this.build(filters);
     this.filter();
+    this.begin();
+    this.resized = () => this.fit();
+    window.addEventListener("resize", this.resized);
   }
 
-  build() {
-    this.tray = element("select", { id: "tray", onchange: () => this.choose() }, element("option", { value: "" }, "all trays"),
-      ...this.site.trays.map((tray) => element("option", { value: tray.name }, tray.name)));
-    this.state = element("select", { id: "state", onchange: () => this.choose() }, element("option", { value: "" }, "all states"),
-      ...GROUPS.map((group) => element("option", { value: group.name }, group.title.toLowerCase())));
-    this.sections = GROUPS.map((group, number) => {
-      const count = element("span");
-      const cells = element("div", { class: "cells", role: "group", "aria-label": group.title,
-        onclick: (event) => this.chosen(event), onkeydown: (event) => this.moved(event) });
-      const root = element("section", { hidden: true }, element("h2", {}, `${group.mark} ${group.title} `, count), cells);
-      return { root, cells, count, number, isLarge: false };
-    });
-    this.cells = this.fans.map((fan, index) => this.cell(fan, index));
-    const legend = element("ul", { class: "legend" }, ...GROUPS.map((group) => element("li", {}, `${group.mark} ${group.title.toLowerCase()}`)),
-      element("li", {}, "bar: score relative to its limit"));
-    const keys = element("p", { class: "muted keys" }, "Arrow keys move between fans, Enter opens one, Esc goes back.");
-    const form = element("form", { class: "filters", onsubmit: (event) => event.preventDefault() },
-      element("label", { for: "tray" }, "Tray"), this.tray, element("label", { for: "state" }, "State"), this.state);
+  close() {
+    window.removeEventListener("resize", this.resized);
+  }
+
+  build(filters) {
+    const choice = (id, text, options) => {
+      const select = element("select", { id, onchange: () => this.choose() }, ...options.map(([value, words]) => element("option", { value }, words)));
+      if (options.some(([value]) => value === filters.get(id))) select.value = filters.get(id);
+      return [element("label", { for: id }, text), select];
+    };
+    const trays = choice("tray", "Tray", [["", "all trays"], ...this.site.trays.map((tray) => [tray.name, tray.name])]);
+    const by = choice("by", "Grouped by", [["tray", "tray"], ["place", "place"]]);
+    [this.tray, this.by] = [trays[1], by[1]];
+    this.chips = GROUPS.map((group) => element("button", { type: "button", class: `chip ${group.name}`, "aria-pressed": "false", title: ABOUT[group.name],
+      hidden: true, onclick: () => { this.state = this.state === group.name ? "" : group.name; this.choose(); } }));
+    const bar = element("form", { class: "bar", onsubmit: (event) => event.preventDefault() },
+      element("div", { class: "chips", role: "group", "aria-label": "Fans by state; press one to see only these" }, ...this.chips),
+      ...(this.site.trays.length > 1 ? trays : []), ...(hasPlaces() && !this.isDense ? by : []));
+    this.panel = new LearningPanel();
     this.nothing = element("p", { class: "muted", hidden: true }, "No fan matches this selection.");
-    return element("div", {}, form, legend, keys, this.nothing, ...this.sections.map((section) => section.root));
+    this.cells = this.fans.map((fan, index) => new (this.isDense ? FanTile : FanCard)(fan.tray, fan.fan, index));
+    this.attention = element("div", { class: "cards above", role: "group", "aria-label": "In alarm", onkeydown: (event) => this.moved(event) });
+    this.main = element("div");
+    this.arrange();
+    return element("div", { class: "overview" }, bar, this.panel.root, this.nothing, this.isDense ? this.attention : "", this.main);
   }
 
-  cell(fan, index) {
-    const mark = element("span", { class: "mark", "aria-hidden": "true" });
-    const words = element("span", { class: "words" });
-    const root = element("button", { class: "cell", type: "button", tabindex: "-1" }, mark,
-      element("span", { class: "name" }, fanLabel(fan)), words);
-    root.index = index;
-    return { root, mark, words, text: "", group: -1, class: -1, percent: -1 };
+  // The sections, in the order of the configuration.
+  arrange() {
+    const keyOf = (fan) => (this.by.value === "place" && !this.isDense && placeOf(fan.tray, fan.fan)) || fan.tray;
+    const found = new Map();
+    this.fans.forEach((fan, index) => found.set(keyOf(fan), [...(found.get(keyOf(fan)) ?? []), index]));
+    this.sections = [...found].map(([key, indexes]) => {
+      const cells = element("div", { class: this.isDense ? "tiles" : "cards", role: "group", "aria-label": key,
+        onkeydown: (event) => this.moved(event), ...(this.isDense && { onclick: (event) => this.open(event), onpointerover: (event) => this.explain(event),
+          onfocusin: (event) => this.explain(event) }) }, ...indexes.map((index) => this.cells[index].root));
+      return { indexes, cells, root: element("section", { class: this.isDense ? "row" : "" }, found.size > 1 ? element("h2", {}, key) : "", cells) };
+    });
+    this.main.replaceChildren(...this.sections.map((section) => section.root));
+    for (const { where: shown, tray, fan } of this.isDense ? [] : this.cells) shown.textContent = this.by.value === "place" ? tray : placeOf(tray, fan);
   }
 
-  // All fans at a glance have come. The first time all cells are drawn; then some in each frame, so that none takes long.
+  // The pictures fill the screen where fans are few.
+  fit() {
+    if (this.isDense || !this.root.isConnected) return;
+    for (const { cells, indexes } of this.sections) {  // as many columns as fill every row
+      const count = indexes.filter((index) => !this.cells[index].root.hidden).length, most = Math.max(1, Math.floor(cells.clientWidth / LEAST_CARD));
+      cells.style.setProperty("--columns", Math.ceil(count / Math.ceil(count / most)) || 1);
+    }
+    const cards = this.cells.map((cell) => cell.root).filter((root) => !root.hidden);
+    const rows = new Set(cards.map((root) => root.offsetTop)).size, spark = cards[0]?.querySelector(".spark").clientHeight ?? 0;
+    if (!rows) return;
+    const others = this.root.getBoundingClientRect().bottom + scrollY - rows * spark;
+    const height = Math.max(LEAST_SPARK, Math.min(MOST_SPARK, (innerHeight - others - SPARE) / rows));
+    if (Math.abs(height - spark) > 4) this.root.style.setProperty("--spark", `${Math.floor(height)}px`);
+  }
+
+  // Also after events were missed: the last minute of the fans that have a picture.
+  begin() {
+    return learn(async () => {
+      const now_s = performance.now() / 1000;
+      for (const spark of (await ask("/sparks")).fans) {
+        const card = this.cardOf(spark.tray, spark.fan);
+        if (!card?.spark) continue;
+        const later = card.spark.rows.filter((row) => row[0] > now_s);
+        card.spark.rows = [];
+        spark.t_s.forEach((t_s, i) => card.spark.add(now_s + t_s - spark.t_s.at(-1), spark.measured[i], spark.predicted[i], spark.half_width[i]));
+        card.spark.rows.push(...later);
+        card.spark.draw();
+      }
+    });
+  }
+
+  cardOf(tray, fan) {
+    const index = this.fans.findIndex((each) => each.tray === tray && each.fan === fan);
+    return this.isDense ? this.above.get(index) : this.cells[index];
+  }
+
+  // All fans at a glance have come. The first time all are drawn; then tiles some in each frame, so that none takes long.
   update(fleet) {
     const isFirst = !this.classes;
     this.classes = bytes(fleet.classes);
     this.levels = bytes(fleet.levels);
+    this.values = fleet.values;
+    this.learning = fleet.learning;
     this.waiting = this.cells.length;
-    if (isFirst) this.draw(this.waiting);
+    if (this.isDense) this.attend();
+    if (isFirst || !this.isDense) this.draw(this.waiting);
     else this.frame ||= requestAnimationFrame(() => this.draw(SLICE));
+    const now_s = performance.now() / 1000, { fans, speed, command, twin, half_width } = fleet.values;
+    fans.forEach((index, i) => (this.isDense ? this.above.get(index) : this.cells[index])?.showValues(now_s, speed[i], command[i], twin[i], half_width[i]));
+    if (this.isDense) { this.panel.update(this.learning, false); return; }
+    this.cells.forEach((cell) => this.explainCard(cell));
+    const isUnheard = this.cells.every((cell) => this.site.classes[cell.class] === "silent" && cell.spark.rows.every((row) => row[1] === null));
+    this.panel.update(this.learning, isUnheard);
+    this.root.classList.toggle("unheard", isUnheard);
+    this.fit();
   }
 
   draw(most) {
     this.frame = 0;
-    const came = new Map();
+    let changed = false;
     for (let drawn = 0; drawn < most && this.waiting > 0; drawn++, this.waiting--) {
       const index = this.next;
       this.next = (index + 1) % this.cells.length;
-      const group = this.drawCell(index);
-      if (group === null) continue;
-      if (!came.has(group)) came.set(group, []);
-      came.get(group).push(index);
+      changed = this.show(this.cells[index], index) || changed;
     }
-    for (const [group, indexes] of came) this.place(group, indexes);
-    if (came.size) this.count();
+    if (changed) this.changed();
     if (this.waiting > 0) this.frame = requestAnimationFrame(() => this.draw(SLICE));
   }
 
-  // Returns the group of a fan if it is another one than before, else null.
-  drawCell(index) {
-    const cell = this.cells[index], level = this.levels[index], before = cell.group;
-    const isOther = this.classes[index] !== cell.class;
-    if (isOther) {
-      cell.class = this.classes[index];
-      cell.group = this.groupOfClass[cell.class];
-    }
-    const percent = level === NO_LEVEL ? 0 : this.step * Math.round(level / this.step);
-    const hasMoved = percent !== cell.percent && Math.abs(level - cell.percent) >= this.step;
-    if (isOther || hasMoved) this.label(cell, index, percent);
-    return cell.group === before ? null : cell.group;
+  // Returns whether it is in another group than before.
+  show(cell, index) {
+    const shownClass = this.classes[index], level = this.levels[index], bare = this.groupOfClass[shownClass];
+    const of = bare === NOT_JUDGED && this.learning[cell.tray]?.[cell.fan] ? LEARNING : bare;
+    if (cell.class === shownClass && cell.level === level && (cell.group === LEARNING) === (of === LEARNING)) return false;
+    return cell.show(shownClass, of, level, this.site.classes[shownClass]);
+  }
+
+  changed() {
+    if (!this.isDense) this.sort();
+    this.count();
   }
 
   // An alarm was raised; what the fan's next sample says comes up to a second later. Many that come at once are shown
   // together.
-  raise(index) {
+  raise(index, alarm) {
     const cell = this.cells[index];
-    if (!cell || cell.group === 0) return;
-    Object.assign(cell, { class: this.site.classes.indexOf("alarm"), group: 0 });
-    this.label(cell, index, Math.max(0, cell.percent));
-    this.raised ??= [];
-    this.raised.push(index);
-    this.due ||= requestAnimationFrame(() => {
-      this.place(0, this.raised.filter((each) => this.cells[each].group === 0));
-      this.count();
-      this.due = this.raised = null;
-    });
+    if (!cell || !this.classes || cell.group === ALARM) return;
+    cell.show(this.site.classes.indexOf("alarm"), ALARM, this.levels[index], "alarm");
+    if (this.isDense) this.addAbove(index, alarm);
+    this.due ||= requestAnimationFrame(() => { this.due = 0; this.changed(); });
   }
 
-  label(cell, index, percent) {
-    const group = GROUPS[cell.group], fan = this.fans[index];
-    const words = cell.group === NORMAL ? "normal" : this.site.classes[cell.class];
-    if (percent !== cell.percent) {
-      cell.percent = percent;
-      cell.root.style.backgroundSize = `${Math.min(100, percent)}% .25rem`;
-    }
-    const share = percent ? `, ${levelText(percent)}` : "";
-    const text = `${fanLabel(fan)} ${words}${share}${share && " of the limit"}`;
-    if (cell.text !== text) {
-      cell.text = text;
-      cell.root.title = text;
-      if (this.sections[cell.group].isLarge) cell.root.removeAttribute("aria-label");
-      else cell.root.setAttribute("aria-label", text);
-      if (cell.mark.textContent !== group.mark) cell.mark.textContent = group.mark;
-      if (this.sections[cell.group].isLarge) cell.words.textContent = `${words}${share}`;
-      const kind = `cell ${group.name}`;
-      if (cell.root.className !== kind) cell.root.className = kind;
-    }
+  showAlarm(alarm) {
+    const card = this.cardOf(alarm.tray, alarm.fan);
+    if (card) this.explainCard(card);
   }
 
-  place(group, indexes) {
-    const parent = this.sections[group].cells, had = document.activeElement;
-    if (parent.childElementCount === 0 || indexes.length > 20) {
-      parent.append(...this.cells.filter((cell) => cell.group === group).map((cell) => cell.root));
-    } else {
-      for (const index of indexes) parent.insertBefore(this.cells[index].root, firstAfter(parent.children, index));
+  explainCard(card) {
+    if (card instanceof FanCard) card.explain(this.alarms.get(`${card.tray}/${card.fan}`), learningText(this.learning[card.tray]?.[card.fan]));
+  }
+
+  // Cards of the fans in alarm of a large site, of those whose speeds come.
+  attend() {
+    const wanted = new Set(this.values.fans);
+    for (const [index, card] of this.above) {
+      if (!wanted.has(index) && this.groupOfClass[this.classes[index]] !== ALARM) { card.root.remove(); this.above.delete(index); }
     }
+    const isNew = this.values.fans.filter((index) => !this.above.has(index)).map((index) => this.addAbove(index)).length;
+    for (const [index, card] of this.above) this.show(card, index);
+    if (isNew && !this.hasAsked) { this.hasAsked = true; this.begin(); }
+  }
+
+  addAbove(index, alarm = null) {
+    if (this.above.has(index)) return;
+    const { tray, fan } = this.fans[index], card = new FanCard(tray, fan, index);
+    this.above.set(index, card);
+    card.where.textContent = where(tray, fan);
+    card.show(this.classes[index], ALARM, this.levels[index], "alarm");
+    card.explain(alarm ?? this.alarms.get(`${tray}/${fan}`), null);
+    this.attention.append(card.root);
+  }
+
+  // The worst first; what has not moved stays where it is.
+  sort() {
+    const rank = (index) => RANK[GROUPS[this.cells[index].group]?.name] ?? 3;
+    const had = document.activeElement;
+    for (const section of this.sections) {
+      const order = [...section.indexes].sort((one, other) => rank(one) - rank(other) || one - other);
+      section.worst = rank(order[0]);
+      if (order.some((index, i) => section.cells.children[i] !== this.cells[index].root)) section.cells.append(...order.map((index) => this.cells[index].root));
+    }
+    const sections = [...this.sections].sort((one, other) => one.worst - other.worst || one.indexes[0] - other.indexes[0]);
+    if (sections.some((section, i) => this.main.children[i] !== section.root)) this.main.append(...sections.map((section) => section.root));
     if (had !== document.activeElement && this.root.contains(had)) had.focus();
   }
 
   count() {
-    const counts = GROUPS.map(() => 0), shown = GROUPS.map(() => 0);
+    const counts = GROUPS.map(() => 0);
     for (const cell of this.cells) {
-      if (cell.group < 0) continue;
-      counts[cell.group] += 1;
-      if (!cell.root.hidden) shown[cell.group] += 1;
+      if (cell.group >= 0) counts[cell.group] += 1;
+      const isHidden = (this.tray.value !== "" && cell.tray !== this.tray.value) || (this.state !== "" && GROUPS[cell.group]?.name !== this.state);
+      if (cell.root.hidden !== isHidden) cell.root.hidden = isHidden;
     }
-    const wanted = this.state.value;
-    this.sections.forEach((section, number) => {
-      section.count.textContent = shown[number] === counts[number] ? `(${counts[number]})` : `(${shown[number]} of ${counts[number]})`;
-      this.enlarge(section, counts[number] <= LARGE_UP_TO && (number < LARGE_GROUPS || this.fans.length <= LARGE_UP_TO));
-      section.root.hidden = shown[number] === 0 || (wanted !== "" && wanted !== GROUPS[number].name);
+    GROUPS.forEach((group, number) => {
+      const chip = this.chips[number], isPressed = this.state === group.name;
+      setText(chip, `${group.mark} ${counts[number]} ${group.title}`);
+      chip.hidden = counts[number] === 0 && !isPressed;
+      chip.setAttribute("aria-pressed", String(isPressed));
     });
-    this.nothing.hidden = this.sections.some((section) => !section.root.hidden);
-    this.offer(this.root.querySelector("section:not([hidden]) .cell:not([hidden])"));
+    for (const { root, indexes } of this.sections) {
+      const isHidden = indexes.every((index) => this.cells[index].root.hidden);
+      if (root.hidden !== isHidden) root.hidden = isHidden;
+    }
+    this.attention.hidden = !["", "alarm"].includes(this.state);
+    this.nothing.hidden = !this.classes || this.sections.some((section) => !section.root.hidden);
+    this.offer(this.root.querySelector(".cell:not([hidden])"));
   }
 
-  // Cells with names and words, where they are few.
-  enlarge(section, isLarge) {
-    if (section.isLarge === isLarge) return;
-    section.isLarge = isLarge;
-    section.cells.classList.toggle("large", isLarge);
-    this.cells.forEach((cell, index) => {
-      if (cell.group === section.number) this.label(Object.assign(cell, { text: "" }), index, cell.percent);
-    });
-  }
-
-  // One cell is reached by Tab: the one that had the focus last, as long as it is shown.
+  // One cell is reached by Tab: the first, or that to which somebody moved, as long as it is shown.
   offer(cell) {
     const now = this.offered;
-    if (!cell || (now && !now.hidden && now.closest("section:not([hidden])"))) return;
+    if (!cell || (this.hasMoved && now.isConnected && !now.hidden)) return;
     if (now) now.tabIndex = -1;
     cell.tabIndex = 0;
     this.offered = cell;
@@ -199,7 +245,7 @@ export class Overview {
   // Focus a fan by its name; returns whether it is there.
   focus(name) {
     const index = this.fans.findIndex((fan) => `${fan.tray}/${fan.fan}` === name);
-    const cell = this.cells[index]?.root;
+    const cell = (this.above.get(index) ?? this.cells[index])?.root;
     if (!cell?.isConnected || cell.hidden) return false;
     this.moveTo(cell);
     return true;
@@ -209,35 +255,37 @@ export class Overview {
     if (this.offered) this.offered.tabIndex = -1;
     cell.tabIndex = 0;
     this.offered = cell;
+    this.hasMoved = true;
     cell.focus();
   }
 
   choose() {
+    if (!this.isDense && this.by.value !== this.arrangedBy) { this.arrange(); this.sort(); }
     this.filter();
     history.replaceState(null, "", address);
   }
 
   filter() {
-    this.cells.forEach((cell, index) => {
-      const isHidden = this.tray.value !== "" && this.fans[index].tray !== this.tray.value;
-      if (cell.root.hidden !== isHidden) cell.root.hidden = isHidden;
-    });
+    this.arrangedBy = this.by.value;
     this.count();
-    const chosen = [["tray", this.tray.value], ["state", this.state.value]].filter(([, value]) => value);
+    const chosen = [["tray", this.tray.value], ["state", this.state], ["by", this.by.value === "tray" ? "" : this.by.value]].filter(([, value]) => value);
     address = `#/fans${chosen.length ? `?${new URLSearchParams(chosen)}` : ""}`;
   }
 
-  chosen(event) {
-    const cell = event.target.closest(".cell");
-    if (!cell) return;
-    const fan = this.fans[cell.index];
-    location.hash = `#/fan/${encodeURIComponent(fan.tray)}/${fan.fan}`;
+  open(event) {
+    const cell = event.target.closest(".tile");
+    if (cell) location.hash = hashOf(this.fans[cell.index].tray, this.fans[cell.index].fan);
+  }
+
+  explain(event) {
+    const cell = event.target.closest(".tile");
+    if (cell) this.cells[cell.index].explain();
   }
 
   moved(event) {
     const steps = { ArrowRight: 1, ArrowLeft: -1, ArrowDown: 0, ArrowUp: 0 };
     if (!(event.key in steps)) return;
-    const all = [...this.root.querySelectorAll("section:not([hidden]) .cell:not([hidden])")];
+    const all = [...this.root.querySelectorAll(".cell:not([hidden])")];
     const at = all.indexOf(event.target.closest(".cell"));
     let to = at + steps[event.key];
     if (steps[event.key] === 0) {
@@ -249,15 +297,4 @@ export class Overview {
     event.preventDefault();
     this.moveTo(next);
   }
-}
-
-// The first of the cells, which are in order, that comes after an index; null: none.
-function firstAfter(cells, index) {
-  let low = 0, high = cells.length;
-  while (low < high) {
-    const middle = (low + high) >> 1;
-    if (cells[middle].index > index) high = middle;
-    else low = middle + 1;
-  }
-  return cells[low] ?? null;
 }

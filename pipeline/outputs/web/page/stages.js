@@ -4,16 +4,16 @@ import { element } from "./dom.js";
 import { badge } from "./alarms.js";
 
 const WELL = ["ok", "stopped"];
-const HEADS = [["Stage"], ["State"], ["In, messages/s", "number"], ["Out, messages/s", "number"], ["Latency, ms: p50", "number"], ["p99", "number"],
-  ["Lost", "number"], ["Problems and notes"]];
+const HEADS = [["Stage"], ["State"], ["In, messages/s", "number"], ["Out, messages/s", "number"], ["Delay, ms: usual", "number", "Half of the outputs were not older than this"],
+  ["worst 1 %", "number", "99 % of the outputs were not older than this"], ["Lost", "number", "Messages or samples that were lost since the stage began"], ["Problems and notes"]];
 
 export class StagesView {
   constructor() {
     this.body = element("tbody");
     this.shown = "";
     this.root = element("div", {}, element("h2", {}, "Stages"), element("div", { class: "scroll", tabindex: 0, role: "region", "aria-label": "Stages" },
-      element("table", { class: "folding" }, element("thead", {}, element("tr", {}, ...HEADS.map(([text, kind]) =>
-        element("th", { scope: "col", class: kind }, text)))), this.body)));
+      element("table", { class: "folding" }, element("thead", {}, element("tr", {}, ...HEADS.map(([text, kind, title]) =>
+        element("th", { scope: "col", class: kind, title }, text)))), this.body)));
   }
 
   update(stages) {
@@ -27,7 +27,7 @@ export class StagesView {
     this.body.replaceChildren(...stages.map((each) => element("tr", {}, cell("Stage", each.name),
       cell("State", WELL.includes(each.state) ? element("span", { class: "badge good" }, `● ${each.state}`) : badge("warning", each.state)),
       cell("In, messages/s", each.in_hz.toFixed(1), "number"), cell("Out, messages/s", each.out_hz.toFixed(1), "number"),
-      cell("Latency p50, ms", latency(each, each.latency_p50_ms), "number"), cell("Latency p99, ms", latency(each, each.latency_p99_ms), "number"),
+      cell("Delay: usual, ms", latency(each, each.latency_p50_ms), "number"), cell("Delay: worst 1 %, ms", latency(each, each.latency_p99_ms), "number"),
       cell("Lost", each.lost ? `▲ ${each.lost}` : "0", each.lost ? "number lost" : "number"), cell("Problems and notes", about(each) || ""))));
   }
 }
