@@ -16,6 +16,7 @@ from fantwin.schemas.health import (
     Input,
     LatencyBucket,
     Learning,
+    NamedFan,
     Note,
     Output,
 )
@@ -63,7 +64,7 @@ OF_TYPE: dict[Any, st.SearchStrategy[Any]] = {
 
 RECORDS = (
     *(Counter, Input, Output, Diagnosis, AwaitedInput, Note, AcceptedSamples, StatedTacho, LatencyBucket),
-    *(FanLearning, Learning),
+    *(FanLearning, Learning, NamedFan),
 )
 """of which a message holds several"""
 
@@ -71,14 +72,14 @@ RECORDS = (
 def scalar(name: str, hint: Any) -> st.SearchStrategy[Any]:
     if hint is Header:
         return HEADER
-    if name in SCALARS:
-        return SCALARS[name]
-    if isinstance(hint, type) and issubclass(hint, OpenEnum):
-        return st.integers(0, LARGEST_ENUM_VALUE).map(hint)
     for record in RECORDS:
         if hint == tuple[record, ...]:
             values = {name: scalar(name, hint) for name, hint in other_fields(record).items()}
             return st.lists(st.builds(record, **values), max_size=3).map(tuple)
+    if name in SCALARS:
+        return SCALARS[name]
+    if isinstance(hint, type) and issubclass(hint, OpenEnum):
+        return st.integers(0, LARGEST_ENUM_VALUE).map(hint)
     return OF_TYPE[hint]
 
 
