@@ -74,12 +74,10 @@ class OrdinaryOperation:
         ]
 
     def _missing(self, fan: int, visited: int, changes: int) -> str:
-        if visited >= NEEDED_RANGES and changes >= NEEDED_CHANGES:
-            return ""
-        return (
-            f"{self._range_of(fan)}, {NEEDED_S:.0f} s each in {visited} tenths of {self._range} "
-            f"({NEEDED_RANGES} needed), {changes} changes ({NEEDED_CHANGES} needed)"
-        )
+        levels, moves = NEEDED_RANGES - visited, NEEDED_CHANGES - changes
+        more = [f"{NEEDED_S:.0f} s at each of {levels} more level{'s' * (levels > 1)}"] if levels > 0 else []
+        more += [f"{moves} more change{'s' * (moves > 1)} by a tenth of {self._range}"] if moves > 0 else []
+        return f"{self._range_of(fan)} so far; still {' and '.join(more)}" if more else ""
 
     def held(self) -> list[str]:
         """Which fans never changed their command by more than a tenth of the range, a few words for each."""
@@ -89,5 +87,5 @@ class OrdinaryOperation:
     def _range_of(self, fan: int) -> str:
         low, high = self._lowest[fan], self._highest[fan]
         if not np.isfinite(low):
-            return "no command yet"
+            return "no command"
         return f"command {low:.3g}" if low == high else f"commands {low:.3g} to {high:.3g}"
