@@ -60,7 +60,7 @@ def fans_json(model: SiteModel, fans: Sequence[FanNow]) -> list[dict[str, Any]]:
                 "speed_unit": units[tray],
                 "command": command,
                 "deviation_percent": deviation,
-                **_of_alarm(alarms.get((tray, number)), number),
+                **_of_alarm(alarms.get((tray, number))),
                 "learning": learning[tray][number] if tray in learning else None,
             }
         )
@@ -132,13 +132,13 @@ def _known(values: Array) -> list[float | None]:
     return [None if math.isnan(value) else float(f"{value:.5g}") for value in values.tolist()]
 
 
-def _of_alarm(alarm: CurrentAlarm | None, fan: int) -> dict[str, Any]:
+def _of_alarm(alarm: CurrentAlarm | None) -> dict[str, Any]:
     """Words of an active alarm; empty where there is none."""
     if alarm is None or not alarm.newest.active:
         return {"deviation": "", "cause": "", "probability": None}
     causes = alarm.causes
     return {
-        "deviation": deviation_in(alarm.raised.message, fan) if alarm.raised else "",
+        "deviation": deviation_in(alarm.raised.about) if alarm.raised else "",
         "cause": likely_causes(causes),
         "probability": causes[0].probability if causes and causes[0].cause != CANNOT_TELL else None,
     }
