@@ -24,7 +24,6 @@ from fantwin.pipeline.site.fans_json import MOST_LIVE, fans_json
 from fantwin.pipeline.site.fleet import Fan
 from fantwin.pipeline.site.site_json import (
     alarms_json,
-    curves_json,
     fan_in_full,
     fleet_json,
     rates_json,
@@ -59,7 +58,7 @@ def gateway(opened: Callable[..., RunningGateway], tmp_path: Path, users: Path) 
     return opened(tmp_path, granted, users=users)
 
 
-def test_what_the_api_says_of_fans_alarms_and_curves_is_what_the_messages_said(gateway, monkeypatch):
+def test_what_the_api_says_of_fans_alarms_and_series_is_what_the_messages_said(gateway, monkeypatch):
     gateway.feed(score(), score(1.0, state=FanState.ALARM), alarm())
     client = Client(gateway)
     fans = client.ask("GET", "/api/v1/fans")[1]["fans"]
@@ -86,14 +85,15 @@ def test_what_the_api_says_of_fans_alarms_and_curves_is_what_the_messages_said(g
     (found,) = client.ask("GET", "/api/v1/alarms")[1]["alarms"]
     assert (found["fan"], found["presented"], found["probability"]) == (2, True, 0.8)
     assert found["causes"][0]["evidence"] == "drag +20 %"
-    curves = client.ask("GET", f"/api/v1/fans/{TRAY}/0/curves")[1]
-    assert curves["speed_unit"] == "rpm"
-    assert curves["t_s"] == [(NOW_NS + 4 * STEP_NS) / 1e9, (NOW_NS + 10**9 + 4 * STEP_NS) / 1e9]
-    assert curves["measured"] == [1000.0, 1000.0]
-    assert curves["half_width"] == [20.0, 20.0]
-    assert curves["command"] == [0.5, 0.5]
-    unjudged = client.ask("GET", f"/api/v1/fans/{TRAY}/3/curves")[1]
-    assert unjudged["predicted"] == [None, None], "where nothing is judged, there is no twin to see"
+    series = client.ask("GET", f"/api/v1/fans/{TRAY}/0/series?points=4000")[1]
+    assert series["speed_unit"] == "rpm"
+    assert series["t_s"] == [(NOW_NS + 4 * STEP_NS) / 1e9, (NOW_NS + 10**9 + 4 * STEP_NS) / 1e9]
+    means = {name: values["mean"] for name, values in series["columns"].items()}
+    assert means["measured"] == [1000.0, 1000.0]
+    assert means["half_width"] == [20.0, 20.0]
+    assert means["command"] == [0.5, 0.5]
+    unjudged = client.ask("GET", f"/api/v1/fans/{TRAY}/3/series?points=4000")[1]["columns"]
+    assert unjudged["predicted"]["mean"] == [None, None], "where nothing is judged, there is no twin to see"
     assert client.ask("GET", f"/api/v1/fans/{TRAY}/{FANS}")[0] == 404
     assert client.ask("GET", "/api/v1/fans/nowhere/0")[0] == 404
     monkeypatch.setattr("fantwin.pipeline.site.site_model.SILENT_AFTER_S", 0.0)
@@ -106,12 +106,11 @@ def test_what_the_api_says_of_fans_alarms_and_curves_is_what_the_messages_said(g
 
 def test_every_answer_has_the_type_that_the_description_declares_and_leaves_nothing_out(gateway):
     gateway.feed(score(state=FanState.ALARM), alarm(), golden_twin())
-    model, tray = gateway.core._model, gateway.core._model.trays[0]
+    model = gateway.core._model
     made = {
         "/site": site_json(model, {}),
         "/fans": {"fans": fans_json(model, model.every_fan())},
         f"/fans/{TRAY}/2": fan_in_full(model, Fan(TRAY, 2)),
-        f"/fans/{TRAY}/2/curves": curves_json(model.history(Fan(TRAY, 2), 0), tray),
         "/alarms": alarms_json(model, everything=False),
         "/sparks": sparks_json(model),
         "/alarm-rate": rates_json(model),

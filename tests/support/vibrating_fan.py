@@ -111,7 +111,8 @@ def main(folder: Path, channel: str) -> None:
     gateway = RunningGateway(folder)
     gateway.feed(*scores)
     client = Client(gateway)
-    found["page"] = client.ask("GET", f"/api/v1/fans/{TRAY}/1/curves")[1][channel]
+    range_s = f"from={START_S}&to={START_S + 60}&points=4000"
+    found["page"] = client.ask("GET", f"/api/v1/fans/{TRAY}/1/series?{range_s}")[1]["columns"][channel]["max"]
     found["page, words"] = client.ask("GET", "/api/v1/site")[1]["channels"]
     families = text_string_to_metric_families(client.ask("GET", "/metrics")[1])
     found["metrics"] = [

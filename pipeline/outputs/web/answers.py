@@ -51,7 +51,7 @@ class Tray(BaseModel):
 
 
 class Channel(BaseModel):
-    """What is measured of a fan beside its speed; a column of `Curves`."""
+    """What is measured of a fan beside its speed; a column of `Series`."""
 
     name: str
     title: str
@@ -206,22 +206,6 @@ class FanInFull(Fan):
     alarm: Alarm | None
     twin: Twin | None
     wear: list[Wear]
-
-
-class Curves(BaseModel):
-    """Samples of a fan as columns, with one for each channel: speeds in the unit of the tray; null: not known."""
-
-    model_config = ConfigDict(extra="allow")
-    __pydantic_extra__: dict[str, list[float | None]] = Field(init=False)  # type: ignore[assignment]
-
-    speed_unit: str
-    t_s: list[float]
-    measured: list[float | None]
-    predicted: list[float | None]
-    half_width: list[float | None]
-    torque_balance_command: list[float | None]
-    score: list[float | None]
-    command: list[float | None]
 
 
 class Extremes(BaseModel):

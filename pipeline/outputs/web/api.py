@@ -32,7 +32,6 @@ from fantwin.pipeline.site.site_json import (
     alarms_json,
     answers_json,
     clip_json,
-    curves_json,
     fan_in_full,
     fleet_json,
     rates_json,
@@ -106,7 +105,6 @@ class Api:
         get("/site", self.site, response_model=typed.Site)
         get("/fans", self.fans, response_model=typed.Fans)
         get("/fans/{tray}/{fan}", self.fan, response_model=typed.FanInFull)
-        get("/fans/{tray}/{fan}/curves", self.curves, response_model=typed.Curves)
         get("/fans/{tray}/{fan}/series", self.series_of, response_model=typed.Series, responses=_TABLE)
         get("/sparks", self.sparks, response_model=typed.Sparks)
         get("/alarms", self.alarms, response_model=typed.Alarms)
@@ -140,12 +138,6 @@ class Api:
     async def fan(self, tray: str, fan: int) -> JSON:
         """One fan with its alarm, its twin and its wear."""
         return fan_in_full(self.model, self._fan(tray, fan))
-
-    async def curves(self, tray: str, fan: int, seconds: Whole = int(HISTORY_S)) -> JSON:
-        """The last hour of a fan, or its last seconds."""
-        found = self._fan(tray, fan)
-        since_t_ns = self.model.newest_t_ns(tray) - seconds * NS_PER_S
-        return curves_json(self.model.history(found, since_t_ns), self._tray(tray))
 
     async def series_of(
         self,
