@@ -24,6 +24,12 @@ export function notifyButton() {
 
 export function notifyOf(alarm) {
   if (!isOn()) return;
-  const shown = new Notification(`✖ ${inFull(alarm.tray, alarm.fan)}`, { body: alarm.cause_with_share || alarm.message, tag: `${alarm.tray}/${alarm.fan}`, icon: "/page/icon.svg" });
+  let shown;
+  try {
+    shown = new Notification(`✖ ${inFull(alarm.tray, alarm.fan)}`, { body: alarm.cause_with_share || alarm.message, tag: `${alarm.tray}/${alarm.fan}`, icon: "/page/icon.svg" });
+  } catch (failure) {  // on phones, browsers let only service workers notify
+    console.info(failure.message);
+    return;
+  }
   shown.onclick = () => { window.focus(); location.hash = "#/alarms"; shown.close(); };
 }
