@@ -7,7 +7,7 @@ import { clock, element, facts, keepFocus, setText, stamp } from "./dom.js";
 import { csvAddress, savePicture } from "./export.js";
 import { HistoryView } from "./history.js";
 import { Marks } from "./marks.js";
-import { inFull, label, unitOf, where } from "./names.js";
+import { label, unitOf, where } from "./names.js";
 import { address } from "./overview.js";
 import { PlotStack } from "./plots.js";
 import { plotsOf } from "./fan_plots.js";

@@ -50,5 +50,5 @@ function panel(tray, fans) {
 function silence(problems) {
   return element("section", { class: "panel" }, element("h2", {}, "No sample has come from any fan yet"),
     element("p", {}, "As soon as the source sends, the fans appear here by themselves."), ...problems.map((text) => element("p", {}, text)),
-    element("p", {}, "What would help: ", ...command("fantwin status"), " says which stage waits for what; ", ...command("fantwin discover"), " lists the fans of this computer."));
+    element("p", {}, "What would help: ", ...command("fantwin status"), " says which stage waits for what; ", ...command("fantwin doctor"), " checks the configuration and its devices."));
 }

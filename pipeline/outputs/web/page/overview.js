@@ -5,7 +5,7 @@ import { FanCard } from "./card.js";
 import { element, setText } from "./dom.js";
 import { LearningPanel, learningText } from "./learning.js";
 import { hashOf, hasPlaces, placeOf, where } from "./names.js";
-import { ABOUT, bytes, GROUPS, groupNumber, NO_LEVEL } from "./states.js";
+import { ABOUT, bytes, GROUPS, groupNumber } from "./states.js";
 import { FanTile } from "./tile.js";
 import { ask, learn } from "./server.js";
 
