@@ -35,7 +35,9 @@ def users(
     action: Annotated[UserAction, typer.Argument(metavar="ACTION", help=f"{', '.join(UserAction)}.")] = UserAction.LIST,
     name: Annotated[str | None, typer.Argument(help="Letters, digits, `.`, `_`, `@` and `-`.")] = None,
     role: Annotated[str, typer.Option(help="viewer: may only view; operator: may also act.")] = "viewer",
-    days: Annotated[float | None, typer.Option(min=0.01, help="With add-token: it ends after this time.")] = None,
+    days: Annotated[
+        float | None, typer.Option(min=0.01, max=36500, help="With add-token: it ends after this time.")
+    ] = None,
     config: ConfigOption = DEFAULT_CONFIG,
     overrides: SetOption = None,
     json_output: JsonOption = False,
@@ -68,11 +70,17 @@ def users(
         _list(path, found, tokens, json_output=json_output)
         return
     if name is None:
-        raise UsageError(f"name a user: fantwin users {action} NAME")
+        raise UsageError(f"give a name: fantwin users {action} NAME")
     if action in (UserAction.ADD_TOKEN, UserAction.REMOVE_TOKEN):
+        if action == UserAction.ADD_TOKEN and gateway.users is None:
+            raise UserError(
+                f'{config}: [gateway] names no file of users, so its API takes no token: add users = "{named}"'
+            )
         if action == UserAction.ADD_TOKEN and name in found:
             raise UserError(f"{path}: {name} is a user: give the token another name, which is shown where it acts")
         done = _change_tokens(tokens_file(path), tokens, action, name, role, days)
+        if not path.exists():  # the gateway needs it, also for programs alone
+            write_users(path, found)
         show(done, *(str(each) for each in done.values()), json_output=json_output)
         return
     if action == UserAction.ADD and name in tokens:

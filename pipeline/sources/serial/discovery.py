@@ -82,10 +82,13 @@ def _heard(port: str, listen_s: float) -> Heard | None:
                 if found and len(found[1]) >= _SAMPLES:
                     break
     except (OSError, ValueError) as error:
-        exists = (
-            "this user may not open it: join its group (often dialout)" if os.path.lexists(port) else "no such port"
-        )
-        raise UserError(f"{port}: {exists}") from error
+        if not os.path.lexists(port):
+            why = "no such port"
+        elif os.access(port, os.R_OK | os.W_OK):
+            why = "no serial port, or another program has it"
+        else:
+            why = "this user may not open it: join its group (often dialout)"
+        raise UserError(f"{port}: {why}") from error
     return _samples(data)
 
 

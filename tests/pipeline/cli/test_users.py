@@ -63,6 +63,7 @@ def test_a_token_is_shown_once_listed_with_its_end_and_removed(config):
     path = config.parent / "users.tokens.toml"
     assert path.stat().st_mode & 0o777 == 0o600
     assert text not in path.read_text()
+    assert Users(config.parent / "users.toml").of("grafana") is None, "a gateway starts with tokens and no users"
     tokens = Tokens(config.parent / "users.toml")
     (found,) = filter(None, [tokens.of(text)])
     assert (found.name, found.role) == ("grafana", "operator")
@@ -73,6 +74,7 @@ def test_a_token_is_shown_once_listed_with_its_end_and_removed(config):
     assert "is a token" in str(fantwin("users", "add", "grafana", "-c", config, typed=f"{PASSWORD}\n").exception)
     assert fantwin("users", "remove-token", "grafana", "-c", config).exit_code == 0
     assert tokens.of(text) is None, "from the next request on"
+    assert fantwin("users", "add-token", "grafana", "-c", config, "--days", "inf").exit_code == 2
     path.write_text('[grafana]\nrole = "root"\n')
     path.chmod(0o600)
     assert "[grafana] is no token" in str(fantwin("users", "-c", config).exception)
