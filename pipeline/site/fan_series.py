@@ -7,6 +7,7 @@ and how probable each cause was when.
 from __future__ import annotations
 
 import csv
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -27,6 +28,8 @@ from fantwin.scoring.alarms.current_alarms import current_alarm
 from fantwin.scoring.diagnosis.causes import short_name
 
 MOST_MARKS = 1000
+LONGEST_READ_S = 120.0
+"""of recordings for one answer: nobody waits longer, and others wait to read"""
 _BEFORE = 50
 """transitions before the range that are looked at for the alarm at its beginning"""
 _SPEEDS = ("deviation_rad_s", *CURVES[:3])
@@ -71,13 +74,19 @@ class FanSeries:
         unread: set[str] = set()
         has_raw = False
         tray = self.model.tray(fan.tray)
+        ends_s, notes = time.monotonic() + LONGEST_READ_S, list[str]()
         for block in recorded.blocks(fan.tray, begin_ns, end_ns, _READ, unread):
             if tray and block.fans == tray.fans:
                 t_ns = np.asarray(block.t_ns if isinstance(block, Score) else block.host_receive_t_ns)
                 before = np.flatnonzero(t_ns < end_ns)
                 buckets.add(t_ns[before], _series_of(block, fan.number)[before])
                 has_raw |= isinstance(block, Raw)
-        notes = [f"{name} cannot be read in full" for name in sorted(unread)]
+            if time.monotonic() >= ends_s:
+                notes.append(
+                    f"later recordings are left out, after {LONGEST_READ_S:g} s of reading: choose a shorter time"
+                )
+                break
+        notes += [f"{name} cannot be read in full" for name in sorted(unread)]
         return (
             [*notes, "of recorded times only what was measured: twin and score are not recorded"] if has_raw else notes
         )
@@ -118,8 +127,8 @@ class FanSeries:
             :, [at for at, _ in shown]
         ]
         for t_ns, values in zip(found.t_ns.tolist(), kinds.reshape(len(kinds), -1).tolist(), strict=True):
-            time = datetime.fromtimestamp(t_ns / NS_PER_S, UTC).isoformat(timespec="milliseconds")
-            rows.writerow([time, *("" if value != value else f"{value:.6g}" for value in values)])  # noqa: PLR0124  NaN
+            at = datetime.fromtimestamp(t_ns / NS_PER_S, UTC).isoformat(timespec="milliseconds")
+            rows.writerow([at, *("" if value != value else f"{value:.6g}" for value in values)])  # noqa: PLR0124  NaN
         return text.getvalue()
 
     def _speed_unit(self, fan: Fan) -> Any:

@@ -167,3 +167,13 @@ def test_marks_are_the_alarm_and_what_operators_did_and_causes_hold_until_the_ne
     inside = FanSeries(model, None).as_json(FAN, at(25), at(35), 10)
     assert [sorted(each["probabilities"].values()) for each in inside["causes"]] == [[0.9]], "it began before the range"
     assert FanSeries(model, None).as_json(Fan(TRAY, 0), at(0), at(60), 10)["marks"] == []
+
+
+def test_a_range_that_takes_too_long_to_read_is_answered_with_what_was_read_and_says_so(model, tmp_path, monkeypatch):
+    recorded = record(tmp_path, *map(raw, range(100)))
+    series = FanSeries(model, recorded)
+    whole = series.as_json(FAN, at(0), at(100), 100)
+    monkeypatch.setattr("fantwin.pipeline.site.fan_series.LONGEST_READ_S", 0.0)
+    cut = series.as_json(FAN, at(0), at(100), 100)
+    assert 0 < len(cut["t_s"]) < len(whole["t_s"]) == 100
+    assert "left out" in cut["note"] and "left out" not in whole["note"]
