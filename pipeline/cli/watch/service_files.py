@@ -14,6 +14,7 @@ from pathlib import Path
 from string import Template
 
 from fantwin.pipeline.config.settings import Config
+from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.sources.hwmon.config import ROOT, HwmonConfig
 from fantwin.pipeline.sources.modbus.config import ModbusConfig
 from fantwin.pipeline.sources.serial.config import SerialConfig
@@ -35,7 +36,7 @@ class Service:
         config: the configuration, an absolute path.
         run_folder: where it writes.
         program: the words that start `fantwin`.
-        installation: folders that the program needs.
+        installation: folders that the program needs, and those of twins.
         user: who runs it.
         group: the primary group of that user.
         chips: names of the hwmon chips whose fans it commands.
@@ -62,12 +63,13 @@ class Service:
         lines = [
             each.port for each in sources if isinstance(each, SerialConfig | ModbusConfig) and _is_device(each.port)
         ]
+        twins = {(config.folder / tray.twin).resolve().parent for tray in config.trays if tray.twin}
         group = grp.getgrgid(pwd.getpwnam(user).pw_gid).gr_name if user != USER else USER
         return cls(
             config=config.path.resolve(),
             run_folder=config.run_folder.resolve(),
             program=(sys.executable, "-P", "-m", "fantwin"),  # what is beside the configuration is not imported
-            installation=tuple({Path(sys.prefix), Path(sys.base_prefix), Path(__file__).resolve().parents[3]}),
+            installation=tuple({Path(sys.prefix), Path(sys.base_prefix), Path(__file__).resolve().parents[3], *twins}),
             user=user,
             group=group,
             chips=tuple(dict.fromkeys(each.chip_name for each in commanded if each.root == ROOT)),
@@ -145,9 +147,16 @@ def _rule(chip: str) -> str:
 
 
 def owner_of(config: Path) -> str:
-    """The person whose configuration it is; the service's own user where it is of root."""
+    """The person whose configuration it is; the service's own user where it is of root.
+
+    Raises:
+        UserError: nobody here has that number.
+    """
     owner = config.stat().st_uid
-    return pwd.getpwuid(owner).pw_name if owner else USER
+    try:
+        return pwd.getpwuid(owner).pw_name if owner else USER
+    except KeyError as error:
+        raise UserError(f"{config}: its owner {owner} is no user of this system: name one with --user") from error
 
 
 def written_below(root: Path, files: Mapping[Path, str]) -> list[Path]:

@@ -4,13 +4,18 @@ from __future__ import annotations
 
 import json
 import os
+import pwd
+import shutil
 from pathlib import Path
+from typing import NoReturn
 
 import pytest
 
 from fantwin.pipeline.cli.watch import service as module
+from fantwin.pipeline.cli.watch import service_files
 from tests.support.fantwin_command import error_of, fantwin
 from tests.support.ports import free_port
+from tests.support.running_chain import DEMO
 
 PROGRAMS = ("systemctl", "systemd-sysusers", "udevadm", "chown")
 TRAY = '[[tray]]\nname = "board"\nfans = 2\nsource = { kind = "hwmon", chip = "nct6798", writable = true }\n'
@@ -113,3 +118,25 @@ def test_a_service_that_does_not_start_is_one_line(host: Host, tmp_path: Path) -
     assert said == (
         "systemctl restart fantwin.service: Job for fantwin.service failed.; journalctl -u fantwin says more"
     )
+
+
+def test_a_configuration_of_nobody_is_refused_and_a_twin_beside_its_folder_is_seen_in_a_home(
+    host: Host, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    twins, config = tmp_path / "twins", tmp_path / "site" / "fantwin.toml"
+    twins.mkdir()
+    config.parent.mkdir()
+    shutil.copy(DEMO / "twin.onnx", twins)
+    config.write_text('[[tray]]\nname = "tray1"\nfans = 8\nport = "/dev/none"\ntwin = "../twins/twin.onnx"\n')
+    monkeypatch.setattr(service_files, "_HOMES", (f"{tmp_path}/",))
+    unit = fantwin("service", "install", "--dry-run", "-c", config, "--user", "root").stdout
+    (shown,) = (line for line in unit.splitlines() if line.startswith("BindReadOnlyPaths="))
+    assert {str(twins), str(config.parent)} <= set(shown.partition("=")[2].split())
+
+    def unknown(_: int) -> NoReturn:
+        raise KeyError
+
+    monkeypatch.setattr(pwd, "getpwuid", unknown)
+    if os.getuid() == 0:
+        os.chown(config, 12345, -1)
+    assert "is no user of this system: name one with --user" in error_of("service", "install", "-c", config)
