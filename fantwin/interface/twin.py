@@ -100,6 +100,7 @@ class Twin:
         Warns:
             FantwinWarning: of what was repaired, left out or taken for granted.
 
+        Examples:
             >>> import fantwin
             >>> commands = {"time": [0.00, 0.01, 0.02, 0.03], "command": [0.5, 0.5, 0.8, 0.8]}
             >>> predicted = fantwin.load().predict(commands, initial_speed_rpm=3000.0)

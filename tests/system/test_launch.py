@@ -94,7 +94,10 @@ def command_reaches_the_fan(chain: Chain) -> int:
         bus.subscribe(tray_key(SITE, TRAY, "raw"), keep)
         done = as_typed(*chain.words("command"), "--fan", 3, 0.625, "--json")
         assert done.returncode == 0, done.stderr
-        assert json.loads(done.stdout) == {"tray": TRAY, "fan": 3, "kind": "command", "value": 0.625, "unit": ""}
+        assert json.loads(done.stdout) == {
+            **{"tray": TRAY, "fan": 3, "name": "", "kind": "command"},
+            **{"value": 0.625, "unit": ""},
+        }
         eventually(lambda: "command" in newest and newest["command"][3] == 0.625, "fan 3 has its command")
         assert np.count_nonzero(newest["command"] == 0.625) == 1
         return int(newest["sequence"][0]) + 1

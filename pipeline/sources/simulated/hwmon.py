@@ -98,7 +98,7 @@ class HwmonTree:
 
     def commands(self) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """(fans,) duty of each fan, NaN where it is automatic; and (fans,) where it is."""
-        modes = [channel.read(f"pwm{channel.number}_enable", AUTOMATIC) for channel in self._channels]
+        modes = [*map(self._mode, self._channels)]
         automatic = np.array([mode >= AUTOMATIC for mode in modes])
         duty = np.array([self._duty(*each) for each in zip(self._channels, modes, strict=True)])
         return np.where(automatic, np.nan, duty), automatic
@@ -107,7 +107,8 @@ class HwmonTree:
         """(fans,) each: write what has changed. duty: shown where the driver commands."""
         for fan, channel in enumerate(self._channels):
             channel.write(f"fan{channel.number}_input", rpm[fan])
-            if automatic[fan]:
+            # a command that has come since `commands` is not written over
+            if automatic[fan] and self._mode(channel) >= AUTOMATIC:
                 channel.last_pwm = round(HIGHEST_PWM * duty[fan])
                 channel.write(f"pwm{channel.number}", channel.last_pwm)
 
@@ -122,6 +123,9 @@ class HwmonTree:
         (folder / "device").symlink_to(os.path.relpath(device, folder))
         (folder / "name").write_text(f"{name}\n", encoding="utf-8")
         return folder
+
+    def _mode(self, channel: _Channel) -> int:
+        return channel.read(f"pwm{channel.number}_enable", AUTOMATIC)
 
     def _duty(self, channel: _Channel, mode: int) -> float:
         if mode == FULL_SPEED:

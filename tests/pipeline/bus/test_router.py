@@ -84,7 +84,10 @@ def test_clients_that_start_before_the_router_connect_once_it_runs(endpoint):
 
 @pytest.mark.parametrize(
     "words",
-    ["status --once", "alarms", "alarms ack tray1 0 --timeout 1", "wear", "command --fan 0 0.5", "command --sweep"],
+    [
+        *("status --once", "status --wear", "alarms", "alarms ack tray1 0 --timeout 1"),
+        *("command --fan 0 0.5", "command --sweep"),
+    ],
 )
 def test_a_question_to_a_site_whose_router_is_down_is_answered_soon(words, endpoint):
     settings = ("--set", "bus.mode='client'", "--set", f"bus.endpoint='{endpoint}'")

@@ -63,8 +63,8 @@ def test_alarms_and_wear_of_a_recording_name_the_fans(scored: Path) -> None:
     history = ("alarms", "--history", "--recordings", scored)
     assert "tray1 GPU (fan 2)" in shown(*history)
     assert {each["name"] for each in document(*history)["alarms"]} == {"GPU"}
-    assert "rear top (fan 1)" in shown("wear", scored)
-    assert {row["fan"]: row["name"] for row in document("wear", scored)["wear"]} == dict(enumerate(NAMES))
+    assert "rear top (fan 1)" in shown("info", "--wear", scored)
+    assert {row["fan"]: row["name"] for row in document("info", "--wear", scored)["wear"]} == dict(enumerate(NAMES))
 
 
 def test_fans_are_identified_by_name(raw: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from fantwin.pipeline.cli.simulation.simulate import InjectedFaults, tachos_of
@@ -58,6 +59,16 @@ def test_a_driver_drives_its_fans_until_they_are_taken_over(tmp_path: Path) -> N
     assert int((root / "hwmon0" / "pwm1_enable").read_text()) == 2, "the profile of the driver goes on"
     tree.close()
     assert not root.exists()
+
+
+def test_a_command_is_not_written_over_by_the_driver_that_has_just_looked(tmp_path: Path) -> None:
+    tree = HwmonTree(tmp_path / "hwmon", "nct6798", 2)
+    _, automatic = tree.commands()
+    chip = tmp_path / "hwmon" / "hwmon0"
+    (chip / "pwm1_enable").write_text("1\n", encoding="utf-8")
+    (chip / "pwm1").write_text("51\n", encoding="utf-8")
+    tree.show(np.array([900.0, 900.0]), np.array([0.5, 0.5]), automatic)
+    assert [int((chip / f"pwm{number}").read_text()) for number in (1, 2)] == [51, 128]
 
 
 def test_a_fault_in_the_file_begins_when_it_is_written_and_ends_when_it_is_gone(
