@@ -47,8 +47,9 @@ class ViewerConfig(StageConfig):
         default=9876,
         ge=0,
         le=65535 - PAGE_ABOVE_DATA,
-        description="port on this host (127.0.0.1) for the data of live viewers, native and in a browser; the page of "
-        "the latter has the port 100 above it, 9976; shard K uses the K-th ports from there on; 0: no live viewers",
+        description="port on this host (127.0.0.1) for the data of live viewers; the page of those in a browser has "
+        "the port 100 above it; not set, `fantwin up` chooses free ones from there on; shard K uses the K-th; 0: no "
+        "live viewers",
     )
     show: tuple[str, ...] = Field(
         default=(),

@@ -16,6 +16,7 @@ LEARNER = "learner"
 """the stage that gives a tray its twin"""
 RECORDER = "recorder"
 GATEWAY = "gateway"
+VIEWER = "viewer"
 STAGES: dict[str, StageRow] = {
     row.name: row
     for row in (

@@ -1,4 +1,4 @@
-"""The configuration as `fantwin up` runs it on this host: without stages whose extra is missing, and with a free port.
+"""The configuration as `fantwin up` runs it on this host: without stages whose extra is missing, and with free ports.
 
 Both choices are added to the overrides, so that every stage and the recording know them.
 """
@@ -14,11 +14,12 @@ from pathlib import Path
 from typing import Any
 
 from fantwin.pipeline.config.loading import load_config
-from fantwin.pipeline.config.registry import GATEWAY, STAGES
+from fantwin.pipeline.config.registry import GATEWAY, STAGES, VIEWER
 from fantwin.pipeline.config.settings import Config
 from fantwin.pipeline.config.shards import Shard, process_list
 from fantwin.pipeline.extras import missing_extra
 from fantwin.pipeline.http_server import listening_socket
+from fantwin.pipeline.site.loopback import LOOPBACK
 
 _PORTS = 1000
 """number of ports that are tried, from the configured one on"""
@@ -74,21 +75,26 @@ def _loaded(
     return ThisHost(config, tuple(overrides), tuple(left_out.values()))
 
 
-def with_free_port(host: ThisHost, trays: Collection[str] | None) -> ThisHost:
-    """The same, with a free port for the operators' page if the configuration sets none.
+def with_free_ports(host: ThisHost, trays: Collection[str] | None) -> ThisHost:
+    """The same, with free ports for the operators' page and for live viewers where the configuration sets none.
 
     trays: of this host, see `process_list`.
     """
-    section: Any = host.config.sections.get(GATEWAY)
-    shards = _pages(host.config, trays)
-    if not shards or "port" in section.model_fields_set:
+    overrides = host.overrides
+    for stage, key in ((GATEWAY, "port"), (VIEWER, "grpc_port")):
+        section: Any = host.config.sections.get(stage)
+        shards = [row.shard.number - 1 for row in process_list(host.config, trays) if row.stage == stage]
+        if not shards or key in section.model_fields_set:
+            continue
+        configured = getattr(section, key)
+        at, above = (section.host, {0}) if stage == GATEWAY else (LOOPBACK, {0, section.web_port - configured})
+        needed = [number + more for number in shards for more in above]
+        ports = range(configured, configured + _PORTS)
+        port = next((port for port in ports if _are_free(at, [port + more for more in needed])), configured)
+        if port != configured:
+            overrides = (*overrides, f"{stage}.{key}={port}")
+    if overrides == host.overrides:
         return host
-    numbers = [shard.number - 1 for shard in shards]
-    ports = range(section.port, section.port + _PORTS)
-    port = next((port for port in ports if _are_free(section.host, [port + n for n in numbers])), section.port)
-    if port == section.port:
-        return host
-    overrides = (*host.overrides, f"{GATEWAY}.port={port}")
     return ThisHost(load_config(host.config.path, overrides), overrides, host.left_out)
 
 

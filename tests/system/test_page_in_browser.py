@@ -107,6 +107,7 @@ def test_everything_is_done_by_keyboard(gateway, browser):
     keyboard.press("ArrowLeft")
     keyboard.press("Enter")
     card = page.locator(f'article[data-fan="{TRAY}/{FAULTY}"]')
+    expect(card).to_be_visible()
     for button, done in (("Acknowledge", "by ann"), ("Shelve", "shelved until")):
         tab_to(button)
         keyboard.press("Enter")

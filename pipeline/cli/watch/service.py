@@ -28,7 +28,7 @@ from fantwin.pipeline.cli.watch.service_files import (
     written_below,
 )
 from fantwin.pipeline.errors import UsageError, UserError
-from fantwin.pipeline.launch.this_host import load_for_this_host, page_addresses, with_free_port
+from fantwin.pipeline.launch.this_host import load_for_this_host, page_addresses, with_free_ports
 
 SYSTEM = Path("/")
 _RUNS_SYSTEMD = Path("run/systemd/system")
@@ -126,7 +126,7 @@ def _install(config: Path, user: str | None, *, is_dry: bool, json_output: bool)
     if not _is_active():
         if here.config.bus.mode == "peer" and accepts_connections(here.config.bus.endpoint):
             raise UserError(f"{here.config.bus.endpoint}: something runs there: end `fantwin up` first (Ctrl-C)")
-        here = with_free_port(here, None)
+        here = with_free_ports(here, None)
     try:
         written = written_below(SYSTEM, files)
     except OSError as error:

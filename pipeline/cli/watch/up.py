@@ -73,12 +73,12 @@ def up(
     # the process of a stage loads no launcher
     from fantwin.pipeline.launch.launcher import Launcher  # noqa: PLC0415
     from fantwin.pipeline.launch.site_report import EventLog  # noqa: PLC0415
-    from fantwin.pipeline.launch.this_host import load_for_this_host, page_addresses, with_free_port  # noqa: PLC0415
+    from fantwin.pipeline.launch.this_host import load_for_this_host, page_addresses, with_free_ports  # noqa: PLC0415
     from fantwin.pipeline.site.loss_accounting import refused_lines  # noqa: PLC0415
 
     loaded = load_for_this_host(config, overrides or ())
     of_host = chosen_trays(loaded.config, trays, shard)
-    here = with_free_port(loaded, of_host)
+    here = with_free_ports(loaded, of_host)
     settings = here.config
     log = EventLog(sys.stderr.fileno())
     pages = [f"operators' page: {address}" for address in page_addresses(settings, of_host)]

@@ -10,7 +10,8 @@ import pytest
 
 from fantwin.pipeline import extras
 from fantwin.pipeline.config.settings import ConfigError
-from fantwin.pipeline.launch.this_host import load_for_any_host, load_for_this_host, page_addresses, with_free_port
+from fantwin.pipeline.launch.this_host import load_for_any_host, load_for_this_host, page_addresses, with_free_ports
+from fantwin.stages.viewer import PAGE_ABOVE_DATA, ViewerConfig
 
 TRAYS = "".join(f'[[tray]]\nname = "{name}"\nfans = 1\nport = "x"\ntwin = "t.onnx"\n' for name in "ab")
 
@@ -65,9 +66,9 @@ def test_the_page_takes_the_next_free_port_where_none_is_set(
 ) -> None:
     port, _ = two_ports
     default_port(port)
-    host = with_free_port(load_for_this_host(path), None)
+    host = with_free_ports(load_for_this_host(path), None)
     assert page_addresses(host.config) == [f"http://127.0.0.1:{port + 1}/"]
-    set_by_hand = with_free_port(load_for_this_host(path, [f"gateway.port={port}"]), None)
+    set_by_hand = with_free_ports(load_for_this_host(path, [f"gateway.port={port}"]), None)
     assert page_addresses(set_by_hand.config) == [f"http://127.0.0.1:{port}/"], "it is refused when the stage starts"
 
 
@@ -77,11 +78,25 @@ def test_all_shards_of_the_page_need_a_free_port_and_those_of_other_hosts_do_not
     port, _ = two_ports
     default_port(port - 1)
     shards = load_for_this_host(path, ["launcher.shards={gateway=2}"])
-    both = page_addresses(with_free_port(shards, None).config)
+    both = page_addresses(with_free_ports(shards, None).config)
     assert len(both) == 2 and f"http://127.0.0.1:{port}/" not in both
-    assert page_addresses(with_free_port(shards, ["b"]).config, ["b"])[0] != f"http://127.0.0.1:{port}/"
+    assert page_addresses(with_free_ports(shards, ["b"]).config, ["b"])[0] != f"http://127.0.0.1:{port}/"
     none = load_for_this_host(path, ['launcher.without=["gateway"]'])
-    assert (with_free_port(none, None), page_addresses(none.config)) == (none, [])
+    assert (with_free_ports(none, None), page_addresses(none.config)) == (none, [])
+
+
+def test_live_viewers_take_the_next_free_ports_where_none_is_set(
+    path: Path, two_ports: tuple[int, socket.socket], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    taken, _ = two_ports
+    monkeypatch.setattr(ViewerConfig.model_fields["grpc_port"], "default", taken - PAGE_ABOVE_DATA)
+    ViewerConfig.model_rebuild(force=True)
+    host = load_for_this_host(path)
+    assert with_free_ports(host, None).config.sections["viewer"].web_port > taken  # type: ignore[attr-defined]
+    by_hand = load_for_this_host(path, [f"viewer.grpc_port={taken}"])
+    assert with_free_ports(by_hand, None).overrides == by_hand.overrides, "it is refused when the stage starts"
+    monkeypatch.undo()
+    ViewerConfig.model_rebuild(force=True)
 
 
 @pytest.fixture
