@@ -77,7 +77,7 @@ def test_a_fan_is_shown_by_its_name_first_on_every_view_and_a_name_is_text(tmp_p
         expect(page.get_by_role("heading", name=label, exact=True)).to_be_visible()
         expect(page.locator(".where").first).to_contain_text("rack <3>")
         page.goto(f"http://127.0.0.1:{running.port}/#/alarms")
-        card = page.locator("article", has_text=in_full)
+        card = page.locator("article", has_text=label)
         expect(card.get_by_text("90 rpm below the twin", exact=True)).to_be_visible()
         page.goto(f"http://127.0.0.1:{running.port}/#/history")
         expect(page.locator("summary", has_text=in_full)).to_be_visible()
