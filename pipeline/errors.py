@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 
 class FantwinError(Exception):
-    """What whoever uses fantwin can correct: one line that says what is wrong, where, and what to do."""
+    """Error that a user can correct: one line that says what is wrong, where, and what to do."""
 
 
 FantwinError.__module__ = "fantwin"  # as it is imported, and as a traceback shows it

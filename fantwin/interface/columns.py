@@ -1,4 +1,4 @@
-"""Which columns of a table are the time, the command and the speed of which fan."""
+"""Columns of a table: the time, and the command and the speed of each fan."""
 
 from __future__ import annotations
 

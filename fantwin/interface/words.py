@@ -1,4 +1,4 @@
-"""What is said to whoever calls: warnings, and the errors of the pipeline in the words of Python."""
+"""Warnings for the caller, and the errors of the pipeline in the words of Python."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ from fantwin.schemas.messages import Raw, Score
 from fantwin.schemas.units import NS_PER_S
 
 LATEST_NS = 60 * NS_PER_S
-"""a message of samples was received at most so long after them, and not before"""
+"""longest time between samples and the receipt of their message"""
 _KINDS: dict[str, type[Raw | Score]] = {"score": Score, "raw": Raw}
 """the topics that have samples of people's interest, the better one first"""
 _ENDLESS_NS = (1 << 63) - 1

@@ -29,7 +29,7 @@ from fantwin.scoring.diagnosis.causes import short_name
 
 MOST_MARKS = 1000
 LONGEST_READ_S = 120.0
-"""of recordings for one answer: nobody waits longer, and others wait to read"""
+"""longest time for which one answer may read recordings, since others wait for their turn"""
 _BEFORE = 50
 """transitions before the range that are looked at for the alarm at its beginning"""
 _SPEEDS = ("deviation_rad_s", *CURVES[:3])

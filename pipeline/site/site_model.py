@@ -336,7 +336,7 @@ class SiteModel:
         return {each.tray: each for health in heard for each in health.learning if not health.is_last}
 
     def every_wear(self) -> Sequence[Mapping[str, Any]]:
-        """The wear of all fans of which it is known, one row each."""
+        """The wear of each fan whose wear is known, one row each."""
         with self._lock:
             return [row for _, rows in self._wear.values() for row in rows]
 

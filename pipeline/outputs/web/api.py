@@ -153,7 +153,7 @@ class Api:
         points: Annotated[int, Query(ge=1, le=MOST_POINTS)] = 1000,
         format: Literal["json", "csv"] = "json",
     ) -> Response:
-        """A fan over any range of time, in at most so many points: of each the least, mean and largest value."""
+        """A fan over any range of time, in at most `points` points, each with its least, mean and largest value."""
         found = self._fan(tray, fan)
         end_ns = (self.model.newest_t_ns(tray) or time.time_ns()) + 1 if end_s is None else round(end_s * NS_PER_S)
         begin_ns = end_ns - HISTORY_S * NS_PER_S if begin_s is None else round(begin_s * NS_PER_S)
