@@ -87,6 +87,8 @@ def copied(tmp_path: Path, endpoint: str) -> Callable[[str], Path]:
             path.write_text(re.sub(r"\b(5020|8000)\b", port, text), encoding="utf-8")
         with (folder / "fantwin.toml").open("a", encoding="utf-8") as configuration:
             configuration.write(f'\n[bus]\nendpoint = "{endpoint}"\n')
+            # several sites that start at once may choose the same free ports
+            configuration.write(f'[gateway]\nport = {free_port()}\n[launcher]\nwithout = ["viewer"]\n')
         return folder
 
     return copy
