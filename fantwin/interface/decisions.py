@@ -20,7 +20,7 @@ from fantwin.schemas.messages import Alarm, Message, Score
 from fantwin.scoring.score_message import BAND_SIGMAS
 
 LIMIT = 1.0
-"""of a score, which is relative to it"""
+"""score at which an alarm is raised: scores are relative to their limit"""
 _NEVER_NS = np.iinfo(np.int64).min
 
 

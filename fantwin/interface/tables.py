@@ -25,7 +25,7 @@ from fantwin.schemas.units import NS_PER_S
 
 Array: TypeAlias = NDArray[Any]
 NAME = Path("the table")
-"""in place of a file, in errors"""
+"""name of a table in errors, where other data have a file"""
 _LEAST_SHARED = 0.5
 """share of the samples of a long table that the fans must have at common times"""
 _SHOWN = 6

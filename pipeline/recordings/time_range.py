@@ -54,7 +54,7 @@ class RecordedRange:
         """recordings: the first part of each, NAME.mcap."""
         self._recordings = recordings
         self._spans: dict[tuple[Path, int], tuple[int, int]] = {}
-        """of finished parts, by path and size: when their first and last messages were received"""
+        """times of receipt of the first and last message of each finished part, by path and size"""
 
     def blocks(
         self, tray: str, begin_ns: int, end_ns: int, columns: Collection[str], unread: set[str]

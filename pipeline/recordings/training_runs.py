@@ -58,7 +58,7 @@ class RecordedTray:
     damage: str
     """what of the file could not be read, in one line; empty if all of it was read"""
     names: FanNames = NO_NAMES
-    """of all fans of the tray"""
+    """names of all fans of the tray"""
 
     def between(self, from_s: float, to_s: float) -> RecordedTray:
         """The samples with from_s <= t_s < to_s, of runs that have at least two of them."""

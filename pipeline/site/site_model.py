@@ -120,8 +120,10 @@ class SiteModel:
         return self.add_decoded_score(tray, score) if is_kept else score
 
     def wants_score(self, tray: str, every_s: float) -> bool:
-        """Whether a known tray's last score was so long ago. It takes no lock: threads of the bus ask, and nothing may
-        wait for a disk on which the history is saved."""
+        """Whether the last score of a known tray is older than `every_s`.
+
+        It takes no lock: threads of the bus ask, and nothing may wait for a disk on which the history is saved.
+        """
         return self._now_s() - self._heard_s.get(tray, -np.inf) >= every_s
 
     def add_decoded_score(self, name: str, score: Score) -> Score | None:

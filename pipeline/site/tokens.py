@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import secrets
 import time
 import tomllib
@@ -19,8 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from fantwin.pipeline.errors import UserError
-from fantwin.pipeline.files import PRIVATE, is_read_by_others, replace_file
-from fantwin.pipeline.site.users import NAME, UserRole
+from fantwin.pipeline.site.users import NAME, UserRole, read_private_tables, write_private_tables
 
 PREFIX = "fantwin_"
 """begins each token: scanners of leaked secrets find it"""
@@ -95,10 +93,7 @@ def read_tokens(path: Path) -> dict[str, Token]:
         UserError: it cannot be read, others may read it, or it is no such file.
     """
     try:
-        with path.open("rb") as file:
-            if is_read_by_others(os.fstat(file.fileno())):
-                raise UserError(f"{path}: others may read it: chmod 600 {path}")
-            tables = tomllib.load(file)
+        tables = read_private_tables(path)
     except FileNotFoundError:
         return {}
     except (OSError, tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
@@ -117,10 +112,7 @@ def write_tokens(path: Path, tokens: Mapping[str, Token]) -> None:
         expires = token.expires.isoformat() if token.expires else ""
         lines.append(f"\n[{json.dumps(name)}]\nrole = {json.dumps(token.role)}\n")
         lines.append(f'sha256 = "{token.sha256}"\nexpires = "{expires}"\n')
-    try:
-        replace_file(path, "".join(lines).encode(), PRIVATE)
-    except OSError as error:
-        raise UserError(f"{path}: the tokens cannot be written: {error.strerror}") from error
+    write_private_tables(path, lines, "tokens")
 
 
 def _hashed(text: str) -> str:

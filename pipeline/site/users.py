@@ -9,7 +9,7 @@ import json
 import os
 import re
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -108,6 +108,31 @@ def hasher() -> PasswordHasher:
     return PasswordHasher()
 
 
+def read_private_tables(path: Path) -> dict[str, Any]:
+    """The tables of a TOML file that only its owner may read.
+
+    Raises:
+        UserError: others may read it.
+        OSError, TOMLDecodeError, UnicodeDecodeError: it cannot be read.
+    """
+    with path.open("rb") as file:
+        if is_read_by_others(os.fstat(file.fileno())):
+            raise UserError(f"{path}: others may read it: chmod 600 {path}")
+        return tomllib.load(file)
+
+
+def write_private_tables(path: Path, lines: Iterable[str], what: str) -> None:
+    """Replace such a file as a whole. what: is in it, for errors.
+
+    Raises:
+        UserError: it cannot be written.
+    """
+    try:
+        replace_file(path, "".join(lines).encode(), PRIVATE)
+    except OSError as error:
+        raise UserError(f"{path}: the {what} cannot be written: {error.strerror}") from error
+
+
 def read_users(path: Path) -> dict[str, User]:
     """All users of a file, by name.
 
@@ -115,10 +140,7 @@ def read_users(path: Path) -> dict[str, User]:
         UserError: as `Users`.
     """
     try:
-        with path.open("rb") as file:
-            if is_read_by_others(os.fstat(file.fileno())):
-                raise UserError(f"{path}: others may read it: chmod 600 {path}")
-            tables = tomllib.load(file)
+        tables = read_private_tables(path)
     except (OSError, tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise _unreadable(path, error) from error
     return {name: _user(path, name, table) for name, table in tables.items()}
@@ -134,10 +156,7 @@ def write_users(path: Path, users: Mapping[str, User]) -> None:
     for name, user in sorted(users.items()):
         lines.append(f"\n[{json.dumps(name)}]\nrole = {json.dumps(user.role)}\n")
         lines.append(f"password_hash = {json.dumps(user.password_hash)}\n")
-    try:
-        replace_file(path, "".join(lines).encode(), PRIVATE)
-    except OSError as error:
-        raise UserError(f"{path}: the users cannot be written: {error.strerror}") from error
+    write_private_tables(path, lines, "users")
 
 
 def checked_password(password: str, name: str) -> str:

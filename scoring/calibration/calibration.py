@@ -42,7 +42,7 @@ def daily_interval(count: float, fan_hours: float) -> tuple[float, float]:
 
 
 ENOUGH_EXPECTED, ENOUGH_RATIO = 3.0, 10.0
-"""of `says_something`"""
+"""see `says_something`: expected false alarms, and ratio of the upper bound to the declared rate"""
 
 
 @dataclass(frozen=True)

@@ -322,3 +322,16 @@ def test_pages_that_ask_at_once_share_one_answer_which_is_never_older_than_the_q
         return [int((await each).body) for each in pages]
 
     assert asyncio.run(all_ask()) == [0] + [1] * 8
+
+
+def test_every_answer_forbids_foreign_scripts_and_the_cookie_is_for_the_server_only(gateway):
+    client = Client(gateway)
+    _, _, headers = client.ask("POST", "/api/v1/login", {"name": "ann", "password": PASSWORD})
+    cookie = headers["set-cookie"].lower()
+    assert "httponly" in cookie
+    assert "samesite=strict" in cookie
+    for path in ("/", "/page/main.js", "/api/v1/site", "/api/v1/nothing", "/metrics"):
+        _, _, headers = client.ask("GET", path)
+        assert "default-src 'none'" in headers["content-security-policy"], path
+        assert headers["x-content-type-options"] == "nosniff"
+    assert client.ask("GET", "/page/../app.py")[0] == 404

@@ -197,7 +197,7 @@ def test_the_page_is_accessible_and_fits_all_screens(scheme, gateway, browser):
         expect(page.locator("main")).to_contain_text(shown)
         for width_px, height_px in SIZES:
             page.set_viewport_size({"width": width_px, "height": height_px})
-            page.wait_for_function("document.documentElement.scrollWidth <= window.innerWidth")  # laid out anew
+            page.wait_for_function("document.documentElement.scrollWidth <= window.innerWidth")
         found[view] = inaccessible(page)
     header = page.locator("header").bounding_box()
     assert header is not None and header["height"] < 90, "two rows on a phone"

@@ -17,7 +17,7 @@ from fantwin.twin.models.physics import LAG
 from fantwin.twin.runs import Array
 
 MOST_STEPS = 1000
-"""in a period, as of a running site (pipeline.prediction.free_run)"""
+"""largest number of steps in a period, as in a running site (pipeline.prediction.free_run)"""
 
 
 class TorchTwin(torch.nn.Module):

@@ -52,7 +52,7 @@ class Episode:
     feedback_by: str = ""
     feedback_reason: str = ""
     name: str = ""
-    """of the fan"""
+    """name of the fan"""
 
     @property
     def label(self) -> str:
