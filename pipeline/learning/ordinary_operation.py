@@ -77,7 +77,7 @@ class OrdinaryOperation:
         levels, moves = NEEDED_RANGES - visited, NEEDED_CHANGES - changes
         more = [f"{NEEDED_S:.0f} s at each of {levels} more level{'s' * (levels > 1)}"] if levels > 0 else []
         more += [f"{moves} more change{'s' * (moves > 1)} by a tenth of {self._range}"] if moves > 0 else []
-        return f"{self._range_of(fan)} so far; still {' and '.join(more)}" if more else ""
+        return f"{self._range_of(fan)} so far, still {' and '.join(more)}" if more else ""
 
     def held(self) -> list[str]:
         """Which fans never changed their command by more than a tenth of the range, a few words for each."""

@@ -51,7 +51,7 @@ def test_the_first_version_waits_for_enough_running_and_enough_movement(tmp_path
     ), "nobody knows when the fan will have moved enough"
     assert waits.helps == "`fantwin command --sweep` moves the fans"
     assert waits.fans[0].missing.startswith(
-        "command 0.5 so far; still 20 s at each of 3 more levels and 10 more changes"
+        "command 0.5 so far, still 20 s at each of 3 more levels and 10 more changes"
     )
     learner.run(600)
     assert learner.put_in_force == ["tray1-1"]

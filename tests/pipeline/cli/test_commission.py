@@ -178,11 +178,11 @@ def test_it_waits_for_the_fans_of_every_tray_and_says_which_have_not_moved(
     monkeypatch.setattr(PlayedSite, "still", ("b",))
     result = played.commission("--at-most-hours", 0.5, "--json")
     lines = result.stderr.splitlines()
-    both = r"1 min of at least 1; still missing: tray a, fan 0: .*; tray b, fan 0: command 0\.5, .*"
+    both = r"1 min of at least 1; still missing: tray a, fan 0: .*; tray b, fan 0: command 0\.5 so far, .*"
     assert any(re.fullmatch(both, line) for line in lines), lines
     alone = r"10 min of at least 1; still missing: tray b, fan 0: [^;]*"
     assert any(re.fullmatch(alone, line) for line in lines), lines
-    failed = "tray b failed: in 0.5 h its fans have not moved enough (fan 0: command 0.5, "
+    failed = "tray b failed: in 0.5 h its fans have not moved enough (fan 0: command 0.5 so far, "
     assert [line.endswith("; going on without it") for line in lines if line.startswith(failed)] == [True]
     assert str(result.exception).startswith(failed)
     assert [line.split()[-3] for line in played.of("train")] == ["a"]

@@ -144,14 +144,14 @@ def test_a_fan_has_moved_enough_after_enough_levels_and_changes_and_the_others_a
     operation = OrdinaryOperation(TRAY)
     assert (
         operation.missing()[0]
-        == "fan 0: no command so far; still 20 s at each of 4 more levels and 10 more changes by a tenth of 0 to 100"
+        == "fan 0: no command so far, still 20 s at each of 4 more levels and 10 more changes by a tenth of 0 to 100"
     )
     operation.take(samples(stairs([20.0, 45.0, 70.0, 95.0, 20.0, 45.0])))
     first, second = operation.missing()
-    assert first == "fan 0: commands 20 to 95 so far; still 5 more changes by a tenth of 0 to 100"
+    assert first == "fan 0: commands 20 to 95 so far, still 5 more changes by a tenth of 0 to 100"
     assert (
         second
-        == "fan 1: command 20 so far; still 20 s at each of 3 more levels and 10 more changes by a tenth of 0 to 100"
+        == "fan 1: command 20 so far, still 20 s at each of 3 more levels and 10 more changes by a tenth of 0 to 100"
     )
     operation.take(samples(stairs([20.0, 45.0, 70.0, 95.0, 20.0]), first_s=150.0))
     (left,) = operation.missing()
@@ -168,4 +168,4 @@ def test_a_command_that_flickers_between_two_ranges_does_not_change_and_gaps_do_
     sparse.take(samples(stairs([20.0, 45.0], held=10), period_s=10.0))
     lacking = sparse.missing()[0]
     more = "still 20 s at each of 4 more levels and 9 more changes by a tenth of 0 to 100"
-    assert lacking == f"fan 0: commands 20 to 45 so far; {more}"
+    assert lacking == f"fan 0: commands 20 to 45 so far, {more}"
