@@ -40,7 +40,7 @@ def test_the_first_version_waits_for_enough_running_and_enough_movement(tmp_path
     assert learner.learning.starts == []
     (note,) = learner.core.notes()
     assert note.startswith(
-        "no twin yet, nothing is judged; 10 min recorded (5 needed); not moved enough yet: fan 0: command 0.5 so far;"
+        "no twin yet, nothing is judged; 10 min recorded (5 needed); not moved enough yet: fan 0: command 0.5 so far,"
     )
     waits = learner.core.learning()
     assert waits is not None
