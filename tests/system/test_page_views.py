@@ -174,10 +174,13 @@ def test_marks_say_when_an_alarm_came_and_what_operators_did_and_evidence_is_dra
     marks.nth(2).press("Shift")
     expect(marks.nth(2)).to_have_attribute("aria-label", re.compile("acknowledged by ann: .*filter ordered"))
     expect(page.locator(".mark-list li")).to_have_count(3)
-    area = page.locator(".plot .u-over").first.bounding_box()
-    mark = marks.nth(1).bounding_box()
-    assert area is not None and mark is not None
-    assert (mark["x"] + mark["width"] / 2 - area["x"]) / area["width"] == pytest.approx(5 / 6, abs=0.02)
+    page.wait_for_function(
+        """() => {
+            const area = document.querySelector(".plot .u-over").getBoundingClientRect();
+            const mark = document.querySelectorAll(".mark")[1].getBoundingClientRect();
+            return Math.abs((mark.x + mark.width / 2 - area.x) / area.width - 5 / 6) < 0.02;
+        }"""
+    )
     evidence = page.get_by_role("region", name="Evidence of each cause")
     expect(evidence).to_contain_text("more drag 90 %")
     page.get_by_text("Course of the alarm").click()
