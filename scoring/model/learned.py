@@ -41,6 +41,8 @@ DAY = 1.0
 """the same between days, of one fan"""
 LEAST = 0.05
 """least share of a prior standard deviation that is believed"""
+LARGEST_LOG = 6.0
+"""largest logarithm of the ratio of a variance to its prior that is looked at"""
 SECONDS_PER_DAY = 86400.0
 
 
@@ -156,29 +158,39 @@ def learned_priors(runs: Sequence[RunSums]) -> Priors:
     means = [float(share) for run in runs for share in run.mean_share if math.isfinite(share)]
     of_means = math.fsum(share**2 for share in means) / max(len(means), 1)
 
-    def between(prior: float, variance: float, number: float) -> float:
-        return _between(prior, variance, number, fan_days)
-
     step_s, wander_s, air_s = SEGMENT_S, priors.wander_s, priors.air_s
     within = _same(NEAR * step_s, wander_s, step_s) - _same(FAR * step_s, wander_s, step_s)
     drifts = math.exp(-FAR * step_s / air_s) - math.exp(-FARTHEST * step_s / air_s)
     return replace(
         priors,
-        wander=between(priors.wander, *_grown(pairs[:2], squares[:2], (NEAR, FAR), within)),
-        air=between(priors.air, *_grown(pairs[1:], squares[1:], (FAR, FARTHEST), drifts)),
-        twin_share=between(priors.twin_share, of_means, len(means)),
+        wander=_of_growth(priors.wander, pairs[:2], squares[:2], (NEAR, FAR), within, fan_days),
+        air=_of_growth(priors.air, pairs[1:], squares[1:], (FAR, FARTHEST), drifts, fan_days),
+        twin_share=_between(priors.twin_share, of_means, len(means), fan_days),
     )
 
 
-def _grown(pairs: list[float], squares: list[float], apart: tuple[int, int], share: float) -> tuple[float, float]:
-    """Variance of which a share makes segments that are farther apart differ more, at the upper end of its standard
-    error; and the number of independent pairs. pairs, squares, apart: of the nearer and the farther ones."""
+def _of_growth(
+    prior: float, pairs: list[float], squares: list[float], apart: tuple[int, int], share: float, fan_days: float
+) -> float:
+    """Return the standard deviation of what makes segments that are farther apart differ more, by a share of its
+    variance. pairs, squares, apart: of the nearer and the farther ones.
+
+    Its variance is log-normal around the prior, and the growth is known with the error of two estimated variances: a
+    growth that noise hides says nothing against the prior.
+    """
     numbers = [number / distance for number, distance in zip(pairs, apart, strict=True)]
     if min(numbers) < 1.0:
-        return 0.0, 0.0
+        return prior
     near, far = (total / number / 2.0 for total, number in zip(squares, pairs, strict=True))
     error = math.sqrt(near**2 * 2.0 / numbers[0] + far**2 * 2.0 / numbers[1])
-    return (max(far - near, 0.0) + error) / share, min(numbers)
+    logs = np.linspace(-LARGEST_LOG, LARGEST_LOG, 401)
+    misfit = (far - near - share * prior**2 * np.exp(logs)) / error if error > 0.0 else np.zeros_like(logs)
+    density = -0.5 * (np.square(misfit) + np.square(logs) / POPULATION)
+    weights = np.exp(density - density.max())
+    log = float(weights @ logs / weights.sum())
+    if log < 0.0:
+        log *= POPULATION / (POPULATION + DAY / max(fan_days, 1e-9))
+    return prior * math.exp(0.5 * log)
 
 
 def _between(prior: float, variance: float, number: float, fan_days: float) -> float:

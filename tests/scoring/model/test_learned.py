@@ -66,6 +66,20 @@ def test_each_prior_follows_what_was_planted_and_narrows_where_there_is_less() -
     assert {name for name, value in vars(windy).items() if value != vars(of_population)[name]} == learned_ones
 
 
+def test_what_noise_hides_widens_no_prior_so_that_a_fan_that_is_slow_from_its_first_sample_has_an_alarm() -> None:
+    """A tray read once a second, whose readings scatter by a per cent: the air is not seen, and was taken for six."""
+    pairs, noise = np.array([600.0, 300.0, 75.0]), 0.01
+    priors = learned_priors([RunSums(np.full(3, 7200.0), np.zeros(3), pairs, 2.0 * pairs * noise**2)])
+    assert priors.air == pytest.approx(Priors().air, rel=0.3)
+    whole = running(FANS, 20.0, 0)
+    slow = replace(whole, measured_speed_rad_s=0.82 * whole.measured_speed_rad_s)
+    fans = made_fans(FANS)
+    decision = Decision(fans, BIN_NS, 0.1, 86_400.0, priors)
+    for one in Bins(BIN_NS, fans.top_rad_s, fans.reads_balance, None).take(slow):
+        decision.take(one)
+    assert decision.active.all()
+
+
 def test_the_order_of_runs_and_where_they_were_added_up_change_no_bit() -> None:
     runs = [sums_of(bins_of(30.0, seed, mean=0.05)) for seed in range(4)]
     shuffled = runs.copy()
