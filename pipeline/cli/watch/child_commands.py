@@ -20,20 +20,13 @@ from typing import Any, Self
 
 from fantwin.pipeline.acquisition.raw_samples import RawSamples
 from fantwin.pipeline.bus.session import join_bus
+from fantwin.pipeline.cli.watch.commission_state import RECORDING_ONLY
 from fantwin.pipeline.config.registry import RECORDER
 from fantwin.pipeline.config.settings import Config, TrayConfig
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.selftest.scratch_site import lines_of, started
 from fantwin.schemas.messages import Raw
 
-RECORDING_ONLY = (
-    *("--set", f"launcher.stages={json.dumps(['acquisition', 'resampler', 'recorder'])}"),
-    *("--set", "launcher.without=[]"),
-    *("--set", "launcher.shards={ recorder = 1 }"),
-    *("--set", "recorder.keep_days=0"),
-    *("--set", "recorder.keep_share_of_disk=1"),
-)
-"""the options of a site that only records: all trays in one recording, however much it takes of the disk"""
 SILENT_S = 60.0
 """without a sample, from the start of a recording on: the line is dead"""
 STANDARD_ERROR = 2

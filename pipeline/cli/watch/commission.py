@@ -27,6 +27,7 @@ from fantwin.pipeline.cli.options import (
 from fantwin.pipeline.cli.progress import EXIT_INTERRUPTED
 from fantwin.pipeline.cli.twins.data_options import check_writable
 from fantwin.pipeline.cli.watch.child_commands import Commands, Stopped
+from fantwin.pipeline.cli.watch.commission_state import Unfinished
 from fantwin.pipeline.cli.watch.commissioning import Commissioning, Plan, TrayWork
 from fantwin.pipeline.cli.watch.doctor import running_sessions
 from fantwin.pipeline.cli.watch.sweep import range_within
@@ -85,7 +86,8 @@ def commission(
 
     A tray that fails is left out: the others get their twins, but `fantwin up` is not started. Ctrl-C ends `commission`
     without further twins. Recordings stay, in folders `commissioned-N` of their own; the recorder's limits
-    do not touch them. With --json, `fantwin up` is not started.
+    do not touch them. The same command goes on with complete recordings of the last day, unless no twin could be made
+    of them. With --json, `fantwin up` is not started.
 
     Exit codes: 0 success; 1 at least one tray failed, and one line says why; 3 success, but data were lost while
     recording; 130 Ctrl-C. Once `fantwin up` is started, the exit code is that of `up`.
@@ -119,10 +121,11 @@ def commission(
             say(f"{config}: tray {each.name} keeps its twin {each.twin}")
     plan = Plan(options if sweep else None, rounds, 60.0 * minutes, 3600.0 * at_most_hours, false_alarms_per_day)
     commands = Commands(stop, say, to_standard_error=json_output)
-    commissioning = Commissioning(settings, configured, commands, works, plan)
-    _run(commissioning, works)
+    with Unfinished(settings.run_folder) as unfinished:
+        commissioning = Commissioning(settings, configured, commands, works, plan, unfinished)
+        _run(commissioning, works)
     for work in commissioning.left:
-        for fan in work.held:
+        for fan in work.so_far.held:
             say(
                 f"tray {work.name}, {fan} while it was calibrated: what it does at other commands is uncertain; "
                 "calibrate again later"
@@ -133,7 +136,7 @@ def commission(
         found |= {"recordings": list(map(str, commissioning.recordings)), "lost": commissioning.lost}
         typer.echo(json.dumps(found))
     if commissioning.failures:
-        raise UserError(f"{commissioning.failures}; recorded: {commissioning.recorded}")
+        raise UserError(f"{commissioning.failures}; recorded: {commissioning.recorded}{commissioning.how_to_go_on}")
     if watch and not json_output and not stop.is_set():
         say(f"fantwin up {shlex.join(configured)}")
         os.execv(FANTWIN[0], [*FANTWIN, "up", *configured])
@@ -194,12 +197,14 @@ def _run(commissioning: Commissioning, works: Sequence[TrayWork]) -> None:
     except Stopped:
         written = [work.name for work in works if work.entry]
         twins = f"twins were written of tray {', '.join(written)} only" if written else "no twin was written"
-        typer.echo(f"interrupted: {twins}; recorded until then: {commissioning.recorded or 'nothing'}", err=True)
+        recorded = f"recorded until then: {commissioning.recorded or 'nothing'}{commissioning.how_to_go_on}"
+        typer.echo(f"interrupted: {twins}; {recorded}", err=True)
         raise typer.Exit(EXIT_INTERRUPTED) from None
     except UserError as error:
         if not commissioning.recordings:
             raise
-        raise UserError(f"{error}; recorded until then: {commissioning.recorded}") from error
+        recorded = f"recorded until then: {commissioning.recorded}{commissioning.how_to_go_on}"
+        raise UserError(f"{error}; {recorded}") from error
 
 
 def _tray_as_json(work: TrayWork) -> dict[str, Any]:
@@ -209,7 +214,7 @@ def _tray_as_json(work: TrayWork) -> dict[str, Any]:
         "tray": work.name,
         "twin": str(work.twin),
         "entry": work.entry,
-        "held": work.held,
+        "held": work.so_far.held,
         "false_alarms_per_day": calibration.false_alarms_per_day,
         "is_target": calibration.is_target,
         "fan_hours": calibration.fan_hours,

@@ -8,7 +8,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from fantwin.pipeline.cli.watch.child_commands import RECORDING_ONLY, Commands, RecordingSite, Stopped
+from fantwin.pipeline.cli.watch.child_commands import Commands, RecordingSite, Stopped
+from fantwin.pipeline.cli.watch.commission_state import LOG, RECORDING_ONLY, TraySoFar, Unfinished
 from fantwin.pipeline.config.loading import write_twin
 from fantwin.pipeline.config.settings import Config, TrayConfig
 from fantwin.pipeline.errors import UserError
@@ -17,6 +18,8 @@ from fantwin.pipeline.learning.training_data import Part, read_training_data
 from fantwin.pipeline.replay.offline.healthy_runs import in_this_process
 
 SHOWN_EVERY_S = 60.0
+TRAINING, VALIDATION, CALIBRATION = "training", "validation", "calibration"
+"""purposes of recordings: validation sets the band, and with calibration, in ordinary operation, the limits"""
 
 
 @dataclass(frozen=True)
@@ -41,13 +44,7 @@ class TrayWork:
     tray: TrayConfig
     twin: Path
     """to write"""
-    training: list[Path] = field(default_factory=list)
-    """the parts of a recording"""
-    validation: list[Path] = field(default_factory=list)
-    """the same; it sets the band, and with `operation` the limits"""
-    operation: list[Path] = field(default_factory=list)
-    held: list[str] = field(default_factory=list)
-    """fans that hardly moved while the data for their limits were recorded"""
+    so_far: TraySoFar = field(default_factory=TraySoFar)
     entry: str = ""
     """the twin, as the configuration names it now; empty: it does not yet"""
     failure: str = ""
@@ -63,7 +60,13 @@ class Commissioning:
     """The steps, and what was recorded in them."""
 
     def __init__(
-        self, settings: Config, configured: list[str], commands: Commands, works: Sequence[TrayWork], plan: Plan
+        self,
+        settings: Config,
+        configured: list[str],
+        commands: Commands,
+        works: Sequence[TrayWork],
+        plan: Plan,
+        unfinished: Unfinished,
     ) -> None:
         """configured: the words that give a command this configuration. works: one for each tray that gets a twin."""
         self._settings = settings
@@ -71,6 +74,7 @@ class Commissioning:
         self._commands = commands
         self._works = works
         self._plan = plan
+        self._unfinished = unfinished
         self.recordings: list[Path] = []
         self.lost: dict[str, int] = {}
         """while recording, by stage"""
@@ -84,6 +88,12 @@ class Commissioning:
     def recorded(self) -> str:
         """The recordings, for people; empty if there is none."""
         return ", ".join(map(str, self.recordings))
+
+    @property
+    def how_to_go_on(self) -> str:
+        """That recordings are used by the next one, if any are."""
+        kept = any(self._unfinished.has(work.name) for work in self._works)
+        return "; the same command goes on after the recordings that are complete" if kept else ""
 
     @property
     def failures(self) -> str:
@@ -101,6 +111,8 @@ class Commissioning:
         """
         some = self._works if len(self._works) < len(self._settings.trays) else ()
         lines = [word for work in some for word in self._tray_words(work)]
+        for work in self._works:
+            self._take_up(work)
         self._commands.run("doctor", *self._configured, *RECORDING_ONLY, *lines, as_messages=True)
         if self._plan.sweep is None:
             self._record_ordinary_operation()
@@ -110,19 +122,31 @@ class Commissioning:
             with self._failing(work):
                 self._learn(work)
 
+    def _take_up(self, work: TrayWork) -> None:
+        """Go on with what an earlier one has recorded of a tray by the same settings and options."""
+        plan = self._plan
+        work.so_far = self._unfinished.of(work.name, f"{work.tray!r} {plan.sweep} {plan.rounds} {plan.operation_s}")
+        self.recordings += [path for path in work.so_far.files if path not in self.recordings]
+        if work.so_far.recorded:
+            self._commands.say(
+                f"tray {work.name}: {', '.join(work.so_far.recorded)} data were recorded in the last day and are used: "
+                f"{', '.join(map(str, work.so_far.files))} (to record again, delete {self._unfinished.file})"
+            )
+
     def _record_ordinary_operation(self) -> None:
         """The plant moves the fans of all trays."""
-        plan = self._plan
         first, later = ({work.name: OrdinaryOperation(work.tray) for work in self.left} for _ in range(2))
-        training = self._recorded(self.left, lambda site: self._operate(site, first, plan.at_most_s))
-        for work in self.left:
-            work.training = training
-            with self._failing(work):
-                _check_tachos(work)
-        validation, operation = (self._recorded(self.left, lambda site: self._operate(site, later)) for _ in range(2))
-        for work in self.left:
-            work.validation, work.operation = validation, operation
-            work.held = later[work.name].held()
+        if self._lacks(TRAINING):
+            self._record(self.left, TRAINING, lambda site: self._operate(site, first, self._plan.at_most_s))
+            for work in self.left:
+                with self._failing(work):
+                    self._check_tachos(work)
+        if self._lacks(CALIBRATION):
+            for purpose in (VALIDATION, CALIBRATION):
+                self._record(self.left, purpose, lambda site: self._operate(site, later))
+            for work in self.left:
+                work.so_far.held = later[work.name].held()
+                self._unfinished.keep(work.name, work.so_far)
 
     def _record_sweeps(self, options: list[str]) -> None:
         """Two sweeps of each tray, one tray after the other; then ordinary operation of all.
@@ -132,23 +156,27 @@ class Commissioning:
         """
         for work in self.left:
             with self._failing(work):
-                work.training = self._swept(work, options, self._plan.rounds)
-                _check_tachos(work)
-                work.validation = self._swept(work, options, 1)
-        seen = {work.name: OrdinaryOperation(work.tray) for work in self.left}
-        operation = self._recorded(self.left, lambda site: self._operate(site, seen))
-        for work in self.left:
-            work.operation = operation
+                if TRAINING not in work.so_far.recorded:
+                    self._sweep(work, TRAINING, options, self._plan.rounds)
+                    self._check_tachos(work)
+                if VALIDATION not in work.so_far.recorded:
+                    self._sweep(work, VALIDATION, options, 1)
+        if self._lacks(CALIBRATION):
+            seen = {work.name: OrdinaryOperation(work.tray) for work in self.left}
+            self._record(self.left, CALIBRATION, lambda site: self._operate(site, seen))
 
-    def _swept(self, work: TrayWork, options: list[str], rounds: int) -> list[Path]:
+    def _lacks(self, purpose: str) -> bool:
+        return not all(purpose in work.so_far.recorded for work in self.left)
+
+    def _sweep(self, work: TrayWork, purpose: str, options: list[str], rounds: int) -> None:
         words = ["command", "--sweep", *self._configured, *self._tray_words(work), *options, "--rounds", rounds]
-        return self._recorded([work], lambda site: self._commands.run(*words, site=site))
+        self._record([work], purpose, lambda site: self._commands.run(*words, site=site))
 
-    def _recorded(self, works: Sequence[TrayWork], during: Callable[[RecordingSite], None]) -> list[Path]:
-        """The parts of one recording, while something is done. works: the trays whose samples that takes."""
-        folder, trays = self._settings.run_folder, [work.tray for work in works]
-        folder.mkdir(parents=True, exist_ok=True)
-        site = RecordingSite(self._commands, self._settings, self._configured, folder / "commission.log", trays)
+    def _record(self, works: Sequence[TrayWork], purpose: str, during: Callable[[RecordingSite], None]) -> None:
+        """Make one recording of trays while something is done."""
+        self._unfinished.show(f"records {purpose} data of tray {', '.join(work.name for work in works)}")
+        trays = [work.tray for work in works]
+        site = RecordingSite(self._commands, self._settings, self._configured, self._settings.run_folder / LOG, trays)
         try:
             with site:
                 site.wait_for_samples()
@@ -159,7 +187,10 @@ class Commissioning:
                 self.lost[name] = self.lost.get(name, 0) + count
         lost = ", ".join(f"{name} {count}" for name, count in site.lost.items())
         self._commands.say(f"recorded {', '.join(map(str, site.recordings))}; lost: {lost or 'nothing'}")
-        return site.recordings
+        for work in works:
+            if not work.failure:
+                work.so_far.recorded[purpose] = site.recordings
+                self._unfinished.keep(work.name, work.so_far)
 
     def _operate(self, site: RecordingSite, seen: dict[str, OrdinaryOperation], at_most_s: float | None = None) -> None:
         """Record ordinary operation. seen: is given the samples, by tray. at_most_s: wait so long for all fans to have
@@ -197,17 +228,36 @@ class Commissioning:
                 )
 
     def _learn(self, work: TrayWork) -> None:
-        run, tray, twin = self._commands.run, self._tray_words(work), work.twin
+        run, tray, twin, recorded = self._commands.run, self._tray_words(work), work.twin, work.so_far.recorded
         rate = f"{self._plan.false_alarms_per_day:g}"
+        self._unfinished.show(f"makes the twin of tray {work.name}")
         try:
-            run("train", *work.training, "--validate", *work.validation, *tray, "-o", twin)
-            healthy = [*work.validation, *work.operation]
-            run("calibrate", twin, *healthy, *tray, "--false-alarms-per-day", rate, "--extrapolate")
+            with self._making_use(work):
+                run("train", *recorded[TRAINING], "--validate", *recorded[VALIDATION], *tray, "-o", twin)
+                healthy = [*recorded[VALIDATION], *recorded[CALIBRATION]]
+                run("calibrate", twin, *healthy, *tray, "--false-alarms-per-day", rate, "--extrapolate")
         except (Stopped, UserError):
             twin.unlink(missing_ok=True)
             raise
         work.entry = write_twin(self._settings, work.name, twin)
+        self._unfinished.forget(work.name)
         self._commands.say(f'{self._settings.path}: tray {work.name} has twin = "{work.entry}" now')
+
+    def _check_tachos(self, work: TrayWork) -> None:
+        """Raises UserError if the readings for training are not those of the declared tachos."""
+        recordings = work.so_far.recorded[TRAINING]
+        with self._making_use(work):
+            if hints := read_training_data(recordings, Part(work.name), in_this_process).hints:
+                raise UserError(f"{hints[0]}: declare the tacho that was found, then start again")
+
+    @contextmanager
+    def _making_use(self, work: TrayWork) -> Iterator[None]:
+        """Around a use of the recordings of a tray: what has failed with them would fail again."""
+        try:
+            yield
+        except UserError:
+            self._unfinished.forget(work.name)
+            raise
 
     def _tray_words(self, work: TrayWork) -> list[str]:
         """The option of a command that names the tray, where there are several."""
@@ -226,9 +276,3 @@ class Commissioning:
         if not self.left:
             raise UserError(self.failures)
         self._commands.say(f"tray {work.name} failed: {reason}; going on without it")
-
-
-def _check_tachos(work: TrayWork) -> None:
-    """Raises UserError if the readings for training are not those of the declared tachos."""
-    if hints := read_training_data(work.training, Part(work.name), in_this_process).hints:
-        raise UserError(f"{hints[0]}: declare the tacho that was found, then start again")

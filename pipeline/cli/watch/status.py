@@ -16,6 +16,7 @@ from rich.text import Text
 from fantwin.pipeline.bus.session import Bus, join_bus
 from fantwin.pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption, SetOption
 from fantwin.pipeline.cli.printing import STYLES, duration_text, show, table_of
+from fantwin.pipeline.cli.watch.commission_state import RECORDING_ONLY, commissioning_now
 from fantwin.pipeline.cli.watch.wear import show_wear_of_site
 from fantwin.pipeline.config.registry import STAGES
 from fantwin.pipeline.config.roles import READERS, role_names, roles_of
@@ -66,6 +67,8 @@ def status(
 
     Below the table are the counters of what was lost and refused; --json has all counters.
 
+    While `fantwin commission` runs on this host, only the stages that record are expected.
+
     Exit code 1 if a stage is missing, gone, silent, starved or late or has a problem, such as a recorder that cannot
     write, or if a fan is not judged though the configuration has a scorer; 3 if a stage has lost data.
 
@@ -90,22 +93,32 @@ def status(
         return
     if trays or shard:
         raise UsageError("--trays and --shard need --stage: which process?")
+    recording = load_for_any_host(config, [*(overrides or ()), *RECORDING_ONLY[1::2]], stages=())
+
+    def expected() -> tuple[Config, str]:
+        """What should run now, and what a commissioning does."""
+        doing = commissioning_now(settings.run_folder)
+        return recording if doing else settings, doing
+
     with join_bus(settings, listens=False) as bus:
         of_bus = _bus_lines(bus)
         watcher = SiteWatcher(bus, settings.site, roles_of(settings), settings.trays, has_scores=True)
         if once or json_output or not sys.stdout.isatty():
-            _listen(watcher, settings, stop)
+            wanted, doing = expected()
+            _listen(watcher, wanted, stop)
             watcher.ask_for_past_alarms()
-            _require_a_stage(watcher, settings)
-            found = as_json(watcher, settings) if json_output else {}
-            show(found, stage_table(watcher, settings, of_bus), json_output=json_output)
+            _require_a_stage(watcher, wanted, doing)
+            found = as_json(watcher, wanted, doing) if json_output else {}
+            show(found, stage_table(watcher, wanted, of_bus, doing), json_output=json_output)
         else:
             watcher.ask_for_past_alarms()
             with Live(console=Console(), refresh_per_second=4) as live:
                 while not stop.wait(0.25):
-                    live.update(stage_table(watcher, settings, of_bus))
-            _require_a_stage(watcher, settings)
-        states = watcher.states(process_list(settings))
+                    wanted, doing = expected()
+                    live.update(stage_table(watcher, wanted, of_bus, doing))
+            wanted, doing = expected()
+            _require_a_stage(watcher, wanted, doing)
+        states = [] if doing and not watcher.alive() else watcher.states(process_list(wanted))
         if any(state.is_fault or state.problem for state in states) or not_judged(states, watcher.model):
             raise typer.Exit(1)
         if any(watcher.losses().values()):
@@ -141,8 +154,9 @@ def _listen(watcher: SiteWatcher, config: Config, stop: threading.Event) -> None
             return
 
 
-def _require_a_stage(watcher: SiteWatcher, config: Config) -> None:
-    if not watcher.stages():
+def _require_a_stage(watcher: SiteWatcher, config: Config, doing: str) -> None:
+    """doing: what a commissioning does, which at times runs no stage."""
+    if not watcher.stages() and not doing:
         raise UserError(f"{_no_stage(config)}; is `fantwin up -c {config.path}` running?")
 
 
@@ -159,11 +173,13 @@ def _bus_lines(bus: Bus) -> list[Text]:
     return [line, *(Text(each, style="red") for each in [bus.certificate_warning()] if each)]
 
 
-def stage_table(watcher: SiteWatcher, config: Config, of_bus: Sequence[Text] = ()) -> Group:
+def stage_table(watcher: SiteWatcher, config: Config, of_bus: Sequence[Text] = (), doing: str = "") -> Group:
     """The page for people: a row for each stage, then problems, then alarms, then the fans that are not judged.
 
-    of_bus: lines on the bus itself.
+    of_bus: lines on the bus itself. doing: what a commissioning does.
     """
+    if doing and not watcher.alive():
+        return Group(*of_bus, _commissioning(doing))
     columns = ("up", "in /s", "out /s", "p50 ms", "p99 ms", "lost")
     table = table_of(("stage", "state"), columns, title="stages")
     lost = watcher.losses()
@@ -185,7 +201,9 @@ def stage_table(watcher: SiteWatcher, config: Config, of_bus: Sequence[Text] = (
     current = [each for each in as_judged(watcher.current_alarms(), lacking) if is_listed(each.newest)]
     words_now = watcher.model.words_now([Fan(each.newest.header.tray, each.newest.fan) for each in current])
     alarms = [_alarm_line(each, now) for each, now in zip(current, words_now, strict=True)]
-    if not _has_scorer(states):
+    if doing:
+        missing = [_commissioning(doing)]
+    elif not _has_scorer(states):
         missing = [Text("no fan is judged: the configuration has no scorer", style="yellow")]
     elif not any(state.view and state.view.alive and state.view.health.stage == "scorer" for state in states):
         missing = [Text("alarms unknown: no scorer is alive", style="red")]
@@ -196,6 +214,10 @@ def stage_table(watcher: SiteWatcher, config: Config, of_bus: Sequence[Text] = (
     return Group(
         *([table] if watcher.stages() else []), *of_bus, *notes, *problems, *alarms, *missing, *resting, *no_alarms
     )
+
+
+def _commissioning(doing: str) -> Text:
+    return Text(f"commissioning: {doing}; no fan is judged before `fantwin up`", style="yellow")
 
 
 def _has_scorer(states: Sequence[StageState]) -> bool:
@@ -245,11 +267,12 @@ def _alarm_line(current: CurrentAlarm, now: str) -> Text:
     return text.append(f"; {about}") if about else text
 
 
-def as_json(watcher: SiteWatcher, config: Config) -> dict[str, object]:
+def as_json(watcher: SiteWatcher, config: Config, doing: str = "") -> dict[str, object]:
     """The same for machines (`--json`)."""
     states, lost = watcher.states(process_list(config)), watcher.losses()
     lacking = not_judged(states, watcher.model)
     return {
+        "commissioning": doing,
         "stages": [_state_as_json(state, lost.get(state.label, 0)) for state in states],
         "alarms": [current.as_json() for current in as_judged(watcher.current_alarms(), lacking)],
         "not_judged": [each.as_json() for each in lacking],

@@ -10,7 +10,7 @@ import re
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from typing import Any
 
@@ -21,9 +21,11 @@ from rich.console import Console
 from fantwin.pipeline.bus.publisher import Publisher
 from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.cli.watch import status as status_command
+from fantwin.pipeline.cli.watch.commission_state import RECORDING_ONLY, Unfinished
 from fantwin.pipeline.cli.watch.status import as_json, loss_lines, not_judged, stage_table
 from fantwin.pipeline.config.loading import load_config
 from fantwin.pipeline.config.settings import BusConfig
+from fantwin.pipeline.config.shards import process_list
 from fantwin.pipeline.site.site_watcher import SiteWatcher
 from fantwin.pipeline.site.stage_states import StageState, StageView, Word
 from fantwin.schemas.codec import encode, type_name
@@ -305,3 +307,51 @@ def test_into_a_pipe_a_site_without_stages_is_one_line(endpoint, monkeypatch):
     monkeypatch.setattr(status_command, "_LISTEN_MAX_S", 0.3)
     words = ("status", "-c", DEMO / "demo.toml", "--once", "--set", f"bus.endpoint='{endpoint}'")
     assert f"no stage of site 'demo' answers at {endpoint}" in error_of(*words)
+
+
+def test_while_fans_are_commissioned_only_the_stages_that_record_are_expected(endpoint, tmp_path, monkeypatch):
+    monkeypatch.setattr(status_command, "_LISTEN_S", 0.5)
+    monkeypatch.setattr(status_command, "_LISTEN_MAX_S", 1.0)
+    here = (f"bus.endpoint='{endpoint}'", f"run_folder='{tmp_path}'")
+    words = ("-c", DEMO / "demo.toml", *(word for each in here for word in ("--set", each)))
+    config = load_config(DEMO / "demo.toml", [*here, *RECORDING_ONLY[1::2]])
+    healths = [
+        made_messages.health(row.stage, row.instance, f"{row.stage}-{row.instance}-1") for row in process_list(config)
+    ]
+    stop = threading.Event()
+
+    def beat(bus: Bus, of: Health) -> None:
+        key, sequence = health_key(SITE, of.stage, of.instance), itertools.count()
+        publisher = bus.publisher(key, BY_NAME["health"], type_name(Health), of.header.producer)
+        while not stop.wait(0.1):
+            now = time.time_ns()
+            publisher.put(encode(replace(of, t_ns=now, header=Header(of.header.producer, next(sequence), ""))))
+
+    def asked(*more: str) -> tuple[int, str]:
+        done = fantwin_here("status", *words, *more)
+        return done.exit_code, done.stdout
+
+    with ExitStack() as running:
+        unfinished = running.enter_context(Unfinished(tmp_path))
+        unfinished.show("makes the twin of tray tray1")
+        line = "commissioning: makes the twin of tray tray1; no fan is judged before `fantwin up`\n"
+        assert asked() == (0, line), "it runs no stage meanwhile"
+        with Bus(BusConfig(endpoint=endpoint)) as bus:
+            for each in healths:
+                bus.declare_alive(alive_key(SITE, each.stage, each.instance))
+            beats = [threading.Thread(target=beat, args=(bus, each)) for each in healths]
+            for each in beats:
+                each.start()
+            try:
+                code, text = asked("--json")
+                running.close()
+                after, _ = asked()
+            finally:
+                stop.set()
+                for each in beats:
+                    each.join()
+    shown = json.loads(text)
+    states = [(each["stage"], each["state"]) for each in shown["stages"]]
+    assert (code, states) == (0, [(name, "ok") for name in ("acquisition", "resampler", "recorder")])
+    assert shown["commissioning"] == "makes the twin of tray tray1"
+    assert after == 1, "afterwards all stages are expected"
