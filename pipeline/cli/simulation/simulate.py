@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import time as clock
 from collections.abc import Callable
 from contextlib import closing
@@ -142,7 +143,7 @@ def serve_line(
         typer.echo(f"{fans_on} {link or line.port}: {protocol}, speeds in {speed_unit}", err=err)
         if wait:
             wait_for_reader(line, protocol, stop)
-        return play(device, line, protocol, RAD_S_PER_UNIT[speed_unit], stop, on_start)
+        return play(device, line, protocol, RAD_S_PER_UNIT[speed_unit], stop, on_start, say_late())
 
 
 def serve_hwmon(tray: SimulatedTray, root: Path, chip: str, *, err: bool) -> PlaybackCounts:
@@ -151,7 +152,28 @@ def serve_hwmon(tray: SimulatedTray, root: Path, chip: str, *, err: bool) -> Pla
     with closing(HwmonTree(root, chip, tray.fans)) as tree:
         faults = f"echo tacho-stuck:fan=0 > {root / FAULT_FILE}"
         typer.echo(f"{tray.fans} fans of {chip} in {root}; faults: {faults}", err=err)
-        return play_hwmon(tray, tree, stop, InjectedFaults(tray, root).follow)
+        return play_hwmon(tray, tree, stop, InjectedFaults(tray, root).follow, say_late())
+
+
+TOO_LATE_S, SAID_EVERY_S = 1.0, 60.0
+
+
+def say_late() -> Callable[[float], None]:
+    """What takes the lateness of late samples, and says, at most once a minute, that the simulation is far behind."""
+    said_s = -math.inf
+
+    def note(lateness_s: float) -> None:
+        nonlocal said_s
+        now_s = clock.monotonic()
+        if lateness_s > TOO_LATE_S and now_s - said_s >= SAID_EVERY_S:
+            said_s = now_s
+            typer.echo(
+                f"{lateness_s:.1f} s late: this computer is too slow for the simulation now, and what is learned of it "
+                "meanwhile is wrong; end other programs, or simulate fewer fans or a lower --set rate_hz",
+                err=True,
+            )
+
+    return note
 
 
 RATE_HZ = 20.0

@@ -198,10 +198,12 @@ class PlaybackCounts:
     bytes_unread: int = 0
     """sent, but unread when the line was closed"""
 
-    def note_lateness(self, lateness_s: float) -> None:
-        """A sample is sent this much after its time."""
-        self.samples_late += lateness_s > LATE_S
+    def note_lateness(self, lateness_s: float, on_late: Callable[[float], Any]) -> None:
+        """A sample is sent this much after its time. on_late: called if that is late."""
         self.worst_lateness_s = max(self.worst_lateness_s, lateness_s)
+        if lateness_s > LATE_S:
+            self.samples_late += 1
+            on_late(lateness_s)
 
 
 def wait_for_reader(line: PseudoTerminal, protocol: wire.Protocol, stop: threading.Event) -> None:
@@ -225,12 +227,14 @@ def play(
     rad_s_per_unit: float,
     stop: threading.Event,
     on_start: Callable[[int], Any] = lambda _start_ns: None,
+    on_late: Callable[[float], Any] = lambda _lateness_s: None,
 ) -> PlaybackCounts:
     """Send every sample at its time, by a schedule that does not drift, until the last one or until `stop` is set; in
     the binary form also once a second what the device has counted.
 
-    rad_s_per_unit: unit of speed on the line. on_start: called with the epoch time of t_s = 0, ns. After a delay of the
-    process, missed samples are sent as fast as possible; they keep their times.
+    rad_s_per_unit: unit of speed on the line. on_start: called with the epoch time of t_s = 0, ns. on_late: called with
+    the lateness of each late sample, s. After a delay of the process, missed samples are sent as fast as possible; they
+    keep their times.
     """
     played = PlaybackCounts()
     decoder = wire.Decoder(protocol, device.fans, end="device")
@@ -244,7 +248,7 @@ def play(
         _receive_until(start_s + due_s, device, line, decoder, rad_s_per_unit, stop, played, counters)
         if stop.is_set():
             break
-        played.note_lateness(time.monotonic() - start_s - due_s)
+        played.note_lateness(time.monotonic() - start_s - due_s, on_late)
         sample = device.take()
         if sample.lost:
             played.samples_dropped += 1

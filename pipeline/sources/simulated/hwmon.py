@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -139,12 +139,16 @@ def play_hwmon(
     tree: HwmonTree,
     stop: threading.Event,
     before_sample: Callable[[], None] = lambda: None,
+    on_late: Callable[[float], Any] = lambda _lateness_s: None,
 ) -> PlaybackCounts:
-    """Run the fans in real time until the last sample or until `stop` is set. before_sample: called before each."""
+    """Run the fans in real time until the last sample or until `stop` is set.
+
+    before_sample: called before each. on_late: as of `play`.
+    """
     played = PlaybackCounts(start_ns=time.time_ns())
     start_s = time.monotonic()
     while (due_s := device.due_s()) is not None and not stop.wait(max(0.0, start_s + due_s - time.monotonic())):
-        played.note_lateness(time.monotonic() - start_s - due_s)
+        played.note_lateness(time.monotonic() - start_s - due_s, on_late)
         before_sample()
         duty, automatic = tree.commands()
         device.release(automatic)

@@ -4,19 +4,23 @@ from __future__ import annotations
 
 import threading
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from fantwin.pipeline.cli.simulation import simulate
 from fantwin.pipeline.cli.simulation.simulate import InjectedFaults, tachos_of
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.sources.hwmon.config import HwmonConfig
 from fantwin.pipeline.sources.hwmon.source import HwmonSource
+from fantwin.pipeline.sources.simulated import hwmon
 from fantwin.pipeline.sources.simulated.hwmon import HwmonTree, play_hwmon
 from fantwin.pipeline.sources.source import Reading, SourceContext
 from fantwin.schemas.tacho import Tacho
 from fantwin.simulation.tacho import TachoSettings
 from fantwin.simulation.tray import SimulatedTray, TraySettings
+from tests.support.fantwin_command import fantwin
 
 FAST = Tacho(kind="average", window_s=0.05)
 
@@ -59,6 +63,27 @@ def test_a_driver_drives_its_fans_until_they_are_taken_over(tmp_path: Path) -> N
     assert int((root / "hwmon0" / "pwm1_enable").read_text()) == 2, "the profile of the driver goes on"
     tree.close()
     assert not root.exists()
+
+
+def test_a_computer_that_is_too_slow_for_it_is_said_when_it_is_a_second_late_and_once_a_minute(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A sample of 0.05 s takes 0.1 s."""
+
+    class SlowHost(_Stepped):
+        def wait(self, timeout: float | None = None) -> bool:
+            host.now_s += 0.1
+            return super().wait(timeout)
+
+    host = SimpleNamespace(now_s=0.0, time_ns=lambda: 0, monotonic=lambda: host.now_s)
+    monkeypatch.setattr(hwmon, "time", host)
+    monkeypatch.setattr(simulate, "clock", host)
+    monkeypatch.setattr(simulate, "stop_on_signals", lambda: SlowHost(1300))
+    done = fantwin("simulate", "--hwmon", tmp_path / "hw", "--fans", 1, "--set", "chip=emc2305")
+    late = [
+        line.partition(" s late: this computer is too slow")[0] for line in done.stderr.splitlines() if "late" in line
+    ]
+    assert late == ["1.1", "31.1", "61.1"], done.stderr
 
 
 def test_a_command_is_not_written_over_by_the_driver_that_has_just_looked(tmp_path: Path) -> None:
