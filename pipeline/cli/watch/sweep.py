@@ -76,11 +76,11 @@ def sweep(
             raise UserError(f"another sweep moves the fans of tray {chosen.name}: wait until it has ended")
         bus.declare_alive(key)
         at_end = {fan: float(before[fan]) if safe is None else safe for fan in numbers}
-        left_at = _in_words(chosen, at_end)
+        left_at = f"the commands {'they had before' if safe is None else 'of --safe'}: {_in_words(chosen, at_end)}"
         progress(_range_in_words(chosen, lowest, highest))
         if low is None and lowest > chosen.command_min:
             progress(f"the lowest command should keep fans turning; --low {chosen.command_min:g} uses the whole range")
-        progress(f"at the end and after Ctrl-C the fans get these commands: {left_at}")
+        progress(f"at the end and after Ctrl-C the fans get {left_at}")
         is_stopped, constants_s, ended = False, dict[int, float](), ""
         try:
             constants_s = Excitation(line, numbers, lowest, highest, rounds, progress, chosen.names).run()
@@ -88,14 +88,14 @@ def sweep(
             is_stopped = True
         except UserError as error:
             ended = f"the sweep has ended: {error}"
-            raise UserError(f"{ended}; the fans are left at these commands: {left_at}") from error
+            raise UserError(f"{ended}; the fans are left at {left_at}") from error
         finally:
             _leave(line, chosen, at_end, ended)
     known = {str(fan): value if math.isfinite(value) else None for fan, value in constants_s.items()}
     found = {"tray": chosen.name, "names": list(chosen.names.names), "time_constants_s": known, "steps": steps}
     found |= {"left_at": {str(fan): value for fan, value in at_end.items()}, "stopped": is_stopped}
     end = "stopped" if is_stopped else "done"
-    show(found, f"{end}; the fans are left at these commands: {left_at}", json_output=json_output)
+    show(found, f"{end}; the fans are left at {left_at}; `fantwin command` sets others", json_output=json_output)
     if is_stopped:
         raise typer.Exit(1)
 

@@ -5,8 +5,9 @@ fans, in simulated time.
 from __future__ import annotations
 
 import json
+import math
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -92,8 +93,10 @@ class SweptTray(FirstOrderFans):
             super().send(values)
 
 
-def swept_by_command(tray: SweptTray, monkeypatch: pytest.MonkeyPatch) -> str:
-    """The error of the command; the bus is left out."""
+SWEEP = ("command", "--sweep", "-c", DEMO / "demo.toml", "--fans", "0,1,2,3,4,5", "--rounds", "1")
+
+
+def without_bus(tray: SweptTray, monkeypatch: pytest.MonkeyPatch) -> None:
 
     class NoBus:
         def __enter__(self) -> NoBus:
@@ -108,12 +111,23 @@ def swept_by_command(tray: SweptTray, monkeypatch: pytest.MonkeyPatch) -> str:
 
     monkeypatch.setattr(sweep_module, "join_bus", lambda *_, **__: NoBus())
     monkeypatch.setattr(sweep_module, "_BusLine", lambda *_: tray)
-    return error_of("command", "--sweep", "-c", DEMO / "demo.toml", "--fans", "0,1,2,3,4,5", "--rounds", "1")
+
+
+@pytest.mark.parametrize(("safe", "of", "value"), [((), "they had before", 0.4), (("--safe", 0.7), "of --safe", 0.7)])
+def test_it_says_why_the_fans_are_left_where_they_are(
+    safe: Sequence[object], of: str, value: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    without_bus(SweptTray(swept_s=math.inf), monkeypatch)
+    lines = fantwin(*SWEEP, *safe).stdout.splitlines()
+    commands = f"the commands {of}: {', '.join(f'fan {fan} {value}' for fan in range(6))}"
+    assert f"at the end and after Ctrl-C the fans get {commands}" in lines
+    assert lines[-1] == f"done; the fans are left at {commands}; `fantwin command` sets others"
 
 
 def test_one_fan_that_refuses_its_command_keeps_no_other_from_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
     tray = SweptTray(lambda fan: "unit 1 refuses 97" if fan == 4 else "")
-    error = swept_by_command(tray, monkeypatch)
+    without_bus(tray, monkeypatch)
+    error = error_of(*SWEEP)
     assert list(tray.command) == [0.4, 0.4, 0.4, 0.4, tray.command[4], 0.4]
     assert tray.command[4] != 0.4
     by_hand = "THESE FANS KEEP THE LAST COMMAND; send these by hand: fan 4 0.4 (unit 1 refuses 97); "
@@ -123,5 +137,6 @@ def test_one_fan_that_refuses_its_command_keeps_no_other_from_its_own(monkeypatc
 def test_without_acquisition_all_fans_are_named_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     tray = SweptTray()
     tray.is_gone = True
-    error = swept_by_command(tray, monkeypatch)
+    without_bus(tray, monkeypatch)
+    error = error_of(*SWEEP)
     assert "fan 5 0.4 (no acquisition of tray tray1 received the command); the sweep has ended: no acq" in error
