@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated
@@ -13,8 +13,10 @@ import typer
 from fantwin.pipeline.cli.options import DEFAULT_CONFIG, JsonOption
 from fantwin.pipeline.cli.printing import show
 from fantwin.pipeline.cli.progress import working
+from fantwin.pipeline.cli.watch.next_step import next_commands
 from fantwin.pipeline.errors import UsageError, UserError
 from fantwin.pipeline.files import write_whole
+from fantwin.pipeline.launch.this_host import load_for_any_host
 from fantwin.pipeline.sources.found import Found, free_name
 from fantwin.pipeline.sources.hwmon.config import ROOT
 from fantwin.pipeline.sources.hwmon.discovery import discover_hwmon
@@ -103,7 +105,7 @@ def init(
         raise UserError(f"{config}: exists and was not changed: name another file with -c, or remove it")
     if trays:
         write_whole(config, "\n".join(['site = "site"\n', *(each.toml for each in trays)]).encode(), "; choose with -c")
-    following = [_next(trays, config)] if trays else []
+    following = [command for command, _ in next_commands(load_for_any_host(config, stages=()))] if trays else []
     following += [each.next_command for each in found_logs]
     lines = [
         *(f"{each.title}: {line}" for each in trays for line in (*each.notes, *each.missing)),
@@ -170,12 +172,3 @@ def _asked(root: Path) -> Chosen:
         Path(password) if password else None,
         Path(logs) if logs else None,
     )
-
-
-def _next(trays: Sequence[Found], config: Path) -> str:
-    """The command that comes after this one."""
-    named = "" if config == DEFAULT_CONFIG else f" -c {config}"
-    if any(each.kind != "hwmon" for each in trays):
-        return f"fantwin doctor{named}"
-    is_writable = all(each.tray["source"].get("writable") for each in trays)
-    return f"fantwin commission{named}{' --sweep' if is_writable else ''}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 
 import typer
@@ -35,13 +36,23 @@ def _lines(path: Path) -> tuple[str, ...]:
     if _runs(config):
         return (f"site {config.site!r} runs; next: fantwin status, fantwin alarms",)
     lacking = [tray.name for tray in config.trays if not _has_twin(tray, config)]
+    what = f"no twin yet of tray {', '.join(lacking)}" if lacking else "every tray has a twin"
+    nexts = (f"next: {command}  ({why})" for command, why in next_commands(config))
+    learns = ("or: fantwin up  (learns it while the plant moves the fans)",) if lacking else ()
+    return (f"{path}: site {config.site!r}, {what}", *nexts, *learns)
+
+
+def next_commands(config: Config) -> list[tuple[str, str]]:
+    """What to type, one after the other, so that the fans of a configuration are watched; and why."""
+    named = "" if config.path == DEFAULT_CONFIG else f" -c {shlex.quote(str(config.path))}"
+    lacking = [tray.source for tray in config.trays if not _has_twin(tray, config)]
     if not lacking:
-        return (f"{path}: site {config.site!r}, every tray has a twin; next: fantwin up",)
-    what = f"{path}: site {config.site!r}, no twin yet of tray {', '.join(lacking)}"
-    return (
-        f"{what}; next: fantwin commission  (records healthy fans and makes it)",
-        "or: fantwin up  (learns it while the plant moves the fans)",
-    )
+        return [(f"fantwin up{named}", "watches the fans")]
+    doctor = (f"fantwin doctor{named}", "shows what the devices send: are the units right?")
+    takes_commands = not any(source.why_no_commands for source in lacking)
+    moved = (" --sweep", "moves healthy fans") if takes_commands else ("", "records healthy fans that the plant moves")
+    commission = (f"fantwin commission{named}{moved[0]}", f"{moved[1]}, makes their twin, and watches them")
+    return [*([doctor] if any(source.kind != "hwmon" for source in lacking) else ()), commission]
 
 
 def _has_twin(tray: TrayConfig, config: Config) -> bool:

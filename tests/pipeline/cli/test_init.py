@@ -21,7 +21,7 @@ from fantwin.pipeline.sources.hwmon.config import HwmonConfig
 from fantwin.pipeline.sources.redfish.config import RedfishConfig
 from fantwin.pipeline.sources.serial.config import SerialConfig
 from fantwin.schemas.wire import Protocol, Sample, encode
-from tests.support.fantwin_command import error_of, fantwin, usage_error_of
+from tests.support.fantwin_command import as_typed, error_of, fantwin, usage_error_of
 from tests.support.hwmon_trees import add_chip, board
 from tests.support.redfish_server import Controller, redfish_server
 from tests.support.written_logs import write_ulog
@@ -77,6 +77,8 @@ def test_the_fans_of_this_computer_are_a_configuration_that_loads_and_the_next_c
     assert (done.exit_code, found["written"], found["next"]) == (0, "fantwin.toml", ["fantwin commission --sweep"])
     assert [tray.name for tray in trays(file)] == ["nct6798", "thinkpad"]
     assert all(isinstance(tray.source, HwmonConfig) and tray.source.writable for tray in trays(file))
+    _, said = as_typed().stdout.splitlines()[:2]
+    assert said.startswith("next: fantwin commission --sweep  ("), "as init has said"
     before = file.read_bytes()
     exists = "fantwin.toml: exists and was not changed: name another file with -c, or remove it"
     assert error_of("init", "--root", root, "--hwmon") == exists
@@ -94,7 +96,8 @@ def test_the_device_at_a_serial_port_is_heard(
 ) -> None:
     with device(protocol, speed) as port:
         done = fantwin("init", "--serial", port)
-    assert (done.exit_code, done.stdout.splitlines()[-1]) == (0, "next: fantwin doctor"), done.output
+    following = done.stdout.splitlines()[-2:]
+    assert (done.exit_code, following) == (0, ["next: fantwin doctor", "next: fantwin commission --sweep"]), done.output
     (tray,) = trays(file)
     assert tray.source == SerialConfig(port=port, protocol=protocol)
     assert (tray.fans, tray.speed_unit, tray.command_max) == (3, unit, command_max)
@@ -112,7 +115,8 @@ def test_a_silent_port_is_a_guess_that_says_so(file: Path, monkeypatch: pytest.M
 def test_the_fans_of_a_controller_are_named_as_it_names_them(file: Path) -> None:
     with redfish_server(Controller(is_new=True)) as url:
         done = fantwin("init", "--redfish", url, "--redfish", url)
-    assert (done.exit_code, done.stdout.splitlines()[-1]) == (0, "next: fantwin doctor"), done.output
+    following = done.stdout.splitlines()[-2:]
+    assert (done.exit_code, following) == (0, ["next: fantwin doctor", "next: fantwin commission"]), done.output
     one, other = trays(file)
     assert (one.name, other.name, one.fans) == ("127-0-0-1", "127-0-0-1-2", 2)
     assert isinstance(one.source, RedfishConfig) and one.source.fans == ("FAN1", "FAN2")

@@ -38,15 +38,19 @@ def test_each_state_of_this_computer_has_its_next_command(folder: Path, endpoint
     assert "unknown key 'tray.0.twinn'" in wrong and correct.startswith("next: correct it; fantwin doctor")
 
     file.write_text(site)
-    first, second = said()
-    assert first.startswith("fantwin.toml: site 'hall', no twin yet of tray cpu; next: fantwin commission")
-    assert second.startswith("or: fantwin up")
+    first, second, third, last = said()
+    assert first == "fantwin.toml: site 'hall', no twin yet of tray cpu"
+    assert second.startswith("next: fantwin doctor  ("), "what a line sends is not known"
+    assert third.startswith("next: fantwin commission --sweep  (") and last.startswith("or: fantwin up")
+
+    file.write_text(site.replace('port = "p"', 'source = { kind = "push" }'))
+    assert said()[2].startswith("next: fantwin commission  ("), "it takes no commands"
 
     file.write_text(f'{site}twin = "fan.onnx"\n')
-    ready = "fantwin.toml: site 'hall', every tray has a twin; next: fantwin up"
-    assert said() == [ready]
+    ready = ["fantwin.toml: site 'hall', every tray has a twin", "next: fantwin up  (watches the fans)"]
+    assert said() == ready
 
     with Bus(BusConfig(endpoint=endpoint)) as bus:
-        assert said() == [ready], "who listens there is of another site"
+        assert said() == ready, "who listens there is of another site"
         bus.declare_alive(Session.of_this_process("scorer", Shard("all", ()), 1, "scorer-all-1").key("hall"))
         assert said() == ["site 'hall' runs; next: fantwin status, fantwin alarms"]
