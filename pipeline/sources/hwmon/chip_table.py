@@ -26,6 +26,7 @@ class Chip:
         note: what else to know, for `fantwin init`.
         pwm_is_known_after_write: `pwmN` reads 0 until a program has set it.
         automatic: what is written to `pwmN_enable` to give the fan back, where that file cannot be read.
+        lowest_rpm: below it, `fanN_input` is 0.
     """
 
     pattern: str
@@ -34,6 +35,7 @@ class Chip:
     note: str = ""
     pwm_is_known_after_write: bool = False
     automatic: int | None = None
+    lowest_rpm: int | None = None
 
 
 def _held(update_s: float) -> Tacho:
@@ -60,7 +62,8 @@ CHIPS: tuple[Chip, ...] = (
         "emc230[1235]",
         "drivers/hwmon/emc2305.c",
         _held(REVOLUTION_S),
-        "reads 0 below 960 rpm; with thermal zones the kernel may keep a higher pwm than the one written",
+        "with thermal zones the kernel may keep a higher pwm than the one written",
+        lowest_rpm=960,
     ),
     Chip(
         "max31790",

@@ -61,6 +61,8 @@ def _of_chip(chip: ChipFolder, chips: Sequence[ChipFolder], root: Path, names: s
         f"fan {number} is fan{fan}_input{_label(chip, fan)}: {readings[fan]} rpm" for number, fan in enumerate(fans)
     ]
     notes.append(f"measures {row.tacho} ({row.source})" if row and row.tacho else _unknown(chip.name))
+    if row and row.lowest_rpm and not any(0 < (rpm or 0) < row.lowest_rpm for rpm in readings.values()):
+        notes.append(f"reads 0 below {row.lowest_rpm} rpm")
     if row and row.note:
         notes.append(row.note)
     source: dict[str, Any] = {"kind": "hwmon", "chip": chip_words(chip, chips)}

@@ -42,6 +42,13 @@ def test_each_chip_with_fans_is_a_tray_that_reads_what_is_there(root: Path) -> N
     assert any("not known" in note for note in found[2].notes)
 
 
+@pytest.mark.parametrize(("rpm", "is_said"), [(335, False), (1500, True)])
+def test_a_limit_of_the_driver_that_a_reading_contradicts_is_not_said(tmp_path: Path, rpm: int, is_said: bool) -> None:
+    add_chip(tmp_path / "hwmon", 0, "emc2305", "i2c/0", {"fan1_input": rpm, "pwm1": 120, "pwm1_enable": 1})
+    (found,) = discover_hwmon(tmp_path / "hwmon")
+    assert ("reads 0 below 960 rpm" in found.notes) is is_said
+
+
 def test_a_fan_is_called_as_the_kernel_calls_it_or_as_its_chip_counts_it(root: Path) -> None:
     def names() -> list[str]:
         trays = parse_config(next(iter(discover_hwmon(root))).toml, Path("fantwin.toml")).trays
