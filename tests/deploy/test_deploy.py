@@ -27,3 +27,13 @@ def test_each_target_is_a_new_folder_of_files_without_links(tmp_path: Path, targ
     assert {str(out / name) for name in some} <= set(found["files"]) and str(out) in found["next"]
     assert not [path for path in out.rglob("*") if path.is_symlink()]
     assert error_of("deploy", target, "-o", out) == f"{out}: exists; name a new folder with -o"
+
+
+def test_compose_says_which_configuration_is_used_and_that_the_one_here_is_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    site = "the site is a simulated tray, by {}/site/fantwin.toml{}: put your [[tray]] there"
+    assert site.format("one", "") in fantwin("deploy", "compose", "-o", "one").stdout
+    (tmp_path / "fantwin.toml").touch()
+    assert site.format("two", " and not by fantwin.toml") in fantwin("deploy", "compose", "-o", "two").stdout

@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from fantwin.pipeline.cli.options import JsonOption
+from fantwin.pipeline.cli.options import DEFAULT_CONFIG, JsonOption
 from fantwin.pipeline.cli.printing import show
 from fantwin.pipeline.cli.watch.service_files import Service, written_below
 from fantwin.pipeline.errors import UserError
@@ -37,6 +37,11 @@ _NEXT = {
     Target.HELM: "helm install plant {out} --set-file config=fantwin.toml -f VALUES.yaml; see {out}/README.md",
     Target.GRAFANA: "import {out}/fantwin.json into Grafana; give {out}/prometheus.yml and its rules to Prometheus",
 }
+_SITE = {
+    Target.COMPOSE: "the site is a simulated tray, by {out}/site/fantwin.toml{unused}: put your [[tray]] there, and "
+    "see `acquisition` in {out}/compose.yaml",
+}
+"""which site the files run, where no option of the next command says it"""
 
 
 def deploy(
@@ -67,4 +72,7 @@ def deploy(
         raise UserError(f"{out}: cannot be written: {error.strerror or error}") from error
     files = sorted(str(path) for path in out.rglob("*") if path.is_file())
     following = _NEXT[target].format(out=out, version=metadata.version("fantwin"))
-    show({"files": files, "next": following}, *files, f"next: {following}", json_output=json_output)
+    unused = f" and not by {DEFAULT_CONFIG}" if DEFAULT_CONFIG.exists() else ""
+    site = _SITE.get(target, "").format(out=out, unused=unused)
+    lines = [*files, *([site] if site else []), f"next: {following}"]
+    show({"files": files, "site": site, "next": following}, *lines, json_output=json_output)
