@@ -132,7 +132,7 @@ class Launcher:
         Raises:
             UserError: a stage cannot run as configured; the others have been stopped.
         """
-        self._refuse_unusable_twins()
+        self.refuse_unusable_twins()
         for slot in self._slots:  # an unusable certificate ends `up` before any stage has made a file
             credentials_of(self._config.bus, role_names(slot.row.stage, slot.row.shard))
         reads = {name: load_stage(name).reads_as_configured(self._config) for name in self._config.stages}
@@ -166,11 +166,14 @@ class Launcher:
                 self.outcome.unusable = self._watcher.unusable(sessions)
         return self.outcome
 
-    def _refuse_unusable_twins(self) -> None:
+    def refuse_unusable_twins(self) -> None:
         """Refuse a twin that is missing or of other fans, by its card, before any stage has made a file.
 
         A tray that names none learns one. Where these stages read no device, a replay may publish its twin, or a
         learner that runs elsewhere. The stages check the rest.
+
+        Raises:
+            StageError: a twin is refused.
         """
         learns = LEARNER in self._config.stages or not self._has_devices
         needed = {name for slot in self._slots if STAGES[slot.row.stage].needs_twin for name in slot.row.shard.trays}

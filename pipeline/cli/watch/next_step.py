@@ -35,11 +35,16 @@ def _lines(path: Path) -> tuple[str, ...]:
         return (f"{error}", "next: correct it; fantwin doctor checks it again")
     if _runs(config):
         return (f"site {config.site!r} runs; next: fantwin status, fantwin alarms",)
-    lacking = [tray.name for tray in config.trays if not _has_twin(tray, config)]
-    what = f"no twin yet of tray {', '.join(lacking)}" if lacking else "every tray has a twin"
+    lacks = what_lacks(config)
     nexts = (f"next: {command}  ({why})" for command, why in next_commands(config))
-    learns = ("or: fantwin up  (learns it while the plant moves the fans)",) if lacking else ()
-    return (f"{path}: site {config.site!r}, {what}", *nexts, *learns)
+    learns = ("or: fantwin up  (learns it while the plant moves the fans)",) if lacks else ()
+    return (f"{path}: site {config.site!r}, {lacks or 'every tray has a twin'}", *nexts, *learns)
+
+
+def what_lacks(config: Config) -> str:
+    """Which trays have no twin yet; empty if all have one."""
+    lacking = [tray.name for tray in config.trays if not _has_twin(tray, config)]
+    return f"no twin yet of tray {', '.join(lacking)}" if lacking else ""
 
 
 def next_commands(config: Config) -> list[tuple[str, str]]:

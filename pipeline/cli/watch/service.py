@@ -17,6 +17,7 @@ import typer
 from fantwin.pipeline.bus.endpoint import accepts_connections
 from fantwin.pipeline.cli.options import DEFAULT_CONFIG, ConfigOption, JsonOption
 from fantwin.pipeline.cli.printing import show
+from fantwin.pipeline.cli.watch.next_step import next_commands, what_lacks
 from fantwin.pipeline.cli.watch.service_files import (
     RULES,
     UNIT,
@@ -28,6 +29,7 @@ from fantwin.pipeline.cli.watch.service_files import (
     written_below,
 )
 from fantwin.pipeline.errors import UsageError, UserError
+from fantwin.pipeline.launch.launcher import Launcher
 from fantwin.pipeline.launch.this_host import load_for_this_host, page_addresses, with_free_ports
 
 SYSTEM = Path("/")
@@ -104,6 +106,10 @@ def _install(config: Path, user: str | None, *, is_dry: bool, json_output: bool)
         raise UserError(
             f"{closed} is closed to the user {made.user}: chmod o+x {closed}, or name another user with --user"
         )
+    Launcher(here.config, here.overrides, typer.echo).refuse_unusable_twins()
+    if lacks := what_lacks(here.config):
+        makes = next_commands(here.config)[-1][0]
+        typer.echo(f"{lacks}: the service learns it while the plant moves the fans; sooner: {makes}", err=True)
     files = made.files()
     folder = made.run_folder
     commands = [["systemd-sysusers", str(SYSTEM / USERS / "fantwin.conf")]]

@@ -81,10 +81,21 @@ def test_it_is_installed_started_shown_and_removed(host: Host, tmp_path: Path) -
     assert error_of("service", "uninstall") == "the service is not installed"
 
 
-def test_a_dry_run_prints_the_files_and_commands_and_changes_nothing(host: Host) -> None:
+def test_a_dry_run_prints_the_files_and_commands_and_changes_nothing(host: Host, tmp_path: Path) -> None:
     done = fantwin("service", "install", "--dry-run")
     assert done.exit_code == 0 and "ProtectKernelTunables=no" in done.stdout
     assert done.stdout.splitlines()[-1] == "systemctl restart fantwin.service"
+    lacks = (
+        "no twin yet of tray board: the service learns it while the plant moves the fans; sooner: fantwin commission"
+    )
+    assert done.stderr == f"{lacks} --sweep\n"
+    named = tmp_path / "named.toml"
+    named.write_text(f'{TRAY}twin = "board.onnx"\n')
+    for more in ((), ("--dry-run",)):
+        missing = error_of("service", "install", "-c", named, *more)
+        assert missing.startswith(f"{tmp_path}/board.onnx: "), "as `up` would refuse it"
+    named.write_text(f"{TRAY}[launcher]\nwithout = ['learner']\n")
+    assert "tray board has no twin: set" in error_of("service", "install", "-c", named, "--dry-run")
     assert not [path for path in host.root.rglob("*") if path.is_file()]
 
 
