@@ -13,6 +13,7 @@ from fantwin.interface.columns import Columns
 from fantwin.interface.tables import fan_table
 from fantwin.interface.twin import USUAL, Twin
 from fantwin.interface.words import in_python, warn
+from fantwin.pipeline.cli.progress import training_progress
 from fantwin.pipeline.learning.fitting import TrainingSettings, calibrated_on, fit_twin, with_calibration
 from fantwin.pipeline.learning.healthy_evidence import marked_running, outlier_warnings
 from fantwin.pipeline.learning.training_data import Part, read_held_out, read_training_data
@@ -34,7 +35,8 @@ def train(
     networks: int | None = None,
     command_unit: str = "",
 ) -> Twin:
-    """A twin of healthy fans, as by `fantwin train`; the same tables and seed give the same twin.
+    """A twin of healthy fans, as by `fantwin train`; the same tables and seed give the same twin. A terminal or
+    a notebook with ipywidgets shows a bar meanwhile.
 
     Args:
         tables: a table or the path of a recording, or a list of them. The fans have run at many commands.
@@ -63,7 +65,8 @@ def train(
         data = read_training_data(healthy, Part(), in_this_process)
         held_out = read_held_out(data, others, Part(), in_this_process) if others else None
         warn(line for each in (data, held_out) if each for line in (*each.damage, *each.hints))
-        trained = fit_twin(data, held_out, name, settings)
+        with training_progress(data, only_bar=True) as start:
+            trained = fit_twin(data, held_out, name, settings, start(""))
         warn(data.with_fan_numbers(trained.identification.warnings))
         return Twin(trained.onnx())
 

@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
+from importlib.util import find_spec
 from typing import TYPE_CHECKING, Self
 
 import typer
@@ -41,18 +42,19 @@ def interruptible(outcome: str) -> Iterator[None]:
 
 
 class Reporter:
-    """Shows on standard error what is being done: a bar on a terminal, which disappears at the end.
+    """Shows on standard error what is being done: a bar on a terminal or in a notebook, which disappears at the end.
 
     Elsewhere a line comes when something else is done than before, and every LINE_PERIOD_S. A context manager.
     """
 
-    def __init__(self, quietly: str = "") -> None:
-        """quietly: what begins without a line."""
+    def __init__(self, quietly: str = "", *, only_bar: bool = False) -> None:
+        """quietly: what begins without a line. only_bar: nothing elsewhere, as a program wants it."""
         self.console = console = Console(stderr=True, highlight=False)
         """what is printed with it stands above the bar"""
-        self._has_lines = not console.is_terminal
+        has_bar = console.is_terminal or (console.is_jupyter and find_spec("ipywidgets") is not None)
+        self._has_lines = not has_bar and not only_bar
         columns = (TextColumn("{task.description}", markup=False), BarColumn(), TextColumn("{task.fields[count]}"))
-        self._bars = Progress(*columns, TimeElapsedColumn(), console=console, transient=True, disable=self._has_lines)
+        self._bars = Progress(*columns, TimeElapsedColumn(), console=console, transient=True, disable=not has_bar)
         self._bar: TaskID | None = None
         self._doing = quietly
         self.restart()
@@ -125,10 +127,12 @@ def show_part(part: str) -> None:
 
 
 @contextmanager
-def training_progress(training_data: TrainingData) -> Iterator[Callable[[str], ProgressCallback]]:
+def training_progress(
+    training_data: TrainingData, *, only_bar: bool = False
+) -> Iterator[Callable[[str], ProgressCallback]]:
     """Around identification and training; yields a function that starts the display of one by its name and returns its
-    progress callback."""
-    with Reporter() as reporter:
+    progress callback. only_bar: as of `Reporter`."""
+    with Reporter(only_bar=only_bar) as reporter:
 
         def start(name: str) -> ProgressCallback:
             reporter.restart()

@@ -88,3 +88,16 @@ def test_what_data_do_not_show_is_said_and_what_is_too_little_is_refused(twin):
         fantwin.train(table_of(1, 20.0), model="linear")
     with pytest.raises(fantwin.FantwinError, match="`tacho` counts: "):
         fantwin.train(table_of(1, 20.0), tacho="counts")
+
+
+def test_training_shows_a_bar_on_a_terminal_and_nothing_in_a_pipe(monkeypatch, capsys):
+    def shown() -> str:
+        fantwin.train(table_of(1, 4.0), model="physical")
+        return capsys.readouterr().err
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", fantwin.FantwinWarning)
+        assert shown() == ""
+        monkeypatch.setenv("FORCE_COLOR", "1")  # what rich takes for a terminal
+        monkeypatch.setenv("TERM", "xterm")
+        assert "identification" in shown()
