@@ -118,6 +118,8 @@ def _change_tokens(
         if tokens.pop(name, None) is None:
             raise UserError(f"{path}: no token {name!r}: there is {', '.join(tokens) or 'none'}")
         done = {"done": f"{name}: removed"}
+    elif name in tokens:
+        raise UserError(f"{path}: {name} has a token: end that first: fantwin users remove-token {name}")
     else:
         expires = datetime.now(UTC).replace(microsecond=0) + timedelta(days=days) if days is not None else None
         text, tokens[name] = new_token(name, _role(name, role), expires)

@@ -72,6 +72,9 @@ def test_a_token_is_shown_once_listed_with_its_end_and_removed(config):
     assert (listed["kind"], listed["name"], listed["expires"][:2]) == ("token", "grafana", "20")
     assert "grafana  operator  token, until 20" in fantwin("users", "-c", config).stdout
     assert "is a token" in str(fantwin("users", "add", "grafana", "-c", config, typed=f"{PASSWORD}\n").exception)
+    again = f"{path}: grafana has a token: end that first: fantwin users remove-token grafana"
+    assert str(fantwin("users", "add-token", "grafana", "-c", config).exception) == again
+    assert tokens.of(text) is not None, "the program that has it goes on"
     assert fantwin("users", "remove-token", "grafana", "-c", config).exit_code == 0
     assert tokens.of(text) is None, "from the next request on"
     assert fantwin("users", "add-token", "grafana", "-c", config, "--days", "inf").exit_code == 2
