@@ -9,10 +9,12 @@ import shlex
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from fantwin.pipeline.cli.watch import service_files
 from fantwin.pipeline.cli.watch.service_files import RULES, UNITS, USERS, Service, written_below
 from fantwin.pipeline.config.loading import parse_config
 from tests.support.fantwin_words import parsed
@@ -67,7 +69,7 @@ def test_systemd_accepts_the_units_which_may_do_little(text: str, folder: str, t
 
 def test_the_commands_of_the_units_are_those_of_fantwin() -> None:
     for unit, name in (("fantwin.service", "up"), ("fantwin-router.service", "router")):
-        words = shlex.split(settings(service(HWMON), unit)["ExecStart"])
+        words = shlex.split(settings(service(HWMON), unit)["ExecStart"].removeprefix(":"))
         assert words[:5] == [sys.executable, "-P", "-m", "fantwin", name]
         assert parsed(words[4:])["config"] == Path("/etc/fantwin/fantwin.toml")
 
@@ -102,6 +104,59 @@ def test_of_a_home_only_the_folders_of_fantwin_are_seen_and_the_user_is_the_one_
     assert made.files()[USERS / "fantwin.conf"] == "g fantwin -\n"
     outside = settings(Service())
     assert outside["ProtectHome"] == "yes" and outside["StateDirectory"] == "fantwin"
+
+
+HARD = 'ann\'s "$HOME" 5 % a:b \\\\ é'
+"""a name of a folder with all that means something in a unit"""
+
+
+def test_systemd_reads_every_path_as_it_is_called(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(service_files, "_HOMES", (f"{tmp_path}/",))
+    folder = tmp_path / HARD
+    (folder / "bin").mkdir(parents=True)
+    (folder / "bin" / "python").symlink_to(sys.executable)
+    made = service(HWMON, folder)
+    made = replace(made, program=(str(folder / "bin" / "python"), "-P"), run_folder=folder / "runs")
+    made = replace(made, written=(folder / "hwmon",))
+    written_below(tmp_path, made.files() | made.router())
+    done = analyze(tmp_path, "verify", "--man=no", "fantwin.service", "fantwin-router.service")
+    assert (done.returncode, done.stderr) == (0, "")
+    started = settings(made)["ExecStart"].removeprefix(":")
+    words = [word.replace("%%", "%").replace("\\'", "'") for word in shlex.split(started)]
+    assert words == ["/usr/bin/env", *made.program, "up", "-c", str(made.config)]
+
+
+def test_whatever_the_configuration_names_by_a_path_is_seen_of_a_home(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(service_files, "_HOMES", (f"{tmp_path}/",))
+    folder, others = tmp_path / "site", [tmp_path / name for name in ("users", "mail", "bmc", "certs", "hw", "twins")]
+    for each in (folder, *others):
+        each.mkdir()
+        (each / "file").write_text("https://ntfy.sh/a\n")
+        (each / "file").chmod(0o600)
+    text = f"""
+[bus]
+mode = "client"
+endpoint = "tls/router:7447"
+security = {{ folder = "../certs" }}
+[gateway]
+users = "../users/file"
+[[notifier.target]]
+name = "desk"
+url_file = "{tmp_path}/mail/file"
+[[tray]]
+name = "board"
+fans = 1
+twin = "../twins/file"
+source = {{ kind = "hwmon", chip = "nct6798", writable = true, root = "../hw" }}
+[[tray]]
+name = "bmc"
+fans = 1
+source = {{ kind = "redfish", url = "https://ann@a", fans = ["F"], password_file = "../bmc/file" }}
+"""
+    found = settings(service(text, folder))
+    assert {str(folder), *map(str, others)} <= set(found["BindReadOnlyPaths"].split())
 
 
 def test_the_rule_lets_the_group_write_the_commands_of_a_chip(tmp_path: Path) -> None:

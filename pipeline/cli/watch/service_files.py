@@ -5,13 +5,14 @@ from __future__ import annotations
 import grp
 import pwd
 import re
-import shlex
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import metadata, resources
 from pathlib import Path
 from string import Template
+
+from pydantic import BaseModel
 
 from fantwin.pipeline.config.settings import Config
 from fantwin.pipeline.errors import UserError
@@ -36,7 +37,8 @@ class Service:
         config: the configuration, an absolute path.
         run_folder: where it writes.
         program: the words that start `fantwin`.
-        installation: folders that the program needs, and those of twins.
+        installation: folders that the program needs.
+        read: folders of files that the configuration names.
         user: who runs it.
         group: the primary group of that user.
         chips: names of the hwmon chips whose fans it commands.
@@ -48,6 +50,7 @@ class Service:
     run_folder: Path = STATE_FOLDER
     program: tuple[str, ...] = ("/opt/fantwin/bin/fantwin",)
     installation: tuple[Path, ...] = ()
+    read: tuple[Path, ...] = ()
     user: str = USER
     group: str = USER
     chips: tuple[str, ...] = ()
@@ -63,13 +66,13 @@ class Service:
         lines = [
             each.port for each in sources if isinstance(each, SerialConfig | ModbusConfig) and _is_device(each.port)
         ]
-        twins = {(config.folder / tray.twin).resolve().parent for tray in config.trays if tray.twin}
         group = grp.getgrgid(pwd.getpwnam(user).pw_gid).gr_name if user != USER else USER
         return cls(
             config=config.path.resolve(),
             run_folder=config.run_folder.resolve(),
             program=(sys.executable, "-P", "-m", "fantwin"),  # what is beside the configuration is not imported
-            installation=tuple({Path(sys.prefix), Path(sys.base_prefix), Path(__file__).resolve().parents[3], *twins}),
+            installation=tuple({Path(sys.prefix), Path(sys.base_prefix), Path(__file__).resolve().parents[3]}),
+            read=tuple(sorted(_folders_read(config))),
             user=user,
             group=group,
             chips=tuple(dict.fromkeys(each.chip_name for each in commanded if each.root == ROOT)),
@@ -90,7 +93,7 @@ class Service:
     def router(self, listen: str = "tls/0.0.0.0:7447") -> dict[Path, str]:
         """The unit of the router at which several hosts meet."""
         command = [*self.program, "router", "-c", str(self.config), "--listen", listen]
-        alone = Service(self.config, self.run_folder, self.program, self.installation, self.user, self.group)
+        alone = replace(self, chips=(), ports=(), groups=(), written=())
         return {UNITS / ROUTER: alone._unit("the router of a site", command, is_notifying=False)}
 
     def _unit(self, description: str, command: Sequence[str], *, is_notifying: bool) -> str:
@@ -101,7 +104,7 @@ class Service:
             description=description,
             version=metadata.version("fantwin"),
             type=notifying if is_notifying else "Type=exec",
-            command=" ".join(_escaped(word) for word in command),
+            command=_command_line(command),
             user=self.user,
             group=self.group,
             folder=str(self.config.parent).replace("%", "%%"),
@@ -115,13 +118,13 @@ class Service:
             yield "StateDirectory=fantwin"
         else:
             yield f"ReadWritePaths={' '.join(_escaped(str(path)) for path in (self.run_folder, *self.written))}"
-        shown = [path for path in (*self.installation, self.config.parent) if f"{path}/".startswith(_HOMES)]
+        shown = _in_homes([*self.installation, *self.read, self.config.parent])
         yield f"ProtectHome={'tmpfs' if shown else 'yes'}"
         if shown:
             yield "# of the homes, what it needs and no more"
-            yield f"BindReadOnlyPaths={' '.join(sorted(_escaped(str(path)) for path in set(shown)))}"
-        if f"{self.run_folder}/".startswith(_HOMES):
-            yield f"BindPaths={_escaped(str(self.run_folder))}"
+            yield f"BindReadOnlyPaths={' '.join(shown)}"
+        if changed := _in_homes([self.run_folder, *self.written]):
+            yield f"BindPaths={' '.join(changed)}"
         if self.ports:
             yield "PrivateDevices=no\nDevicePolicy=closed"
             yield from (f"DeviceAllow=char-{kind} rw" for kind in self.ports)
@@ -190,9 +193,41 @@ def _group_of(port: str) -> str:
         return "dialout"
 
 
+def _command_line(words: Sequence[str]) -> str:
+    """A command of a unit. `:`: a $ begins no variable. systemd starts no program with a quote in its name."""
+    through = ["/usr/bin/env"] if re.search(r"""["'\\]""", words[0]) else []
+    return ":" + " ".join(map(_escaped, (*through, *words)))
+
+
+def _folders_read(config: Config) -> set[Path]:
+    """The folders of what the settings name by a path and is there: files such as those of users are replaced, by which
+    a file that was bound alone would stay the old one."""
+    named = {(config.folder / path).resolve() for path in _paths((config.bus, config.trays, config.sections))}
+    return {path if path.is_dir() else path.parent for path in named if path.exists()}
+
+
+def _paths(settings: object) -> Iterator[Path]:
+    """All paths among settings."""
+    if isinstance(settings, Path):
+        yield settings
+    elif isinstance(settings, BaseModel):
+        yield from _paths([getattr(settings, name) for name in type(settings).model_fields])
+    elif isinstance(settings, Mapping):
+        yield from _paths(list(settings.values()))
+    elif isinstance(settings, Sequence) and not isinstance(settings, str):
+        for each in settings:
+            yield from _paths(each)
+
+
+def _in_homes(paths: Sequence[Path]) -> list[str]:
+    """Those below a home, as a unit binds them: a colon would begin the place where they are shown."""
+    return sorted({_escaped(str(path)).replace(":", "\\:") for path in paths if f"{path}/".startswith(_HOMES)})
+
+
 def _escaped(word: str) -> str:
-    """A word of a unit: % and spaces mean something there."""
-    return shlex.quote(word.replace("%", "%%")) if re.search(r"[^\w@%+=:,./-]", word) else word.replace("%", "%%")
+    """A word of a unit: %, quotes, backslashes and spaces mean something there."""
+    quoted = re.sub(r"""(["'\\])""", r"\\\1", word.replace("%", "%%"))
+    return f'"{quoted}"' if re.search(r"[^\w@%+=:,./-]", quoted) else quoted
 
 
 def may_be_read(service: Service) -> str:
