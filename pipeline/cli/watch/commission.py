@@ -60,10 +60,6 @@ def commission(
     minutes: Annotated[
         float, typer.Option(min=0.1, max=10_000, help="Length of each recording of ordinary operation.")
     ] = 10.0,
-    at_most_hours: Annotated[
-        float,
-        typer.Option(min=0.01, max=1000, help="Without --sweep: the longest wait for the plant to move the commands."),
-    ] = 24.0,
     false_alarms_per_day: Annotated[
         float, typer.Option(min=1e-6, max=8640, help="The rate to declare: false alarms per fan and day.")
     ] = 1.0,
@@ -81,8 +77,8 @@ def commission(
     docs/tutorial/own-fan.md; each is shown before it runs, except the `up` that records. The fans must be healthy.
 
     With --sweep, the trays are swept one after another: --rounds times to train on, once more to validate. Without it,
-    no command is sent: the first recording lasts until the plant has moved the command of every fan enough, and what is
-    missing is shown. The calibration is from little data: calibrate again after a few days.
+    no command is sent: the first recording lasts until the plant has moved the command of every fan enough, at most a
+    day, and what is missing is shown. The calibration is from little data: calibrate again after a few days.
 
     A tray that fails is left out: the others get their twins, but `fantwin up` is not started. Ctrl-C ends `commission`
     without further twins. Recordings stay, in folders `commissioned-N` of their own; the recorder's limits
@@ -119,7 +115,7 @@ def commission(
     for each in chosen:
         if each.twin is not None:
             say(f"{config}: tray {each.name} keeps its twin {each.twin}")
-    plan = Plan(options if sweep else None, rounds, 60.0 * minutes, 3600.0 * at_most_hours, false_alarms_per_day)
+    plan = Plan(options if sweep else None, rounds, 60.0 * minutes, false_alarms_per_day)
     commands = Commands(stop, say, to_standard_error=json_output)
     with Unfinished(settings.run_folder) as unfinished:
         commissioning = Commissioning(settings, configured, commands, works, plan, unfinished)

@@ -18,6 +18,8 @@ from fantwin.pipeline.learning.training_data import Part, read_training_data
 from fantwin.pipeline.replay.offline.healthy_runs import in_this_process
 
 SHOWN_EVERY_S = 60.0
+AT_MOST_S = 86_400.0
+"""how long to wait for the plant to move the fans"""
 TRAINING, VALIDATION, CALIBRATION = "training", "validation", "calibration"
 """purposes of recordings: validation sets the band, and with calibration, in ordinary operation, the limits"""
 
@@ -32,8 +34,6 @@ class Plan:
     """of the first sweep of each tray"""
     operation_s: float
     """length of a recording of ordinary operation"""
-    at_most_s: float
-    """how long to wait at most for the plant to move the fans"""
     false_alarms_per_day: float
 
 
@@ -137,7 +137,7 @@ class Commissioning:
         """The plant moves the fans of all trays."""
         first, later = ({work.name: OrdinaryOperation(work.tray) for work in self.left} for _ in range(2))
         if self._lacks(TRAINING):
-            self._record(self.left, TRAINING, lambda site: self._operate(site, first, self._plan.at_most_s))
+            self._record(self.left, TRAINING, lambda site: self._operate(site, first, AT_MOST_S))
             for work in self.left:
                 with self._failing(work):
                     self._check_tachos(work)
@@ -221,11 +221,8 @@ class Commissioning:
         for work in self.left:
             if lacks := missing.get(work.name):
                 move = "let their own controller vary the commands" if work.tray.source.why_no_commands else "--sweep"
-                self._fail(
-                    work,
-                    f"in {waited_s / 3600:.3g} h its fans have not moved enough ({'; '.join(lacks)}): move them "
-                    f"({move}), or wait longer with --at-most-hours",
-                )
+                few = f"in {waited_s / 3600:.3g} h its fans have not moved enough ({'; '.join(lacks)})"
+                self._fail(work, f"{few}: move them ({move})")
 
     def _learn(self, work: TrayWork) -> None:
         run, tray, twin, recorded = self._commands.run, self._tray_words(work), work.twin, work.so_far.recorded

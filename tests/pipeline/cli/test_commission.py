@@ -183,7 +183,8 @@ def test_it_waits_for_the_fans_of_every_tray_and_says_which_have_not_moved(
     played: Played, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(PlayedSite, "still", ("b",))
-    result = played.commission("--at-most-hours", 0.5, "--json")
+    monkeypatch.setattr(commissioning, "AT_MOST_S", 1800.0)
+    result = played.commission("--json")
     lines = result.stderr.splitlines()
     both = r"1 min of at least 1; still missing: tray a, fan 0: .*; tray b, fan 0: command 0\.5 so far, .*"
     assert any(re.fullmatch(both, line) for line in lines), lines
