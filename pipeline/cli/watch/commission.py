@@ -73,17 +73,17 @@ def commission(
 ) -> None:
     """Record healthy fans, train their twins, calibrate them, add them to the configuration, start `fantwin up`.
 
-    Each tray that names no twin gets one; the others stay as they are. The steps are commands of
-    docs/tutorial/own-fan.md; each is shown before it runs, except the `up` that records. The fans must be healthy.
+    Each tray that names no twin gets one; the others stay as they are. The steps are other commands, each shown before
+    it runs, except the `up` that records. The fans must be healthy.
 
     With --sweep, the trays are swept one after another: --rounds times to train on, once more to validate. Without it,
     no command is sent: the first recording lasts until the plant has moved the command of every fan enough, at most a
     day, and what is missing is shown. The calibration is from little data: calibrate again after a few days.
 
     A tray that fails is left out: the others get their twins, but `fantwin up` is not started. Ctrl-C ends `commission`
-    without further twins. Recordings stay, in folders `commissioned-N` of their own; the recorder's limits
-    do not touch them. The same command goes on with complete recordings of the last day, unless no twin could be made
-    of them. With --json, `fantwin up` is not started.
+    without further twins. Recordings stay, in folders `commissioned-N` that no recorder empties. The same command goes
+    on with complete recordings of the last day, unless no twin could be made of them. With --json, `fantwin up` is not
+    started.
 
     Exit codes: 0 success; 1 at least one tray failed, and one line says why; 3 success, but data were lost while
     recording; 130 Ctrl-C. Once `fantwin up` is started, the exit code is that of `up`.
