@@ -94,12 +94,13 @@ _BARE_ALARM = (FanState.NORMAL, FanState.SUSPECT, FanState.ALARM)
 
 def _shown_classes() -> tuple[ShownClass, ...]:
     """The classes of fans, then those of fans in alarm, then those of fans whose alarm is silenced. Each: normal by its
-    score, then the states, a state of a newer version, and silent."""
+    score, then the states, a state of a newer version, unknown for each reason, and silent."""
     step = 1 / NORMAL_LEVELS
     normal = [f"normal, score {level * step:.1f} to {(level + 1) * step:.1f}" for level in range(NORMAL_LEVELS)]
     bare: list[ShownClass] = []
     active: list[ShownClass] = []
-    for number, name in enumerate([*normal, *(state.words for state in FanState), "unknown state", SILENT]):
+    unknown = [state_name(FanState.UNKNOWN, reason) for reason in InvalidReason]
+    for number, name in enumerate([*normal, *(state.words for state in FanState), "unknown state", *unknown, SILENT]):
         value = number - NORMAL_LEVELS
         state = FanState.NORMAL if value < 0 else FanState(value) if value < len(FanState) else FanState.UNKNOWN
         now = words_now(state)
@@ -111,6 +112,9 @@ def _shown_classes() -> tuple[ShownClass, ...]:
 
 
 SHOWN_CLASSES = _shown_classes()
+_OF_REASON = np.full(256, NORMAL_LEVELS + FanState.UNKNOWN)
+"""the class of a fan whose state is unknown, by the number of its `InvalidReason`"""
+_OF_REASON[list(InvalidReason)] = NORMAL_LEVELS + len(FanState) + 1 + np.arange(len(InvalidReason))
 _GROUPS = np.array([list(FanGroup).index(each.group) for each in SHOWN_CLASSES])
 
 
@@ -173,6 +177,7 @@ class Fleet:
         known = np.minimum(state, len(FanState)) + NORMAL_LEVELS
         level = (np.nan_to_num(self._score, nan=0.0, posinf=1.0, neginf=0.0) * NORMAL_LEVELS).clip(0, NORMAL_LEVELS - 1)
         bare = np.where(state == FanState.NORMAL, level, known)
+        bare = np.where(state == FanState.UNKNOWN, _OF_REASON[self._reasons], bare)
         count, in_alarm = len(SHOWN_CLASSES) // 3, self.in_alarm()
         bare = np.where(self._codes < 0, count - 1, bare)
         return (bare + count * in_alarm + count * (in_alarm & self._silenced)).astype(np.uint8)

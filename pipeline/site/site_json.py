@@ -66,8 +66,8 @@ def site_json(model: SiteModel, viewer_urls: Mapping[str, str]) -> dict[str, Any
 
 
 def fleet_json(model: SiteModel) -> dict[str, Any]:
-    """All fans at a glance: class and level of each cell, a byte each, in base64; speeds of the live fans; and what the
-    first twins wait for.
+    """All fans at a glance: class and level of each cell, a byte each, in base64; speeds of the live fans; what the
+    first twins wait for; and of silent trays, when the last sample came, 0 for never.
     """
     classes, score = model.fans_now()
     level = np.where(np.isnan(score), NO_LEVEL, (np.nan_to_num(score, posinf=9.0) * 100).clip(0, LEVELS))
@@ -77,6 +77,9 @@ def fleet_json(model: SiteModel) -> dict[str, Any]:
         "counts": model.counts(),
         "values": live_values(model),
         "learning": learning_json(model),
+        "silent_since_t_ns": {
+            tray.name: model.newest_t_ns(tray.name) for tray in model.trays if model.is_silent(tray.name)
+        },
     }
 
 

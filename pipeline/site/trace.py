@@ -16,6 +16,7 @@ from fantwin.schemas.fan_names import NO_NAMES, FanNames
 from fantwin.schemas.fields import LARGEST_ENUM_VALUE
 from fantwin.schemas.messages import Array, Score
 from fantwin.schemas.units import RAD_S_PER_UNIT, SpeedUnit
+from fantwin.scoring.alarms.unscored_monitor import REASONS
 
 SILENT = "silent"
 """the state of a fan without samples, in words"""
@@ -167,12 +168,13 @@ def with_holes(trace: Trace, period_ns: int, before_t_ns: int | None = None) -> 
 
 
 def state_name(state: int, invalid_reason: int) -> str:
-    """A state in words; UNKNOWN with its reason: `unknown: gap`. A value of a newer scorer reads `unknown (9)`."""
+    """A state in words; UNKNOWN with its reason: `unknown: no speed`. A value of a newer scorer reads `unknown (9)`."""
     if state == NO_SAMPLES:
         return SILENT
     if state != FanState.UNKNOWN or invalid_reason == InvalidReason.NONE:
         return FanState(state).words
-    return f"unknown: {InvalidReason(invalid_reason).words}"
+    reason = InvalidReason(invalid_reason)
+    return f"unknown: {REASONS.get(reason, reason.words)}"
 
 
 def state_names() -> list[str]:

@@ -66,7 +66,7 @@ def test_what_the_api_says_of_fans_alarms_and_series_is_what_the_messages_said(g
         (2, "alarm"),
         (0, "normal"),
         (1, "normal"),
-        (3, "unknown: gap"),
+        (3, "unknown: samples are missing"),
     ]
     assert fans[1]["score"] == 0.5
     worst, well, _, unjudged = fans

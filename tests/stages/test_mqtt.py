@@ -89,7 +89,7 @@ def test_states_alarms_and_status_are_retained(tmp_path, broker, listener, start
         "time": "2026-09-21T14:13:20.040Z",
     }
     unjudged = state_of(listener, f"{ROOT}/{TRAY}/3")
-    assert (unjudged["state"], unjudged["judged"]) == ("unknown: gap", False)
+    assert (unjudged["state"], unjudged["judged"]) == ("unknown: samples are missing", False)
     assert (unjudged["predicted_speed"], unjudged["score"]) == (None, 0.5)
     eventually(lambda: listener.last(f"{FAN}/alarm") == "null", "without an alarm it says so")
     stage.feed(alarm())

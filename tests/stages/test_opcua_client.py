@@ -129,7 +129,7 @@ def test_it_browses_the_site_and_reads_values_with_their_quality_and_the_time_of
     assert (judged["Score"]["value"], judged["State"]["value"], judged["Judged"]["value"]) == (0.5, "normal", True)
     assert not_judged["Speed"]["status"] == "UncertainLastUsableValue", "samples are missing there"
     assert (not_judged["Score"]["status"], not_judged["Score"]["value"]) == ("BadNoData", None)
-    assert (not_judged["State"]["value"], not_judged["Judged"]["value"]) == ("unknown: gap", False)
+    assert (not_judged["State"]["value"], not_judged["Judged"]["value"]) == ("unknown: samples are missing", False)
     assert client("path", start=FAN, path="/2:Alarm/0:AckedState/0:Id") == [f"{ALARM}/AckedState/Id"]
 
 

@@ -57,7 +57,7 @@ def test_a_raised_alarm_shows_at_once_and_lasts_until_its_message_says_otherwise
     site.update(newest("a", START_NS + 1, (FanState.STOPPED, 0.0), (FanState.NORMAL, 0.9)))
     assert site.names() == ["a/0 alarm, now stopped by its command", "a/1 normal"]
     site.update(newest("a", START_NS + 1, GAP, (FanState.NORMAL, 0.9)))
-    assert site.names()[0] == "a/0 alarm, unknown: gap"
+    assert site.names()[0] == "a/0 alarm, unknown: samples are missing"
     site.silence("a", START_NS + 1)
     assert site.names() == ["a/0 alarm, silent", "a/1 silent"]
     site.add_alarm(alarm("a", 0, START_NS, active=False, transition=Transition.CLEARED))
@@ -79,7 +79,7 @@ def test_the_worst_come_first_and_those_not_judged_last() -> None:
         "a/0 normal",
         "a/3 stopped",
         "b/3 normal",
-        "a/2 unknown: gap",
+        "a/2 unknown: samples are missing",
     ]
     assert [str(fan) for fan in site.fleet.alarms()] == ["b/2", "a/1"], "a silenced alarm asks for no attention"
     counts = {FanGroup.ALARM: 2, FanGroup.SILENCED: 1, FanGroup.SUSPECT: 1, FanGroup.NOT_JUDGED: 1}
