@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser, Page, expect
 
+from fantwin.pipeline.site import site_model
 from fantwin.schemas.enums import FanState, InvalidReason, Transition
 from fantwin.schemas.health import FanLearning, Learning
 from fantwin.schemas.messages import Diagnosis, Score
@@ -33,6 +35,14 @@ TOPMOST = """(plot) => {
     return 1;
 }"""
 """how far from the top of a plot its measured line begins, as a share of its height"""
+RED_SHARE = """(plot) => {
+    const canvas = plot.querySelector("canvas"), context = canvas.getContext("2d");
+    const { data } = context.getImageData(0, 0, canvas.width, canvas.height);
+    let red = 0;
+    for (let at = 0; at < data.length; at += 4) red += data[at] > 150 && data[at + 1] < 60 && data[at + 3] > 100;
+    return red / (canvas.width * canvas.height);
+}"""
+"""how much of a plot is filled as over the limit"""
 
 
 NOTIFICATIONS = """window.notified = [];
@@ -88,6 +98,94 @@ def test_a_card_says_what_a_fan_does_and_why_it_is_in_alarm(gateway, browser):
         "Math.max(...[...document.querySelectorAll('.fan')].map((e) => e.getBoundingClientRect().right))"
     )
     assert right_px > 1280 - 40, "cards fill the width"
+    assert errors == []
+
+
+def test_a_card_says_why_a_fan_is_not_judged_and_does_not_break_a_number(tmp_path, browser):
+    errors: list[str] = []
+    running = RunningGateway(tmp_path, fans=[{"name": "radiator of the second pump, left"}, {}, {}, {}])
+    no_twin = replace(score(1.0), invalid_reason=np.full((5, 4), InvalidReason.NO_TWIN, np.uint8))
+    try:
+        running.feed(score())
+        page = opened(browser, f"http://127.0.0.1:{running.port}/", errors, size=(390, 844))
+        unjudged = page.locator(f'[data-fan="{TRAY}/3"]')
+        expect(unjudged).to_contain_text("not judged")
+        expect(unjudged.locator(".why")).to_have_text("samples are missing")
+        running.feed(no_twin)
+        expect(unjudged.locator(".why")).to_contain_text("there is no twin yet")
+        number = page.locator(f'[data-fan="{TRAY}/0"]').get_by_text("(fan 0)", exact=True)
+        assert number.evaluate("(shown) => shown.getClientRects().length") == 1
+    finally:
+        running.close()
+    assert errors == []
+
+
+def test_a_silent_fan_says_since_when(tmp_path, browser, monkeypatch):
+    errors: list[str] = []
+    monkeypatch.setattr(site_model, "SILENT_AFTER_S", 0.0)
+    running = RunningGateway(tmp_path)
+    try:
+        page = opened(browser, f"http://127.0.0.1:{running.port}/", errors)
+        why = page.locator(".fan .why").first
+        expect(why).to_have_text("no sample yet")
+        running.feed(replace(score(), t_ns=time.time_ns() - 600 * 10**9 + np.arange(5)))
+        expect(why).to_have_text("no sample for 10 min")
+    finally:
+        running.close()
+    assert errors == []
+
+
+def test_the_deviation_is_filled_only_while_it_is_over_the_alarm_limit(gateway, browser):
+    errors: list[str] = []
+    outside = [replace(score(float(second)), band_variance=np.full((5, 4), 0.01, np.float32)) for second in range(60)]
+    gateway.feed(*outside)
+    page = opened(browser, f"http://127.0.0.1:{gateway.port}/#/fan/{TRAY}/2", errors)
+    page.get_by_role("button", name="1 min", exact=True).click()
+    plot = page.get_by_role("region", name="Deviation: measured minus twin")
+    expect(plot).to_contain_text("deviation −10 rpm")
+    assert plot.evaluate(RED_SHARE) == 0, "outside the band, but no alarm"
+    gateway.feed(*(replace(each, t_ns=each.t_ns + 60 * 10**9, score=each.score + 1) for each in outside))
+    page.wait_for_function(f"(plot) => ({RED_SHARE})(plot) > 0.3", arg=plot.element_handle())
+    assert errors == []
+
+
+def test_fingers_move_and_stretch_the_time_and_it_stays(gateway, browser):
+    errors: list[str] = []
+    gateway.feed(*(score(float(second)) for second in range(40)))
+    page = browser.new_context(viewport={"width": 390, "height": 844}, has_touch=True, is_mobile=True).new_page()
+    page.on("pageerror", lambda error: errors.append(str(error)))
+    page.goto(f"http://127.0.0.1:{gateway.port}/#/fan/{TRAY}/0")
+    plot = page.locator(".plot").first
+    expect(plot).to_contain_text("measured 1,000 rpm")
+    from_s, to_s = shown_s(page)
+    area = plot.locator(".u-over")
+    area.scroll_into_view_if_needed()
+    box = area.bounding_box()
+    assert box is not None
+    at = {"x": box["x"], "y": box["y"] + box["height"] / 2, "width": box["width"]}
+    fingers = page.context.new_cdp_session(page)
+
+    def touch(kind: str, *shares: float) -> None:
+        points = [
+            {"x": at["x"] + share * at["width"], "y": at["y"], "id": number} for number, share in enumerate(shares)
+        ]
+        fingers.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+
+    touch("touchStart", 0.5, 0.6)
+    touch("touchMove", 0.3, 0.8)
+    touch("touchEnd")
+    expect(page.get_by_role("button", name="● Live")).to_be_visible()
+    stretched = shown_s(page)
+    assert stretched[1] - stretched[0] == pytest.approx((to_s - from_s) / 5, abs=3)
+    assert stretched[0] + 0.3 * (stretched[1] - stretched[0]) == pytest.approx((from_s + to_s) / 2, abs=3)
+    touch("touchStart", 0.5)
+    touch("touchMove", 0.75)
+    touch("touchEnd")
+    moved = shown_s(page)
+    assert moved[0] - stretched[0] == pytest.approx(-0.25 * (stretched[1] - stretched[0]), abs=3)
+    gateway.feed(*(replace(score(float(second)), command=np.full((5, 4), 0.7, np.float32)) for second in range(40, 50)))
+    expect(page.locator(".title .command")).to_contain_text("0.7")
+    assert shown_s(page) == moved
     assert errors == []
 
 

@@ -4,7 +4,7 @@ import { buttons, buttonsForAll } from "./actions.js";
 import { age, clock, element, keepFocus, lengthText, percent } from "./dom.js";
 import { clipLink } from "./clips.js";
 import { courseOf, sameAlarm } from "./history.js";
-import { hashOf, label, where } from "./names.js";
+import { hashOf, label, shownLabel, where } from "./names.js";
 import { notifyButton } from "./notify.js";
 import { ask, learn } from "./server.js";
 
@@ -33,7 +33,7 @@ export function card(alarm, viewerUrl, { isOfFan = false } = {}) {
   const line = (term, text) => (text ? [element("dt", {}, term), element("dd", {}, text)] : []);
   return element("article", { class: `card ${kind}`, "data-fan": name(alarm), "aria-label": `Alarm of ${alarm.tray} ${label(alarm.tray, alarm.fan)}` },
     element("div", { class: "card-head" }, isOfFan && alarm.active ? "" : badge(alarm.active ? alarm.severity : "none", state),
-      isOfFan ? "" : element("a", { class: "name", href: hashOf(alarm.tray, alarm.fan) }, label(alarm.tray, alarm.fan)), isOfFan ? "" : element("span", { class: "where" }, where(alarm.tray, alarm.fan)),
+      isOfFan ? "" : element("a", { class: "name", href: hashOf(alarm.tray, alarm.fan) }, ...shownLabel(alarm.tray, alarm.fan)), isOfFan ? "" : element("span", { class: "where" }, where(alarm.tray, alarm.fan)),
       element("strong", {}, alarm.cause_with_share), element("span", { class: "muted" }, `since ${clock(alarm.onset_t_ns)} (`, age(alarm.onset_t_ns), ")")),
     element("dl", { class: "facts" }, ...line("Deviation", deviation), ...line("Evidence", [alarm.evidence, others && `less likely: ${others}`].filter(Boolean).join("; ")),
       ...line("What to do", alarm.advice), ...line("State", said.join(", "))),

@@ -1,5 +1,8 @@
 // Elements and texts. What comes from outside is only ever set as text, never as markup.
 
+// A number and its % stay on one line.
+const unbroken = (text) => (typeof text === "string" ? text.replace(/(\d) %/g, "$1\u00a0%") : text);
+
 export function element(tag, attributes = {}, ...children) {
   const made = document.createElement(tag);
   for (const [name, value] of Object.entries(attributes)) {
@@ -7,12 +10,13 @@ export function element(tag, attributes = {}, ...children) {
     else if (value === true) made.setAttribute(name, "");
     else if (value !== false && value !== null && value !== undefined) made.setAttribute(name, value);
   }
-  made.append(...children.filter((child) => child !== null && child !== undefined && child !== ""));
+  made.append(...children.filter((child) => child !== null && child !== undefined && child !== "").map(unbroken));
   return made;
 }
 
 // A text that has not changed is not set again: that would cost a layout.
-export function setText(shown, text) {
+export function setText(shown, given) {
+  const text = unbroken(given);
   if (shown.textContent !== text) shown.textContent = text;
 }
 

@@ -7,14 +7,14 @@ import { clock, element, facts, keepFocus, setText, stamp } from "./dom.js";
 import { csvAddress, savePicture } from "./export.js";
 import { HistoryView } from "./history.js";
 import { Marks } from "./marks.js";
-import { label, unitOf, where } from "./names.js";
+import { shownLabel, unitOf, where } from "./names.js";
 import { address } from "./overview.js";
 import { PlotStack } from "./plots.js";
 import { plotsOf } from "./fan_plots.js";
 import { ask, learn } from "./server.js";
 import { bytes, GROUPS, groupNumber, levelText } from "./states.js";
 import { Timeline } from "./timeline.js";
-import { wearTable } from "./wear.js";
+import { wearFacts } from "./wear.js";
 
 const RANGES = [["1 min", 60], ["10 min", 600], ["1 h", 3600], ["1 day", 86400], ["7 days", 604800]];
 const POINTS = 1200;
@@ -33,8 +33,8 @@ export class FanView {
     this.path = `/fans/${encodeURIComponent(tray)}/${fan}`;
     this.timeline = new Timeline();
     this.marks = new Marks();
-    this.stack = new PlotStack({ onZoom: (from_s, to_s) => this.zoom(from_s, to_s), onLive: () => this.show(this.window_s),
-      onCursor: (at_s) => setText(this.at, at_s === null ? "" : `at ${stamp(at_s * 1e9)}`), drawMarks: (plot) => this.drawMarks(plot) });
+    this.stack = new PlotStack({ onZoom: (from_s, to_s, isDone) => this.zoom(from_s, to_s, isDone), onLive: () => this.show(this.window_s),
+      onCursor: (at_s) => setText(this.at, at_s === null ? "" : `at ${stamp(at_s * 1e9)}`), drawAlarms: (plot) => this.marks.drawAlarms(plot), drawMarks: (plot) => this.drawMarks(plot) });
     this.root = this.build();
     this.updateAlarm(alarm);
     this.recolored = () => this.makePlots();
@@ -61,7 +61,7 @@ export class FanView {
     const tools = element("div", { class: "tools" }, this.ranges, this.pause, element("details", { class: "menu" }, element("summary", { class: "button" }, "From – to"), chosen),
       this.csv, button("PNG", () => savePicture(this.tray, this.fan, this.stack), { title: "The plots as a picture" }), this.at);
     return element("div", { class: "fan-view" },
-      element("div", { class: "title" }, element("a", { class: "back", href: address }, "← Fans"), element("h2", {}, label(this.tray, this.fan)), this.state,
+      element("div", { class: "title" }, element("a", { class: "back", href: address }, "← Fans"), element("h2", {}, ...shownLabel(this.tray, this.fan)), this.state,
         element("span", { class: "values" }, this.speed, element("span", { class: "unit" }, ` ${unitOf(this.tray)}`), this.command)),
       element("p", { class: "where" }, where(this.tray, this.fan), " ", this.since),
       this.alarm, tools, this.note, this.marks.strip, this.stack.root, this.marks.root,
@@ -83,7 +83,7 @@ export class FanView {
     this.twin.replaceChildren(twin ? facts({ "name": twin.name, "kind": twin.kind, "in force since": clock(twin.since_t_ns) || "the start",
       ...Object.fromEntries(Object.entries(twin.parameters).map(([name, value]) => [MEANINGS[name] ?? name, typeof value === "number" ? value.toPrecision(4) : String(value)])) })
       : element("p", { class: "muted" }, "There is no twin of this fan yet."));
-    this.wear.replaceChildren(wearTable(now.wear));
+    this.wear.replaceChildren(...wearFacts(now.wear));
   }
 
   // The past of the time shown, finer for a shorter one.
@@ -95,7 +95,7 @@ export class FanView {
     const past = await ask(`${this.path}/series?${new URLSearchParams(wanted)}`);
     if (asked !== this.asking) return;
     this.timeline.setPast(past);
-    this.marks.set(past.marks);
+    this.marks.set(past.marks, past.causes[0]?.t_s <= past.from_s);
     this.causes = past.causes;
     setText(this.note, past.note);
     this.makePlots();
@@ -142,12 +142,12 @@ export class FanView {
     learn(() => this.load());
   }
 
-  // A time that stays while samples come.
-  zoom(from_s, to_s) {
+  // A time that stays while samples come. isDone: a finger does not move it any more.
+  zoom(from_s, to_s, isDone = true) {
     const middle = (from_s + to_s) / 2, half = Math.max(to_s - from_s, LEAST_ZOOM_S) / 2;
     this.fixed = [middle - half, middle + half];
     this.draw();
-    learn(() => this.load());
+    if (isDone) learn(() => this.load());
   }
 
   choose(event) {

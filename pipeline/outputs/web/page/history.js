@@ -77,7 +77,7 @@ export class HistoryView {
       const of = day(new Date(fault[0].onset_t_ns / 1e6));
       days.set(of, [...(days.get(of) ?? []), fault]);
     }
-    this.body.replaceChildren(...[...days].map(([of, list]) => element("section", {}, element("h3", {}, of === day(new Date()) ? "today" : of), ...list.map((fault) => this.row(fault, open)))));
+    this.body.replaceChildren(...[...days].map(([of, list]) => element("section", {}, element("h3", {}, of === day(new Date()) ? "Today" : of), ...list.map((fault) => this.row(fault, open)))));
     const since = this.begins_t_ns ? ` since ${clock(this.begins_t_ns)}, when this history begins` : "";
     this.reach.textContent = faults.length ? (this.begins_t_ns && this.more.hidden ? `The history reaches back to ${clock(this.begins_t_ns)}.` : "") : `● No alarm${since}.`;
   }
@@ -90,7 +90,7 @@ export class HistoryView {
     const known = fault.find((each) => each.feedback !== "none");
     const said = known ? ACTIONS[known.feedback].title.toLowerCase() : "";
     const by = [...new Set(fault.map((each) => each.operator_name).filter(Boolean))].join(", ");
-    const length = cleared ? `for ${lengthText((cleared.t_ns - last.onset_t_ns) / 1e9)}` : last.active ? "still there" : "";
+    const length = cleared ? `for ${lengthText((cleared.t_ns - last.onset_t_ns) / 1e9)}` : last.active ? "still active" : "";
     return element("details", { class: "fault", "data-fault": key, open: open.has(key) },
       element("summary", {}, element("span", { class: `badge ${last.active ? worst : "plain"}` }, `${SYMBOLS[worst]} ${worst === "none" ? "event" : worst}`), element("time", {}, stamp(last.onset_t_ns).slice(11)),
         this.fan ? "" : element("span", { class: "name" }, inFull(last.tray, last.fan)), element("span", { class: "what" }, cause ? `${cause.cause}, ${percent(cause.probability)}` : first.message),

@@ -14,13 +14,21 @@ const words = (mark) => `${stamp(mark.t_s * 1e9).slice(5)} ${whatHappened(mark.t
 
 export class Marks {
   constructor() {
-    this.marks = [];
+    Object.assign(this, { marks: [], active: [] });
     this.strip = element("div", { class: "marks" });
     this.list = element("ul", {});
     this.root = element("details", { class: "mark-list", hidden: true }, element("summary", {}, "What happened in this time"), this.list);
   }
 
-  set(marks) {
+  // isActive: there was an alarm already when the time asked for began.
+  set(marks, isActive) {
+    this.active = [];  // from when to when there was an alarm, s
+    let since_s = isActive ? -Infinity : null;
+    for (const mark of marks) {
+      if (mark.active) since_s ??= mark.transition === "raised" ? mark.t_s : -Infinity;
+      else if (since_s !== null) { this.active.push([since_s, mark.t_s]); since_s = null; }
+    }
+    if (since_s !== null) this.active.push([since_s, Infinity]);
     this.marks = marks.filter((mark) => SHOWN.includes(mark.transition));
   }
 
@@ -51,7 +59,17 @@ export class Marks {
     this.strip.hidden = this.root.hidden = !shown.length;
   }
 
-  // Into one plot.
+  // Into one plot, below its lines.
+  drawAlarms(plot) {
+    const { ctx, bbox } = plot, inside = (t_s) => Math.min(Math.max(plot.valToPos(t_s, "x", true), bbox.left), bbox.left + bbox.width);
+    ctx.fillStyle = getComputedStyle(document.documentElement).getPropertyValue("--in-alarm").trim();
+    for (const [from_s, to_s] of this.active) {
+      const from = inside(from_s);
+      ctx.fillRect(from, bbox.top, inside(to_s) - from, bbox.height);
+    }
+  }
+
+  // Into one plot, above its lines.
   draw(plot) {
     const { ctx, bbox } = plot, style = getComputedStyle(document.documentElement);
     ctx.save();

@@ -1,5 +1,7 @@
 // What fans are called, where they are, and the address of the view of each.
 
+import { element } from "./dom.js";
+
 let trays = new Map();
 
 export function learnNames(site) {
@@ -14,6 +16,12 @@ export const hashOf = (tray, fan) => `#/fan/${encodeURIComponent(tray)}/${fan}`;
 export function label(tray, fan) {
   const name = nameOf(tray, fan);
   return name ? `${name} (fan ${fan})` : `fan ${fan}`;
+}
+
+// The same to be shown: between the brackets it is not broken.
+export function shownLabel(tray, fan) {
+  const name = nameOf(tray, fan);
+  return name ? [`${name} `, element("span", { class: "number-of-fan" }, `(fan ${fan})`)] : [`fan ${fan}`];
 }
 
 export function inFull(tray, fan) {

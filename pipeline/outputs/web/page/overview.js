@@ -11,7 +11,9 @@ import { ask, learn } from "./server.js";
 
 const CARDS_UP_TO = 150;
 const SLICE = 1250;  // tiles that are drawn in a frame
-const LEAST_SPARK = 44, MOST_SPARK = 440, SPARE = 18, LEAST_CARD = 240;  // pixels
+const LEAST_SPARK = 44, MOST_SPARK = 440, SPARE = 18, LEAST_CARD = 240, LEAST_TILE = 23, MOST_TILE = 48;  // pixels
+const FLAT = 0.5;  // the largest height of a picture, as a share of the width of its card
+const GROUPED_FROM = 9;  // fans, from which on it helps to group them otherwise
 const RANK = { alarm: 0, suspect: 1, learning: 2, not_judged: 2 };  // of a card within its section
 const ALARM = groupNumber("alarm"), NOT_JUDGED = groupNumber("not_judged"), LEARNING = groupNumber("learning");
 
@@ -41,7 +43,7 @@ export class Overview {
     const choice = (id, text, options) => {
       const select = element("select", { id, onchange: () => this.choose() }, ...options.map(([value, words]) => element("option", { value }, words)));
       if (options.some(([value]) => value === filters.get(id))) select.value = filters.get(id);
-      return [element("label", { for: id }, text), select];
+      return [element("span", { class: "choice" }, element("label", { for: id }, text), select), select];
     };
     const trays = choice("tray", "Tray", [["", "all trays"], ...this.site.trays.map((tray) => [tray.name, tray.name])]);
     const by = choice("by", "Grouped by", [["tray", "tray"], ["place", "place"]]);
@@ -50,7 +52,7 @@ export class Overview {
       hidden: true, onclick: () => { this.state = this.state === group.name ? "" : group.name; this.choose(); } }));
     const bar = element("form", { class: "bar", onsubmit: (event) => event.preventDefault() },
       element("div", { class: "chips", role: "group", "aria-label": "Fans by state; press one to see only these" }, ...this.chips),
-      ...(this.site.trays.length > 1 ? trays : []), ...(hasPlaces() && !this.isDense ? by : []));
+      this.site.trays.length > 1 ? trays[0] : "", hasPlaces() && !this.isDense && this.fans.length >= GROUPED_FROM ? by[0] : "");
     this.panel = new LearningPanel();
     this.nothing = element("p", { class: "muted", hidden: true }, "No fan matches this selection.");
     this.cells = this.fans.map((fan, index) => new (this.isDense ? FanTile : FanCard)(fan.tray, fan.fan, index));
@@ -75,16 +77,24 @@ export class Overview {
     for (const { where: shown, tray, fan } of this.isDense ? [] : this.cells) shown.textContent = this.by.value === "place" ? tray : placeOf(tray, fan);
   }
 
-  // The pictures fill the screen where fans are few.
+  // What is shown fills the screen where fans are few.
   fit() {
-    if (this.isDense || !this.root.isConnected) return;
-    for (const { cells, indexes } of this.sections) {  // as many columns as fill every row
-      const count = indexes.filter((index) => !this.cells[index].root.hidden).length, most = Math.max(1, Math.floor(cells.clientWidth / LEAST_CARD));
-      cells.style.setProperty("--columns", Math.ceil(count / Math.ceil(count / most)) || 1);
-    }
+    if (!this.root.isConnected) return;
+    if (this.isDense) { this.fitTiles(); return; }
     const cards = this.cells.map((cell) => cell.root).filter((root) => !root.hidden);
-    const rows = new Set(cards.map((root) => root.offsetTop)).size, spark = cards[0]?.querySelector(".spark").clientHeight ?? 0;
-    if (!rows) return;
+    if (!cards.length) return;
+    const spark = cards[0].querySelector(".spark").clientHeight, width = this.main.clientWidth;
+    const counts = this.sections.map(({ indexes }) => indexes.filter((index) => !this.cells[index].root.hidden).length);
+    // as many columns as fill every row, and not so many that the pictures are higher than wide
+    const columns = (count, most) => Math.ceil(count / Math.ceil(count / most)) || 1;
+    const isGood = (most) => {
+      const lines = counts.reduce((sum, count) => sum + Math.ceil(count / columns(count, most)), 0);
+      return (innerHeight - this.main.offsetTop) / lines - (cards[0].offsetHeight - spark) <= FLAT * width / most && counts.every((count) => count > 4 || count % columns(count, most) === 0);
+    };
+    let most = Math.max(1, Math.floor(width / LEAST_CARD));
+    while (spark && most > 1 && !isGood(most)) most -= 1;
+    this.sections.forEach(({ cells }, i) => cells.style.setProperty("--columns", columns(counts[i], most)));
+    const rows = new Set(cards.map((root) => root.offsetTop)).size;
     const others = this.root.getBoundingClientRect().bottom + scrollY - rows * spark;
     const height = Math.max(LEAST_SPARK, Math.min(MOST_SPARK, (innerHeight - others - SPARE) / rows));
     if (Math.abs(height - spark) > 4) this.root.style.setProperty("--spark", `${Math.floor(height)}px`);
@@ -93,17 +103,21 @@ export class Overview {
   // Also after events were missed: the last minute of the fans that have a picture.
   begin() {
     return learn(async () => {
-      const now_s = performance.now() / 1000;
-      for (const spark of (await ask("/sparks")).fans) {
+      const { fans } = await ask("/sparks"), now_s = performance.now() / 1000;
+      for (const spark of fans) {
         const card = this.cardOf(spark.tray, spark.fan);
         if (!card?.spark) continue;
-        const later = card.spark.rows.filter((row) => row[0] > now_s);
         card.spark.rows = [];
         spark.t_s.forEach((t_s, i) => card.spark.add(now_s + t_s - spark.t_s.at(-1), spark.measured[i], spark.predicted[i], spark.half_width[i]));
-        card.spark.rows.push(...later);
         card.spark.draw();
       }
     });
+  }
+
+  fitTiles() {
+    const inLine = Math.max(1, Math.floor(this.main.clientWidth / LEAST_TILE)), lines = this.sections.reduce((sum, { indexes }) => sum + Math.ceil(indexes.length / inLine), 0);
+    const height = (innerHeight - this.main.offsetTop - SPARE) / lines - 6;
+    this.root.style.setProperty("--tile", `${Math.max(LEAST_TILE, Math.min(MOST_TILE, Math.floor(height)))}px`);
   }
 
   cardOf(tray, fan) {
@@ -118,13 +132,19 @@ export class Overview {
     this.levels = bytes(fleet.levels);
     this.values = fleet.values;
     this.learning = fleet.learning;
+    this.silent_since_t_ns = fleet.silent_since_t_ns;
     this.waiting = this.cells.length;
     if (this.isDense) this.attend();
     if (isFirst || !this.isDense) this.draw(this.waiting);
     else this.frame ||= requestAnimationFrame(() => this.draw(SLICE));
     const now_s = performance.now() / 1000, { fans, speed, command, twin, half_width } = fleet.values;
     fans.forEach((index, i) => (this.isDense ? this.above.get(index) : this.cells[index])?.showValues(now_s, speed[i], command[i], twin[i], half_width[i]));
-    if (this.isDense) { this.panel.update(this.learning, false); return; }
+    if (this.isDense) {
+      this.panel.update(this.learning, false);
+      if (isFirst || this.fitted !== this.above.size) this.fit();
+      this.fitted = this.above.size;
+      return;
+    }
     this.cells.forEach((cell) => this.explainCard(cell));
     const isUnheard = this.cells.every((cell) => this.site.classes[cell.class] === "silent" && cell.spark.rows.every((row) => row[1] === null));
     this.panel.update(this.learning, isUnheard);
@@ -173,7 +193,7 @@ export class Overview {
   }
 
   explainCard(card) {
-    if (card instanceof FanCard) card.explain(this.alarms.get(`${card.tray}/${card.fan}`), learningText(this.learning[card.tray]?.[card.fan]));
+    if (card instanceof FanCard) card.explain(this.alarms.get(`${card.tray}/${card.fan}`), learningText(this.learning[card.tray]?.[card.fan]), this.silent_since_t_ns?.[card.tray]);
   }
 
   // Cards of the fans in alarm of a large site, of those whose speeds come.

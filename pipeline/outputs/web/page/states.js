@@ -7,7 +7,7 @@ export const GROUPS = [
   { name: "learning", title: "learning", mark: "◔" },
   { name: "not_judged", title: "not judged", mark: "?" },
   { name: "silenced", title: "silenced", mark: "◌" },
-  { name: "at_rest", title: "stopped or starting", mark: "■" },
+  { name: "at_rest", title: "at rest", mark: "■" },
   { name: "normal", title: "normal", mark: "●" },
 ];
 export const ABOUT = {

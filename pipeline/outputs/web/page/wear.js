@@ -1,29 +1,20 @@
 // The wear of a fan: how its speed has changed since commissioning, how fast, and when the limit will be reached.
 
-import { clock, element } from "./dom.js";
+import { clock, element, facts } from "./dom.js";
 
 const DAY_NS = 86400e9;
 const digits = (value) => Number(Math.abs(value).toPrecision(2));
 const percent = (share) => `${share < 0 ? "−" : "+"}${digits(100 * share)} %`;
-const within = (share, half) => `${percent(share)} ± ${digits(100 * half)} %`;
+const within = (share, half) => `${percent(share)} ± ${digits(100 * half)} % (95 %)`;
 
-export function wearTable(rows) {
-  if (!rows.length) return element("p", { class: "muted" }, "No data yet. The first values of a fan appear about an hour after commissioning.");
-  const heads = ["Change of the speed (95 % interval)", "Fans beside it", "Change per day (95 % interval)", `${digits(100 * rows[0].limit)} % reached`];
-  return element("div", {}, element("p", { class: "muted" }, `Since commissioning, as of ${clock(rows[0].t_ns)}.`),
-    element("div", { class: "scroll", tabindex: 0, role: "region", "aria-label": "Wear" },
-      element("table", { class: "folding" },
-        element("thead", {}, element("tr", {}, ...heads.map((text) => element("th", { scope: "col" }, text)))),
-        element("tbody", {}, ...rows.map(row)))));
-}
-
-function row(each) {
-  const cell = (label, text) => element("td", { "data-label": label }, text);
-  const trend = each.per_day;
-  return element("tr", {}, cell("Change", within(each.change, 1.96 * each.error)),
-    cell("Fans beside it", each.beside === null ? "" : percent(each.beside)),
-    cell("Change per day", trend ? within(trend.value, (trend.high - trend.low) / 2) : "no trend yet"),
-    cell("Limit reached", forecast(each)));
+export function wearFacts(rows) {
+  if (!rows.length) return [element("p", { class: "muted" }, "No data yet. The first values of a fan appear about an hour after commissioning.")];
+  return rows.map((each) => facts({
+    "change of the speed": `${within(each.change, 1.96 * each.error)}, as of ${clock(each.t_ns)}`,
+    "fans beside it": each.beside === null ? "" : percent(each.beside),
+    "change per day": each.per_day ? within(each.per_day.value, (each.per_day.high - each.per_day.low) / 2) : "no trend yet",
+    [`${digits(100 * each.limit)} % reached`]: forecast(each),
+  }));
 }
 
 function forecast(each) {
