@@ -28,7 +28,7 @@ export function card(alarm, viewerUrl, { isOfFan = false } = {}) {
   const kind = !alarm.active ? "over" : alarm.presented ? alarm.severity : "silenced", state = alarm.active ? alarm.severity : "over";
   const said = alarm.states.map((each) => (each === "acknowledged" && alarm.acknowledged_by ? `${each} by ${alarm.acknowledged_by}` : each))
     .concat(alarm.now ? `now ${alarm.now}` : []);
-  const deviation = alarm.evidence && alarm.message.includes(alarm.evidence) ? "" : alarm.about;
+  const deviation = !alarm.active || (alarm.evidence && alarm.message.includes(alarm.evidence)) ? "" : alarm.about;
   const others = alarm.other_causes.map(share).join("; ");
   const line = (term, text) => (text ? [element("dt", {}, term), element("dd", {}, text)] : []);
   return element("article", { class: `card ${kind}`, "data-fan": name(alarm), "aria-label": `Alarm of ${alarm.tray} ${label(alarm.tray, alarm.fan)}` },

@@ -77,7 +77,7 @@ export class FanView {
   async learn() {
     const now = await ask(this.path), twin = now.twin;
     this.showState(now.state);
-    setText(this.since, now.alarm?.active || !now.since_t_ns ? "" : `since ${clock(now.since_t_ns)}`);
+    setText(this.since, now.alarm?.active || !now.since_t_ns ? "" : `· since ${clock(now.since_t_ns)}`);
     setText(this.speed, speedText(now.speed));
     setText(this.command, now.command === null ? "" : `command ${commandText(now.command)}`);
     this.twin.replaceChildren(twin ? facts({ "name": twin.name, "kind": twin.kind, "in force since": clock(twin.since_t_ns) || "the start",
@@ -191,7 +191,7 @@ export class FanView {
     const isNear = ["normal", "suspect"].includes(group.name) && levelText(this.level);
     this.state.className = `state badge ${group.name}`;
     const isAlarm = group.name === "alarm" && !text.startsWith("alarm");
-    setText(this.state, `${group.mark} ${isAlarm ? "alarm, now " : ""}${text}${isNear ? `, ${isNear}` : ""}`);
+    setText(this.state, `${group.mark} ${isAlarm ? "alarm, now " : ""}${text.replace("unknown", "not judged")}${isNear ? `, ${isNear}` : ""}`);
   }
 
   // isNew: a transition has come.

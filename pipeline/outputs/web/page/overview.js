@@ -11,7 +11,7 @@ import { ask, learn } from "./server.js";
 
 const CARDS_UP_TO = 150;
 const SLICE = 1250;  // tiles that are drawn in a frame
-const LEAST_SPARK = 44, MOST_SPARK = 440, SPARE = 18, LEAST_CARD = 240, LEAST_TILE = 23, MOST_TILE = 48;  // pixels
+const LEAST_SPARK = 44, MOST_SPARK = 440, SPARE = 18, LEAST_CARD = 240, LEAST_TILE = 23, MOST_TILE = 64;  // pixels
 const FLAT = 0.5;  // the largest height of a picture, as a share of the width of its card
 const GROUPED_FROM = 9;  // fans, from which on it helps to group them otherwise
 const RANK = { alarm: 0, suspect: 1, learning: 2, not_judged: 2 };  // of a card within its section

@@ -100,7 +100,7 @@ export class Plot {
     this.about.lines.forEach((line, i) => {
       if (!line.label || line.isPlain) return;
       const value = columns[i][at];
-      const text = line.isArea ? line.between.map((each) => number(columns[each][at])).join(" to ") : number(value);
+      const text = line.isArea && value !== null && value !== undefined ? line.between.map((each) => number(columns[each][at])).join(" to ") : number(value);
       setText(this.values[i], ` ${text}${value === null || value === undefined || !this.about.unit ? "" : ` ${this.about.unit}`}`);
     });
   }
