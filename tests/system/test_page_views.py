@@ -197,6 +197,7 @@ def test_the_axis_is_the_window_and_a_zoom_stays_while_samples_come(gateway, bro
     expect(plot).to_contain_text("measured 1,000 rpm")
     from_s, to_s = shown_s(page)
     assert to_s - from_s == pytest.approx(600, abs=1), "the axis is the window, though only 40 s were heard"
+    plot.evaluate("(shown) => { shown.isKept = true; }")
     area = plot.locator(".u-over")
     box = area.bounding_box()
     assert box is not None
@@ -224,6 +225,7 @@ def test_the_axis_is_the_window_and_a_zoom_stays_while_samples_come(gateway, bro
     gateway.feed(score(80.0))
     expect(page.get_by_role("button", name="● Live")).to_be_visible()
     assert shown_s(page) == paused
+    assert plot.evaluate("(shown) => shown.isKept"), "what is dragged over is not made again when the past comes"
     assert errors == []
 
 

@@ -37,7 +37,7 @@ export class FanView {
       onCursor: (at_s) => setText(this.at, at_s === null ? "" : `at ${stamp(at_s * 1e9)}`), drawAlarms: (plot) => this.marks.drawAlarms(plot), drawMarks: (plot) => this.drawMarks(plot) });
     this.root = this.build();
     this.updateAlarm(alarm);
-    this.recolored = () => this.makePlots();
+    this.recolored = () => { this.madePlots = ""; this.makePlots(); };
     this.scheme = matchMedia("(prefers-color-scheme: dark)");
     this.scheme.addEventListener("change", this.recolored);
     this.begin();
@@ -101,10 +101,14 @@ export class FanView {
     this.makePlots();
   }
 
+  // Plots that are there already stay: somebody may be dragging over one.
   makePlots() {
-    const wanted = plotsOf(this.timeline.names, this.site.channels, unitOf(this.tray), this.causeNames().names);
-    this.stack.clear();
-    this.drawers = wanted.map((about) => [this.stack.add(about), about]);
+    const wanted = plotsOf(this.timeline.names, this.site.channels, unitOf(this.tray), this.causeNames().names), names = JSON.stringify(wanted);
+    if (names !== this.madePlots) {
+      this.madePlots = names;
+      this.stack.clear();
+      this.drawers = wanted.map((about) => [this.stack.add(about), about]);
+    }
     this.draw();
   }
 
