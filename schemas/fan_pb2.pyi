@@ -366,6 +366,28 @@ class Score(_message.Message):
     measured: Measured
     def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fans: _Optional[int] = ..., period_ns: _Optional[int] = ..., t_ns: _Optional[_Iterable[int]] = ..., command: _Optional[_Iterable[float]] = ..., measured_speed_rad_s: _Optional[_Iterable[float]] = ..., predicted_speed_rad_s: _Optional[_Iterable[float]] = ..., band_variance: _Optional[_Iterable[float]] = ..., state: _Optional[_Iterable[_Union[FanState, str]]] = ..., valid: _Optional[_Iterable[bool]] = ..., invalid_reason: _Optional[_Iterable[_Union[InvalidReason, str]]] = ..., torque_balance_command: _Optional[_Iterable[float]] = ..., expected_residual_rad_s: _Optional[_Iterable[float]] = ..., expected_balance_command: _Optional[_Iterable[float]] = ..., score: _Optional[_Iterable[float]] = ..., statistic: _Optional[_Iterable[_Union[Statistic, str]]] = ..., measured: _Optional[_Union[Measured, _Mapping]] = ...) -> None: ...
 
+class Overview(_message.Message):
+    __slots__ = ("header", "fans", "t_ns", "predicted_speed_rad_s", "band_half_width_rad_s", "residual_rad_s", "lowest_residual_rad_s", "highest_residual_rad_s", "highest_score")
+    HEADER_FIELD_NUMBER: _ClassVar[int]
+    FANS_FIELD_NUMBER: _ClassVar[int]
+    T_NS_FIELD_NUMBER: _ClassVar[int]
+    PREDICTED_SPEED_RAD_S_FIELD_NUMBER: _ClassVar[int]
+    BAND_HALF_WIDTH_RAD_S_FIELD_NUMBER: _ClassVar[int]
+    RESIDUAL_RAD_S_FIELD_NUMBER: _ClassVar[int]
+    LOWEST_RESIDUAL_RAD_S_FIELD_NUMBER: _ClassVar[int]
+    HIGHEST_RESIDUAL_RAD_S_FIELD_NUMBER: _ClassVar[int]
+    HIGHEST_SCORE_FIELD_NUMBER: _ClassVar[int]
+    header: Header
+    fans: int
+    t_ns: _containers.RepeatedScalarFieldContainer[int]
+    predicted_speed_rad_s: _containers.RepeatedScalarFieldContainer[float]
+    band_half_width_rad_s: _containers.RepeatedScalarFieldContainer[float]
+    residual_rad_s: _containers.RepeatedScalarFieldContainer[float]
+    lowest_residual_rad_s: _containers.RepeatedScalarFieldContainer[float]
+    highest_residual_rad_s: _containers.RepeatedScalarFieldContainer[float]
+    highest_score: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, header: _Optional[_Union[Header, _Mapping]] = ..., fans: _Optional[int] = ..., t_ns: _Optional[_Iterable[int]] = ..., predicted_speed_rad_s: _Optional[_Iterable[float]] = ..., band_half_width_rad_s: _Optional[_Iterable[float]] = ..., residual_rad_s: _Optional[_Iterable[float]] = ..., lowest_residual_rad_s: _Optional[_Iterable[float]] = ..., highest_residual_rad_s: _Optional[_Iterable[float]] = ..., highest_score: _Optional[_Iterable[float]] = ...) -> None: ...
+
 class Diagnosis(_message.Message):
     __slots__ = ("cause", "probability", "parameter", "change", "unit", "evidence")
     CAUSE_FIELD_NUMBER: _ClassVar[int]

@@ -24,6 +24,7 @@ from fantwin.schemas.tacho import Tacho
 LARGEST_PERIOD_NS = 86_400_000_000_000  # a day
 FURTHEST_T_NS = (1 << 62) - LARGEST_PERIOD_NS  # in the year 2116, and as far before 1970: differences fit into 64 bits
 RECEIVE_TIMES = (1 - FURTHEST_T_NS, FURTHEST_T_NS - 1)
+OVERVIEW_ROW_NS = 1_000_000_000
 GRID_TIMES = (1 - (1 << 62), (1 << 62) - 1)  # the grid may go a little beyond what was received
 
 
@@ -182,6 +183,27 @@ class Score(Measured):
     def outside(self) -> Array:
         """Whether the sample lies outside the band."""
         return np.abs(self.residual_rad_s) > np.sqrt(self.band_variance)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Overview:
+    """What the scores of each second come to. A row is of one second, or of one sample where these are rarer.
+
+    Values are of the samples that were judged, NaN where none was. A scorer that takes a snapshot in the middle of a
+    second sends the row so far, and at the end of the second the whole one.
+    """
+
+    header: Header = Header()
+    fans: int
+    t_ns: Array = column("samples", np.int64, limits=GRID_TIMES)
+    """of the newest sample of each row"""
+    predicted_speed_rad_s: Array = column("samples x fans", np.float32)
+    band_half_width_rad_s: Array = column("samples x fans", np.float32)
+    residual_rad_s: Array = column("samples x fans", np.float32)
+    """measured minus predicted: the mean"""
+    lowest_residual_rad_s: Array = column("samples x fans", np.float32)
+    highest_residual_rad_s: Array = column("samples x fans", np.float32)
+    highest_score: Array = column("samples x fans", np.float32)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -343,6 +365,7 @@ Message: TypeAlias = (
     | Grid
     | Prediction
     | Score
+    | Overview
     | Alarm
     | Request
     | ScorerSnapshot

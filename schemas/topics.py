@@ -20,6 +20,7 @@ from fantwin.schemas.messages import (
     Message,
     ModelCard,
     NewTwin,
+    Overview,
     Prediction,
     PushedSamples,
     Raw,
@@ -66,6 +67,8 @@ class Topic:
     """a consumer that begins needs its last message before those of other topics"""
     is_of_people: bool = False
     """people and programs that are no stage publish it too"""
+    is_summary: bool = False
+    """its rows are made from many samples: few bytes, so they are recorded whatever samples are"""
     is_of_session: bool = False
     """about a session of a stage: a live replay does not publish it, since that session does not run"""
 
@@ -77,7 +80,7 @@ class Topic:
     @property
     def has_samples(self) -> bool:
         """Its messages are blocks of samples, nearly all bytes of a recording: a recorder may leave them out."""
-        return time_column(self.message) in columns(self.message)
+        return time_column(self.message) in columns(self.message) and not self.is_summary
 
     @property
     def is_rare(self) -> bool:
@@ -112,6 +115,16 @@ TOPICS: tuple[Topic, ...] = (
     Topic("grid", Grid, "the grid's rate over the block size", True, 8192, 16 * MIB, "samples on a uniform grid"),
     Topic("prediction", Prediction, "as grid", True, 8192, 32 * MIB, "the healthy twin beside the measurement"),
     Topic("score", Score, "as prediction", True, 8192, 64 * MIB, "scored samples, ready to draw"),
+    Topic(
+        "overview",
+        Overview,
+        "once in 10 s",
+        True,
+        64,
+        2 * MIB,
+        "twin, deviation and score of each second",
+        is_summary=True,
+    ),
     Topic("alarm", Alarm, ON_CHANGE, True, CATCH_UP_MESSAGES, MIB, "transitions of alarms"),
     Topic("request", Request, ON_CHANGE, True, 64, 64 * KIB, "requests of operators about alarms", is_of_people=True),
     Topic(

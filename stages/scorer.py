@@ -2,8 +2,9 @@
 
 Reads: topic `prediction` (measured and predicted speed rad/s, torque balance in command units), `request` (what
 operators request about alarms), and `twin` where twins are learned (pipeline.tray_scoring.learned_scorer).
-Writes: topic `score` (residuals, what is expected of the fan, how much speaks for a fault, state), `alarm` (every
-transition of a fan's alarm), `snapshot` (the state to continue from after a restart).
+Writes: topic `score` (residuals, what is expected of the fan, how much speaks for a fault, state), `overview` (the same
+by the second, always recorded), `alarm` (every transition of a fan's alarm), `snapshot` (the state to continue from
+after a restart).
 Timing: one score message for every prediction message, immediately; of messages that wait together, one.
 
 The core is pipeline.tray_scoring.scorer_core. See docs/explanation/deciding.md.

@@ -51,7 +51,7 @@ STAGES: dict[str, StageRow] = {
             enabled_by="default",
             needs_twin=True,
             reads=("prediction", "request", "twin"),
-            writes=("score", "alarm", "snapshot"),
+            writes=("score", "overview", "alarm", "snapshot"),
         ),
         StageRow(
             RECORDER,

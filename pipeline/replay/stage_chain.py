@@ -28,9 +28,10 @@ class StageChain:
 
     @property
     def side_topics(self) -> tuple[str, ...]:
-        """What the last stage reads and writes besides its main input and the result."""
+        """What the last stage reads and writes besides its main input, the result and its summary."""
         last = self.stages[-1]
-        return (*last.reads[1:], *(topic for topic in last.writes if topic != self.outputs[-1]))
+        others = (topic for topic in last.writes if topic != self.outputs[-1] and not BY_NAME[topic].is_summary)
+        return (*last.reads[1:], *others)
 
 
 def derive_chain(stages: Iterable[Stage], source: str = SOURCE, result: str = RESULT) -> StageChain:

@@ -157,7 +157,7 @@ class LearnedTwinScorer(Core):
         try:
             twin = tray_twin(Path(name), card.content, self._tray.fans)
             before = self._core.last_snapshot() if self._core else []
-            continues = before[0] if before else None
+            continues = next((each for each in before if isinstance(each, ScorerSnapshot)), None)
             if continues and self._has_other_limits_only(card):
                 continues = replace(continues, twin_sha256=twin.sha256)  # what was learned, alarms and wear go on
             core = self._core_of(twin, continues)

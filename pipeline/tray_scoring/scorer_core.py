@@ -14,13 +14,14 @@ import numpy as np
 from fantwin.pipeline.prediction.new_samples import BEGINNING_NS, NewSamples
 from fantwin.pipeline.runtime.stage import Core, never
 from fantwin.pipeline.tray_scoring.healthy_twin import HealthyTwin
+from fantwin.pipeline.tray_scoring.overview_rows import OverviewRows
 from fantwin.pipeline.tray_scoring.scorer_config import ScorerConfig
 from fantwin.pipeline.tray_scoring.scorer_state import ScorerState, with_times_moved
 from fantwin.pipeline.tray_scoring.snapshot_store import SnapshotStore
 from fantwin.pipeline.tray_scoring.tray_scorer import JudgedShare, TrayScorer
 from fantwin.schemas.enums import Transition
 from fantwin.schemas.fan_names import NO_NAMES, FanNames
-from fantwin.schemas.messages import Alarm, Message, ModelCard, Prediction, Request, Score, ScorerSnapshot
+from fantwin.schemas.messages import Alarm, Message, ModelCard, Overview, Prediction, Request, Score, ScorerSnapshot
 from fantwin.schemas.units import NS_PER_S, SpeedUnit
 from fantwin.scoring.alarms.alarm_text import AlarmText
 from fantwin.scoring.alarms.unscored_monitor import UnscoredMonitor
@@ -97,6 +98,7 @@ class ScorerCore(Core):
 
     def _start_new(self) -> None:
         self.tray = TrayScorer(self._fans, self._text, self._config, self._twin)
+        self._overview = OverviewRows()
         self._samples.last_t_ns = self._snapshot_t_ns = BEGINNING_NS
         self._shown_until_t_ns = np.iinfo(np.int64).max
         """end of the time in which health says that a snapshot was not used; not known before the first sample"""
@@ -162,16 +164,17 @@ class ScorerCore(Core):
         block = self._samples.take(item)
         return [*before_score, *self._score(block, item.header.producer)] if block is not None else [*before_score]
 
-    def _score(self, block: Prediction, producer: str) -> list[Score | Alarm | ScorerSnapshot]:
+    def _score(self, block: Prediction, producer: str) -> list[Score | Overview | Alarm | ScorerSnapshot]:
         self._shown_until_t_ns = min(self._shown_until_t_ns, int(block.t_ns[0]) + SHOWN_NS)
         self._input_producer = producer
         score, alarms = self.tray.score(block)
         self._unscored.update(block.period_ns, score.valid, score.invalid_reason)
         self._judged_share.add(score.valid, score.invalid_reason)
         self._owes_snapshot |= bool(alarms)
+        overview = self._overview.add(score)
         snapshots = self._take_due_snapshot() if self._is_snapshot_due(block.period_ns) else []
         # the snapshot first: whoever takes over from one that is killed now must not raise these alarms again
-        return [score, *snapshots, *alarms]
+        return [score, *overview, *snapshots, *alarms]
 
     def counters(self) -> Mapping[str, int]:
         """docs/explanation/deciding.md says what each counts."""
@@ -199,14 +202,14 @@ class ScorerCore(Core):
         problems.append(self.tray.wear.problem(self._samples.last_t_ns))
         return "; ".join(filter(None, problems))
 
-    def close(self) -> list[ScorerSnapshot]:
-        """The snapshot that the next session continues from."""
+    def close(self) -> list[Overview | ScorerSnapshot]:
+        """The rest of the overview, and the snapshot that the next session continues from."""
         snapshots = self.last_snapshot()
         self.abort()
         return snapshots
 
-    def last_snapshot(self) -> list[ScorerSnapshot]:
-        """The state now; nothing before the first sample."""
+    def last_snapshot(self) -> list[Overview | ScorerSnapshot]:
+        """The state now, after the overview up to now; nothing before the first sample."""
         return self._take_snapshot() if self._samples.last_t_ns > BEGINNING_NS else []
 
     def abort(self) -> None:
@@ -254,7 +257,7 @@ class ScorerCore(Core):
         self._counts["snapshots_of_other_times"] += 1
         return discarded
 
-    def _answer(self, request: Request) -> list[Alarm | ScorerSnapshot]:
+    def _answer(self, request: Request) -> list[Overview | Alarm | ScorerSnapshot]:
         alarms = self.tray.alarms.answer(request, max(self._samples.last_t_ns, 0))
         if not alarms:
             self._counts["requests_repeated"] += 1
@@ -270,21 +273,21 @@ class ScorerCore(Core):
         rest_ns = self._rest_ns if self._owes_snapshot else max(SNAPSHOT_PERIOD_NS, SNAPSHOT_PERIOD_SAMPLES * period_ns)
         return self._samples.last_t_ns - self._snapshot_t_ns >= rest_ns
 
-    def _take_due_snapshot(self) -> list[ScorerSnapshot]:
-        """Save the state; returns it if it is to be published, too."""
+    def _take_due_snapshot(self) -> list[Overview | ScorerSnapshot]:
+        """Save the state; returns the overview up to now, and the state if it is to be published, too."""
         unpublished = self._unpublished + 1
         is_published = not self._rest_ns or self._owes_snapshot or unpublished == SAVED_OF_PUBLISHED
-        snapshots = self._take_snapshot()
+        *overview, snapshot = self._take_snapshot()
         self._unpublished = 0 if is_published else unpublished
-        return snapshots if is_published else []
+        return [*overview, snapshot] if is_published else overview
 
-    def _take_snapshot(self) -> list[ScorerSnapshot]:
-        """The state for a restart."""
+    def _take_snapshot(self) -> list[Overview | ScorerSnapshot]:
+        """The state for a restart, after the overview up to now: whoever continues from it does not make that again."""
         self._snapshot_t_ns, self._owes_snapshot = self._samples.last_t_ns, False
         snapshot = self._snapshot()
         if self._snapshot_store:
             self._snapshot_store.save(snapshot)
-        return [snapshot]
+        return [*self._overview.so_far(), snapshot]
 
     def _snapshot(self) -> ScorerSnapshot:
         state = self.tray.state(self._input_producer)

@@ -166,7 +166,7 @@ def scored(core: ScorerCore, item: Any) -> list[dict[str, Any]]:
 
 
 def state_of(core: ScorerCore) -> Any:
-    (snapshot,) = core.last_snapshot()
+    *_, snapshot = core.last_snapshot()
     state = json.loads(snapshot.state_json)
     return [state["alarms"]["conditions"], state["alarms"].get("answered")]
 
@@ -186,7 +186,7 @@ class Kind:
 
 def scorer(items: Callable[[], list[Any]], **settings: Any) -> Kind:
     def save(core: ScorerCore) -> ScorerSnapshot:
-        (snapshot,) = core.last_snapshot()
+        *_, snapshot = core.last_snapshot()
         return decode(ScorerSnapshot, encode(snapshot))
 
     def restored(snapshot: ScorerSnapshot) -> ScorerCore:

@@ -19,7 +19,7 @@ from fantwin.pipeline.tray_scoring.snapshot_store import SnapshotStore
 from fantwin.schemas.blocks import cut
 from fantwin.schemas.enums import Action, FanState, Transition
 from fantwin.schemas.header import Header
-from fantwin.schemas.messages import Alarm, Score, ScorerSnapshot
+from fantwin.schemas.messages import Alarm, Overview, Score, ScorerSnapshot
 from fantwin.schemas.units import NS_PER_S
 from fantwin.scoring.alarms.alarm_state import is_listed, is_retained, is_silenced
 from fantwin.scoring.alarms.current_alarms import CurrentAlarm
@@ -76,7 +76,7 @@ def test_every_alarm_and_answer_is_in_the_file_and_in_a_published_snapshot_befor
         return json.loads(memory.state_json)["alarms"]["last_emitted"]["0"]
 
     made = scorer.step(prediction_of(np.full(100, STEP)))
-    assert [type(message) for message in made] == [Score, ScorerSnapshot, Alarm]
+    assert [type(message) for message in made] == [Score, Overview, ScorerSnapshot, Alarm]
     assert noted()["active"]
     feed(scorer, [request_of(Action.SHELVE, duration_s=60.0)])
     assert noted()["shelved_until_t_ns"] > 0
@@ -251,7 +251,7 @@ def test_row_13_a_snapshot_that_is_ahead_of_a_clock_that_was_set_back_keeps_no_f
 def test_samples_that_come_again_to_the_core_of_the_next_twin_are_not_scored_again(twin: str) -> None:
     before = core_of(3)
     feed(before, [prediction_of(np.zeros((100, 3)))])
-    (snapshot,) = before.last_snapshot()
+    *_, snapshot = before.last_snapshot()
     successor = ScorerCore(
         3,
         "rad/s",

@@ -179,7 +179,7 @@ def feed(core: ScorerCore, items: Iterable[Prediction | Request]) -> tuple[list[
 
 def snapshot_of(core: ScorerCore) -> ScorerSnapshot:
     """The snapshot that it saves at the end."""
-    (snapshot,) = core.close()
+    *_, snapshot = core.close()
     return snapshot
 
 

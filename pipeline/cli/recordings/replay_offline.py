@@ -187,7 +187,7 @@ def _print_verified(found: dict[str, Any], console: Console) -> None:
         not_made = f"{found['samples_not_made']} were not replayed, " if has_scores else ""
         console.print(
             f"[bold red]DIFFERS:[/bold red] {different} of {different + equal} {what} differ, {not_made}"
-            f"{found['inputs_different']} of the grid and of predictions differ, {found['alarms_different']} alarms "
+            f"{found['others_different']} of grid, predictions and overview differ, {found['alarms_different']} alarms "
             "differ; the first differences:"
         )
         _print_lines(console, found["differences"])

@@ -46,7 +46,7 @@ ROOM_BYTES = 4 << 20
 """that must be free beyond `least_free_bytes` for a clip to be cut"""
 REST_S = 0.002
 """after each chunk, for the thread that records"""
-_JUDGED = ("alarm", "snapshot")
+_JUDGED = ("alarm", "overview", "snapshot")
 """topics that a clip has, as samples that were made of others, from its snapshot on"""
 _OF_A_TRAY = ("fans", "speed_unit", NAMES_KEY, TACHO_KEY, "twin_sha256")
 _OF_A_PART = ("part", "continues", "session", "paused_t_ns", "resumed_t_ns", "paused_because", "lost_in_pause")

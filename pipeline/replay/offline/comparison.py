@@ -102,11 +102,12 @@ class CannotCompareError(UserError):
 
 COUNTS = (
     *(f"samples_{name}" for name in ("equal", "different", "not_made", "not_recorded", "not_comparable")),
-    "inputs_different",
+    "others_different",
     *(f"alarms_{name}" for name in ("equal", "different", "not_recorded", "not_comparable")),
     *(f"snapshots_{name}" for name in ("equal", "different", "not_comparable")),
 )
-"""What a comparison counts. Samples are those of the tray, with all fans; inputs are those of `grid` and `prediction`.
+"""What a comparison counts. Samples are those of the tray, with all fans; others are those of `grid` and
+`prediction`, and rows of `overview`.
 
 different: another decision, or a number that differs by more than its tolerance. not_made: recorded, and not replayed.
 not_recorded: replayed, and not in the recording: in flight when it ended, or lost. not_comparable: not equal or not

@@ -91,8 +91,13 @@ class OfflinePipeline:
             for message in chain(restored, self._run_last(core, session)):
                 self._observe(message)
                 yield session.producer, message
-            closing = self._close(core)
-            replayed_snapshot = next((message for message in closing if isinstance(message, ScorerSnapshot)), None)
+            replayed_snapshot = None
+            for message in self._close(core):
+                if isinstance(message, ScorerSnapshot):
+                    replayed_snapshot = message
+                else:
+                    self._observe(message)
+                    yield session.producer, message
 
     def predictions(self) -> Iterator[Prediction]:
         """The input that the last stage, the scorer, would receive; it does not run.

@@ -25,7 +25,7 @@ from fantwin.schemas.blocks import cut
 from fantwin.schemas.codec import CodecError
 from fantwin.schemas.enums import InvalidReason
 from fantwin.schemas.header import Header
-from fantwin.schemas.messages import Alarm, Grid, Message, Prediction, Raw, Request, Score, newest_t_ns
+from fantwin.schemas.messages import Alarm, Grid, Message, Overview, Prediction, Raw, Request, Score, newest_t_ns
 from fantwin.schemas.streams import LOSS_PREFIX
 from fantwin.schemas.topics import TOPICS, tray_key
 from fantwin.schemas.units import NS_PER_S
@@ -60,7 +60,7 @@ class TrayOutput:
 
     def add(self, message: Message) -> None:
         """Write a message, without the samples that an earlier session has made already."""
-        if isinstance(message, Grid | Prediction | Score):
+        if isinstance(message, Grid | Prediction | Score | Overview):
             first = int(np.searchsorted(message.t_ns, self._newest_t_ns[type(message)], side="right"))
             if first == len(message.t_ns):
                 return

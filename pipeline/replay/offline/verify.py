@@ -24,17 +24,22 @@ from fantwin.schemas.codec import CodecError, decode_together
 from fantwin.schemas.enums import Transition
 from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.fields import columns
-from fantwin.schemas.messages import Alarm, Array, Grid, Message, Prediction, Score, ScorerSnapshot
+from fantwin.schemas.messages import Alarm, Array, Grid, Message, Overview, Prediction, Score, ScorerSnapshot
 from fantwin.scoring.saved import from_json
 
-Samples: TypeAlias = Grid | Prediction | Score
+Samples: TypeAlias = Grid | Prediction | Score | Overview
 
 AT_A_LIMIT = (
     "although all numbers agree within the tolerance: one lies so close to its limit that processors decide "
     "differently, or the way of deciding has changed"
 )
 _BLOCK_MESSAGES = 512
-_TOPICS: dict[type[Message], str] = {Grid: "grid", Prediction: "prediction", Score: "score"}
+_TOPICS: dict[type[Message], str] = {
+    Grid: "grid",
+    Prediction: "prediction",
+    Score: "score",
+    Overview: "overview",
+}
 
 
 class TrayVerifier:
@@ -62,7 +67,8 @@ class TrayVerifier:
 
     def add(self, producer: str, message: Message) -> None:
         """Compare the next message that was replayed, of the recorded session `producer`."""
-        if isinstance(message, Grid | Prediction) or (isinstance(message, Score) and self._found.has_scores):
+        is_compared = isinstance(message, Grid | Prediction | Overview)
+        if is_compared or (isinstance(message, Score) and self._found.has_scores):
             compare_samples(message, self._samples_of(type(message), producer), self._found, self._limit_of(producer))
         elif isinstance(message, ScorerSnapshot) and not (message.restored or self._found.has_scores):
             self._snapshots_of(producer).add(message)
@@ -127,8 +133,8 @@ class RecordedSamples:
 
 
 def compare_samples(made: Samples, recorded: RecordedSamples, found: Comparison, limit: Limit = UNLIMITED) -> None:
-    """Compare a block of samples with the recorded ones up to its last sample. Of other stages than the scorer only
-    those count that are recorded and replayed: a session may have made more than the next one consumed."""
+    """Compare a block of samples with the recorded ones up to its last sample. Of others than scores only those count
+    that are recorded and replayed: a session may have made more than the next one consumed."""
     counts, is_score = found.counts, isinstance(made, Score)
     is_taken = np.zeros(len(made.t_ns), np.bool_)
     had_begun = recorded.has_begun
@@ -144,7 +150,7 @@ def compare_samples(made: Samples, recorded: RecordedSamples, found: Comparison,
             found.name(f"{made.fans} fans replayed, {block.fans} recorded")
         else:
             different = _different_rows(made, rows, block, is_made, limit, found)
-        counts["samples_different" if is_score else "inputs_different"] += int((different & within).sum())
+        counts["samples_different" if is_score else "others_different"] += int((different & within).sum())
         if is_score:
             found.add_not_comparable(int((different & ~within).sum()), limit)
             counts["samples_equal"] += int((~different).sum())

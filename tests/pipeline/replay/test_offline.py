@@ -18,7 +18,9 @@ from fantwin.pipeline.recordings.reading import RecordingError
 from fantwin.pipeline.recordings.records import RecordReader
 from fantwin.pipeline.replay.offline.replay_input import open_replay_input
 from fantwin.pipeline.replay.offline.rescoring import rescore
+from fantwin.schemas.blocks import join
 from fantwin.schemas.enums import Action, FanState, Severity, Transition
+from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Alarm
 from fantwin.schemas.units import NS_PER_S
 from tests.support.killed_site import CHAIN, Site
@@ -85,6 +87,38 @@ def test_scores_that_no_stage_made_are_found(short, tmp_path):
 
     found = verified(changed(short, tmp_path / "later.mcap", later)).comparison
     assert found and found.counts["samples_not_made"] == 1 and found.counts["samples_not_recorded"] == 1
+
+
+def test_the_overview_has_every_second_also_where_the_scorer_was_killed_and_a_replay_makes_it_again(
+    scorer_killed, tmp_path
+):
+    score, overview = (
+        join([replace(each, header=Header()) for each in found])
+        for found in [recorded(scorer_killed, "score"), recorded(scorer_killed, "overview")]
+    )
+    residual = np.where(score.valid, score.residual_rad_s, np.nan)
+    seconds = np.unique(score.t_ns // NS_PER_S)
+    assert len(seconds) == 4 and len({each.header.producer for each in recorded(scorer_killed, "overview")}) == 2
+    for second in seconds:
+        samples, rows = score.t_ns // NS_PER_S == second, overview.t_ns // NS_PER_S == second
+        for extreme, values in (
+            (np.fmin.reduce, overview.lowest_residual_rad_s),
+            (np.fmax.reduce, overview.highest_residual_rad_s),
+        ):
+            assert np.allclose(extreme(residual[samples]), extreme(values[rows]), 1e-6, 1e-4, equal_nan=True)
+    with open_replay_input([scorer_killed], None, (), None) as replay_input:
+        rescore(replay_input, tmp_path / "whole.mcap", verify=True)
+    whole = join([replace(each, header=Header()) for each in recorded(tmp_path / "whole.mcap", "overview")])
+    assert np.isin(seconds, whole.t_ns // NS_PER_S).all()
+
+    def higher(entry):
+        if entry.topic != "overview" or entry.message.header.sequence != 1:
+            return entry.message
+        return replace(entry.message, highest_score=entry.message.highest_score * 1.001)
+
+    assert made_equal(verified(scorer_killed))
+    found = verified(changed(scorer_killed, tmp_path / "higher.mcap", higher)).comparison
+    assert found and not found.is_equal and found.counts["others_different"] and "highest_score" in found.named[0]
 
 
 def test_parts_that_overlap_are_one_recording(tmp_path):
