@@ -1,13 +1,14 @@
-"""The samples of a tray in a range of time, from the recordings of a run that still grows.
+"""The samples and the overview of a tray in a range of time, from the recordings of a run that still grows.
 
 Only the chunks of the range are opened, one at a time: a day is read in seconds, whatever the size of the recordings.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
+from typing import TypeAlias
 
 from mcap.opcode import Opcode
 
@@ -24,18 +25,24 @@ from fantwin.pipeline.recordings.records import (
     whole_number,
 )
 from fantwin.schemas.codec import CodecError, decode_together
-from fantwin.schemas.messages import Raw, Score
+from fantwin.schemas.messages import Overview, Raw, Score
 from fantwin.schemas.units import NS_PER_S
 
 LATEST_NS = 60 * NS_PER_S
 """longest time between samples and the receipt of their message"""
-_KINDS: dict[str, type[Raw | Score]] = {"score": Score, "raw": Raw}
-"""the topics that have samples of people's interest, the better one first"""
+Recorded: TypeAlias = Score | Raw | Overview
+_KINDS: dict[str, type[Recorded]] = {"score": Score, "raw": Raw, "overview": Overview}
+_WITHOUT_SCORES = ("raw", "overview")
+"""the topics that together tell of a fan what scores would, these second by second where it was judged"""
 _ENDLESS_NS = (1 << 63) - 1
 
 
-def _payloads(data: bytes, channels: Collection[int], begin_ns: int) -> Iterator[bytes]:
-    """The messages of these channels in a chunk whose newest sample is not older; nothing else of them is looked at."""
+def _payloads(data: bytes, channels: Mapping[int, str], begin_ns: int) -> dict[str, list[bytes]]:
+    """By topic, the messages of these channels in a chunk whose newest sample is not older; nothing else is looked at.
+
+    channels: topics by number.
+    """
+    found: dict[str, list[bytes]] = {}
     at, end = 0, len(data)
     while at < end:
         opcode, length = RECORD.unpack_from(data, at)
@@ -43,8 +50,9 @@ def _payloads(data: bytes, channels: Collection[int], begin_ns: int) -> Iterator
         if opcode == Opcode.MESSAGE:
             channel, _, _, newest_t_ns = MESSAGE.unpack_from(data, at)
             if channel in channels and newest_t_ns >= begin_ns:
-                yield data[at + MESSAGE.size : at + length]
+                found.setdefault(channels[channel], []).append(data[at + MESSAGE.size : at + length])
         at += length
+    return found
 
 
 class RecordedRange:
@@ -58,8 +66,9 @@ class RecordedRange:
 
     def blocks(
         self, tray: str, begin_ns: int, end_ns: int, columns: Collection[str], unread: set[str]
-    ) -> Iterator[Score | Raw]:
-        """The scores of a tray, and where a part has none, its raw samples, in the order they were recorded.
+    ) -> Iterator[Recorded]:
+        """The scores of a tray, and where a part has none, its raw samples and its overview, in the order they were
+        recorded, of a chunk the samples first.
 
         The first and last messages may reach beyond the range. unread: gets the names of files that cannot be read in
         full.
@@ -71,15 +80,16 @@ class RecordedRange:
                 unread.add(path.name)
                 continue
             topics = {topic for _, topic in indexed.channels.values()}
-            topic = next((name for name in _KINDS if name in topics), "")
-            channels = {number for number, (_, each) in indexed.channels.items() if each == topic}
-            for chunk in indexed.chunks if topic else ():
+            wanted = ("score",) if "score" in topics else _WITHOUT_SCORES
+            channels = {number: topic for number, (_, topic) in indexed.channels.items() if topic in wanted}
+            for chunk in indexed.chunks if channels else ():
                 if chunk.message_end_time < begin_ns or chunk.message_start_time > end_ns + LATEST_NS:
                     continue
                 try:
                     with indexed.file.open("rb") as file:
-                        found = list(_payloads(chunk_at(file, chunk), channels, begin_ns))
-                    yield from decode_together(_KINDS[topic], found, columns)
+                        found = _payloads(chunk_at(file, chunk), channels, begin_ns)
+                    for topic in filter(found.get, wanted):
+                        yield from decode_together(_KINDS[topic], found[topic], columns)
                 except (OSError, CodecError, *CORRUPT_DATA_ERRORS):
                     unread.add(path.name)
 

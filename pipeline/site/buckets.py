@@ -45,16 +45,31 @@ class Buckets:
             return
         offset_ns = t_ns[order] - self._begin_ns
         part = offset_ns // self.width_ns
+        values = mean[order]
+        self._merge(part, values, *(values if each is None else each[order] for each in (low, high)))
+        firsts = np.flatnonzero(np.diff(part, prepend=-1))
+        self._offset_ns[part[firsts]] += np.add.reduceat(offset_ns.astype(np.float64), firsts)
+        self._samples[part[firsts]] += np.diff(firsts, append=len(part))
+
+    def add_spans(self, since_ns: Array, until_ns: Array, mean: Array, low: Array, high: Array) -> None:
+        """Add values that stand for spans of time, to each part that has samples in it. (n,) and (n, columns)."""
+        first, last = ((each - self._begin_ns) // self.width_ns for each in (since_ns, until_ns))
+        row = np.repeat(np.arange(len(first)), last - first + 1)
+        part = first[row] + np.arange(len(row)) - np.searchsorted(row, row)
+        order = np.argsort(part, kind="stable")
+        order = order[(part[order] >= 0) & (part[order] < len(self._samples))]
+        if len(order):
+            row = row[order]
+            self._merge(part[order], mean[row], low[row], high[row])
+
+    def _merge(self, part: Array, mean: Array, low: Array, high: Array) -> None:
+        """Add values to parts; part: the number of each row's, ascending."""
         firsts = np.flatnonzero(np.diff(part, prepend=-1))
         at = part[firsts]
-        values = mean[order]
-        lowest, highest = (values if each is None else each[order] for each in (low, high))
-        self._low[at] = np.fmin(self._low[at], np.fmin.reduceat(lowest, firsts, axis=0))
-        self._high[at] = np.fmax(self._high[at], np.fmax.reduceat(highest, firsts, axis=0))
-        self._total[at] += np.add.reduceat(np.nan_to_num(values), firsts, axis=0)
-        self._count[at] += np.add.reduceat(np.isfinite(values).astype(np.int64), firsts, axis=0)
-        self._offset_ns[at] += np.add.reduceat(offset_ns.astype(np.float64), firsts)
-        self._samples[at] += np.diff(firsts, append=len(part))
+        self._low[at] = np.fmin(self._low[at], np.fmin.reduceat(low, firsts, axis=0))
+        self._high[at] = np.fmax(self._high[at], np.fmax.reduceat(high, firsts, axis=0))
+        self._total[at] += np.add.reduceat(np.nan_to_num(mean), firsts, axis=0)
+        self._count[at] += np.add.reduceat(np.isfinite(mean).astype(np.int64), firsts, axis=0)
 
     def points(self) -> Points:
         """A point for each part that has samples, at their mean time, and a row of NaN in each gap."""

@@ -1,7 +1,8 @@
 """A fan over any range of days: what the gateway has kept of the last hour, and before that the recordings.
 
-Of each part of the range there are the least, mean and largest value. With it come the transitions of the fan's alarm,
-and how probable each cause was when.
+Of each part of the range there are the least, mean and largest value; of recordings without scores, twin, deviation and
+score are those of the second (topic `overview`). With it come the transitions of the fan's alarm, and how probable each
+cause was when.
 """
 
 from __future__ import annotations
@@ -16,13 +17,13 @@ from typing import Any
 
 import numpy as np
 
-from fantwin.pipeline.recordings.time_range import RecordedRange
+from fantwin.pipeline.recordings.time_range import Recorded, RecordedRange
 from fantwin.pipeline.site.buckets import Buckets, Points
-from fantwin.pipeline.site.fan_history import COLUMNS, CURVES, SERIES, channels_of, in_series, values_of
+from fantwin.pipeline.site.fan_history import COLUMNS, CURVES, DEVIATION, SERIES, channels_of, in_series, values_of
 from fantwin.pipeline.site.fleet import Fan
 from fantwin.pipeline.site.site_model import SiteModel
 from fantwin.schemas.channels import BY_NAME, measured_columns
-from fantwin.schemas.messages import Alarm, Array, Raw, Score
+from fantwin.schemas.messages import OVERVIEW_ROW_NS, Alarm, Array, Overview, Raw, Score
 from fantwin.schemas.units import NS_PER_S, RAD_S_PER_UNIT
 from fantwin.scoring.alarms.current_alarms import current_alarm
 from fantwin.scoring.diagnosis.causes import short_name
@@ -32,14 +33,21 @@ LONGEST_READ_S = 120.0
 """longest time for which one answer may read recordings, since others wait for their turn"""
 _BEFORE = 50
 """transitions before the range that are looked at for the alarm at its beginning"""
-_SPEEDS = ("deviation_rad_s", *CURVES[:3])
+_SPEEDS = (DEVIATION, *CURVES[:3])
 _NAMES = {
-    "deviation_rad_s": "deviation",
+    DEVIATION: "deviation",
     "measured_speed_rad_s": "measured",
     "predicted_speed_rad_s": "predicted",
     "band_half_width_rad_s": "half_width",
 }
-_READ = (*COLUMNS, "speed_rad_s")
+_OVERVIEW = {
+    "predicted_speed_rad_s": ("predicted_speed_rad_s",) * 3,
+    "band_half_width_rad_s": ("band_half_width_rad_s",) * 3,
+    DEVIATION: ("lowest_residual_rad_s", "residual_rad_s", "highest_residual_rad_s"),
+    "score": ("highest_score",) * 3,
+}
+"""of a series, the columns of an overview with its least, mean and largest value"""
+_READ = (*COLUMNS, "speed_rad_s", *(name for names in _OVERVIEW.values() for name in names))
 
 
 @dataclass(frozen=True)
@@ -72,24 +80,20 @@ class FanSeries:
         self, recorded: RecordedRange, buckets: Buckets, fan: Fan, begin_ns: int, end_ns: int
     ) -> list[str]:
         unread: set[str] = set()
-        has_raw = False
+        kinds: set[type] = set()
         tray = self.model.tray(fan.tray)
         ends_s, notes = time.monotonic() + LONGEST_READ_S, list[str]()
         for block in recorded.blocks(fan.tray, begin_ns, end_ns, _READ, unread):
             if tray and block.fans == tray.fans:
-                t_ns = np.asarray(block.t_ns if isinstance(block, Score) else block.host_receive_t_ns)
-                before = np.flatnonzero(t_ns < end_ns)
-                buckets.add(t_ns[before], _series_of(block, fan.number)[before])
-                has_raw |= isinstance(block, Raw)
+                _add_block(buckets, block, fan.number, end_ns, has_samples=bool(kinds - {Overview}))
+                kinds.add(type(block))
             if time.monotonic() >= ends_s:
                 notes.append(
                     f"later recordings are left out, after {LONGEST_READ_S:g} s of reading: choose a shorter time"
                 )
                 break
         notes += [f"{name} cannot be read in full" for name in sorted(unread)]
-        return (
-            [*notes, "of recorded times only what was measured: twin and score are not recorded"] if has_raw else notes
-        )
+        return [*notes, "of recorded times only what was measured: no twin judged it"] if kinds == {Raw} else notes
 
     def as_json(self, fan: Fan, begin_ns: int, end_ns: int, points: int) -> dict[str, Any]:
         """The points as columns by name, marks, and causes; speeds in the unit of the tray."""
@@ -153,6 +157,25 @@ class FanSeries:
             elif not alarm.active and causes and causes[-1]["probabilities"]:
                 causes.append(_step(alarm.t_ns, ()))
         return {"marks": [_mark(alarm) for alarm in marks], "causes": causes}
+
+
+def _add_block(buckets: Buckets, block: Recorded, fan: int, end_ns: int, *, has_samples: bool) -> None:
+    """Add what a recording tells of a fan before a time. has_samples: it has samples beside an overview."""
+    t_ns = np.asarray(block.host_receive_t_ns if isinstance(block, Raw) else block.t_ns)
+    if not isinstance(block, Overview):
+        before = np.flatnonzero(t_ns < end_ns)
+        buckets.add(t_ns[before], _series_of(block, fan)[before])
+        return
+    since_ns = t_ns // OVERVIEW_ROW_NS * OVERVIEW_ROW_NS
+    before = np.flatnonzero(since_ns < end_ns)
+    low, mean, high = np.full((3, len(t_ns), len(SERIES)), np.nan)
+    for name, of_overview in _OVERVIEW.items():
+        for values, column in zip((low, mean, high), of_overview, strict=True):
+            values[:, SERIES.index(name)] = getattr(block, column)[:, fan]
+    if has_samples:
+        buckets.add_spans(since_ns[before], t_ns[before], mean[before], low[before], high[before])
+    else:
+        buckets.add(t_ns[before], mean[before], low[before], high[before])
 
 
 def _series_of(block: Score | Raw, fan: int) -> Array:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from collections.abc import Iterable
 from dataclasses import replace
 from io import StringIO
 from pathlib import Path
@@ -21,12 +22,13 @@ from fantwin.pipeline.site.fan_history import HISTORY_S
 from fantwin.pipeline.site.fan_series import FanSeries
 from fantwin.pipeline.site.fleet import Fan
 from fantwin.pipeline.site.site_model import SiteModel
+from fantwin.pipeline.tray_scoring.overview_rows import OverviewRows
 from fantwin.schemas.enums import Transition
 from fantwin.schemas.envelope import Envelope
 from fantwin.schemas.header import Header
-from fantwin.schemas.messages import Alarm, Diagnosis, Raw, Score
+from fantwin.schemas.messages import Alarm, Diagnosis, Overview, Raw, Score, newest_t_ns
 from fantwin.schemas.topics import tray_key
-from tests.support.made_messages import alarm, filled
+from tests.support.made_messages import TOPIC_OF, alarm, filled
 
 TRAY, FANS, SITE = "tray1", 2, "hall"
 FAN = Fan(TRAY, 1)
@@ -64,14 +66,21 @@ def model(tmp_path: Path) -> SiteModel:
     return SiteModel(SITE, trays, AlarmHistory(tmp_path / "alarms.sqlite"), keeps_curves=True)
 
 
-def record(folder: Path, *messages: Raw | Score, part: int = 1, finish: bool = True) -> RecordedRange:
+def overview(scores: Iterable[Score]) -> list[Overview]:
+    """What the scorer publishes beside these."""
+    rows = OverviewRows()
+    made = [message for each in scores for message in rows.add(each)]
+    header = Header("scorer-1", 0, TRAY)
+    return [replace(each, header=header) for each in (*made, *rows.so_far())]
+
+
+def record(folder: Path, *messages: Raw | Score | Overview, part: int = 1, finish: bool = True) -> RecordedRange:
     """The messages in a part of a recording, flushed every ten; finish: the recorder has ended it."""
     name = "recording.mcap" if part == 1 else f"recording-{part}.mcap"
     writer = RecordingWriter(folder / name, {"site": SITE, "trays": TRAY, "recording": "recording.mcap"})
     for number, message in enumerate(messages):
-        topic = "raw" if isinstance(message, Raw) else "score"
-        t_ns = np.asarray(message.host_receive_t_ns if isinstance(message, Raw) else message.t_ns)
-        writer.add(Envelope.of(tray_key(SITE, TRAY, topic), message, int(t_ns[-1])))
+        topic = TOPIC_OF[type(message)]
+        writer.add(Envelope.of(tray_key(SITE, TRAY, topic), message, newest_t_ns(message)))
         if number % 10 == 9:
             writer.flush()
     writer.flush()
@@ -117,7 +126,7 @@ def test_recordings_continue_the_past_with_every_odd_sample_also_in_the_part_tha
     assert [100 <= holes[0] <= 150, 200 <= holes[1] <= late, len(holes)] == [True, True, 2]
     assert columns["deviation"]["mean"][0] is None, "the twin is not recorded"
     assert columns["deviation"]["mean"][-1] == -3.0, "the last hour knows it"
-    assert found["note"] == "of recorded times only what was measured: twin and score are not recorded"
+    assert found["note"] == "of recorded times only what was measured: no twin judged it"
     rows = list(csv.DictReader(StringIO(FanSeries(model, recorded).as_csv(FAN, at(33), at(34), 4000))))
     assert len(rows) == 100, "zoomed in, each sample"
     (odd,) = [row for row in rows if float(row["supply_voltage_v_min"]) < 12]
@@ -127,6 +136,64 @@ def test_recordings_continue_the_past_with_every_odd_sample_also_in_the_part_tha
         "",
     )
     assert odd["time"] == "2026-09-21T14:13:53.570+00:00"
+
+
+HOLE, SPIKED, UNJUDGED = 20, 32, 40
+"""seconds without samples, with odd samples, and in which fan 1 was not judged"""
+
+
+@pytest.fixture
+def of_the_morning(tmp_path: Path) -> RecordedRange:
+    """A minute as a recorder keeps it by default. In one sample fan 1 runs 20 rad/s below its twin and reaches a score
+    of 1.5, in another 20 above."""
+    scores = [score(number) for number in range(60) if number != HOLE]
+    of_second = {each.header.sequence: each for each in scores}
+    spike = of_second[SPIKED]
+    for row, speed in ((57, 280.0), (58, 320.0)):
+        spike.measured_speed_rad_s[row, 1] = speed
+    spike.score[57, 1] = 1.5
+    of_second[UNJUDGED].valid[:, 1] = False
+    raws = [replace(raw(each.header.sequence), speed_rad_s=each.measured_speed_rad_s) for each in scores]
+    by_time = sorted((*raws, *overview(scores)), key=newest_t_ns)
+    return record(tmp_path, *by_time)
+
+
+def test_twin_band_deviation_and_score_of_hours_ago_are_there_with_every_odd_sample(model, of_the_morning):
+    late = score(0)
+    model.add_decoded_score(TRAY, replace(late, t_ns=late.t_ns + 3 * HISTORY_S * 10**9))
+    found = FanSeries(model, of_the_morning).as_json(FAN, at(0), at(60), 12)
+    columns, t_s = found["columns"], np.array(found["t_s"]) - START_NS / 1e9
+    assert found["note"] == ""
+    assert set(columns["predicted"]["mean"]) == {300.0} and set(columns["half_width"]["max"]) == {4.0}
+    (low,), (high,), (near,) = (
+        [at for at, value in enumerate(columns[name][kind]) if value == odd]
+        for name, kind, odd in (("deviation", "min", -20.0), ("deviation", "max", 20.0), ("score", "max", 1.5))
+    )
+    assert low == high == near and abs(t_s[low] - SPIKED - 0.5) <= found["bucket_s"]
+    assert columns["deviation"]["mean"][low] == pytest.approx(-3.0, abs=0.5)
+    assert columns["measured"]["min"][low] == 280.0
+
+
+def test_zoomed_in_each_sample_has_the_twin_of_its_second_and_gaps_stay_gaps(model, of_the_morning):
+    found = FanSeries(model, of_the_morning).as_json(FAN, at(19), at(42), 2300)
+    columns, t_s = found["columns"], np.array(found["t_s"]) - START_NS / 1e9
+    measured, deviation, predicted = (
+        np.array(columns[name]["mean"], float) for name in ("measured", "deviation", "predicted")
+    )
+    (hole,) = np.flatnonzero(np.isnan(measured))
+    assert HOLE <= t_s[hole] <= HOLE + 1 and len(t_s) == 2200 + 1
+    unknown = np.flatnonzero(np.isnan(predicted))
+    assert set(np.floor(t_s[unknown])) == {HOLE, UNJUDGED} and len(unknown) == 1 + BLOCK
+    of_spike = np.flatnonzero(np.floor(t_s) == SPIKED)
+    assert set(np.array(columns["deviation"]["min"])[of_spike]) == {-20.0}
+    assert np.isfinite(deviation[of_spike]).all() and measured[of_spike].min() == 280.0
+
+
+def test_an_overview_alone_is_shown_where_no_samples_are_recorded(model, tmp_path):
+    recorded = record(tmp_path, *overview(map(score, range(30))))
+    found = FanSeries(model, recorded).as_json(FAN, at(0), at(30), 30)
+    assert found["columns"]["deviation"]["max"] == [-3.0] * 30
+    assert set(found["columns"]["measured"]["mean"]) == {None}
 
 
 def test_recorded_scores_are_shown_with_their_twin_and_only_chunks_of_the_range_are_opened(
