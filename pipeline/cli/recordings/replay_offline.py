@@ -192,7 +192,7 @@ def _print_verified(found: dict[str, Any], console: Console) -> None:
         )
         _print_lines(console, found["differences"])
     if not has_scores:
-        console.print("scores were not recorded (recorder.topics): alarms and the scorers' snapshots were compared")
+        console.print("scores were not recorded (recorder.topics): alarms, snapshots and overview were compared")
     if found["not_comparable"]:
         console.print(
             f"[bold yellow]not comparable:[/bold yellow] {found[f'{what}_not_comparable']} {what} and "

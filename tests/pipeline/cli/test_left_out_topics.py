@@ -65,7 +65,7 @@ def test_a_difference_is_exit_code_1(lean, tmp_path):
     different = changed(lean, tmp_path / "r.mcap", doubled)
     done = fantwin("replay", "--offline", "--verify", different)
     assert done.exit_code == 1
-    assert "DIFFERS" in done.stdout and "snapshots differ" in done.stdout and "tray1: snapshot of " in done.stdout
+    assert "DIFFERS" in done.stdout and "snapshots differ" in done.stdout and "fan 0: overview." in done.stdout
     verified = json.loads(fantwin("replay", "--offline", "--verify", "--json", different).stdout)["verified"]
     assert (verified["samples_equal"], verified["left_out"], verified["equal"]) == (0, list(MADE), False)
 
