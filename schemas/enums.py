@@ -79,6 +79,8 @@ class Action(OpenEnum):
     TRUE_ALARM = 7
     FALSE_ALARM = 8
     COMMENT = 9
+    SWEEP = 10
+    STOP_SWEEP = 11
 
 
 class Feedback(OpenEnum):

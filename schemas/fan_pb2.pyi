@@ -72,6 +72,8 @@ class Action(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     ACTION_TRUE_ALARM: _ClassVar[Action]
     ACTION_FALSE_ALARM: _ClassVar[Action]
     ACTION_COMMENT: _ClassVar[Action]
+    ACTION_SWEEP: _ClassVar[Action]
+    ACTION_STOP_SWEEP: _ClassVar[Action]
 
 class Feedback(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
@@ -149,6 +151,8 @@ ACTION_COMMISSION: Action
 ACTION_TRUE_ALARM: Action
 ACTION_FALSE_ALARM: Action
 ACTION_COMMENT: Action
+ACTION_SWEEP: Action
+ACTION_STOP_SWEEP: Action
 FEEDBACK_NONE: Feedback
 FEEDBACK_TRUE_ALARM: Feedback
 FEEDBACK_FALSE_ALARM: Feedback
@@ -632,19 +636,33 @@ class FanLearning(_message.Message):
     missing: str
     def __init__(self, progress: _Optional[float] = ..., missing: _Optional[str] = ...) -> None: ...
 
+class Sweep(_message.Message):
+    __slots__ = ("plan", "running", "ended", "asked_t_ns")
+    PLAN_FIELD_NUMBER: _ClassVar[int]
+    RUNNING_FIELD_NUMBER: _ClassVar[int]
+    ENDED_FIELD_NUMBER: _ClassVar[int]
+    ASKED_T_NS_FIELD_NUMBER: _ClassVar[int]
+    plan: str
+    running: str
+    ended: str
+    asked_t_ns: int
+    def __init__(self, plan: _Optional[str] = ..., running: _Optional[str] = ..., ended: _Optional[str] = ..., asked_t_ns: _Optional[int] = ...) -> None: ...
+
 class Learning(_message.Message):
-    __slots__ = ("tray", "what", "until_t_ns", "helps", "fans")
+    __slots__ = ("tray", "what", "until_t_ns", "helps", "fans", "sweep")
     TRAY_FIELD_NUMBER: _ClassVar[int]
     WHAT_FIELD_NUMBER: _ClassVar[int]
     UNTIL_T_NS_FIELD_NUMBER: _ClassVar[int]
     HELPS_FIELD_NUMBER: _ClassVar[int]
     FANS_FIELD_NUMBER: _ClassVar[int]
+    SWEEP_FIELD_NUMBER: _ClassVar[int]
     tray: str
     what: str
     until_t_ns: int
     helps: str
     fans: _containers.RepeatedCompositeFieldContainer[FanLearning]
-    def __init__(self, tray: _Optional[str] = ..., what: _Optional[str] = ..., until_t_ns: _Optional[int] = ..., helps: _Optional[str] = ..., fans: _Optional[_Iterable[_Union[FanLearning, _Mapping]]] = ...) -> None: ...
+    sweep: Sweep
+    def __init__(self, tray: _Optional[str] = ..., what: _Optional[str] = ..., until_t_ns: _Optional[int] = ..., helps: _Optional[str] = ..., fans: _Optional[_Iterable[_Union[FanLearning, _Mapping]]] = ..., sweep: _Optional[_Union[Sweep, _Mapping]] = ...) -> None: ...
 
 class AcceptedSamples(_message.Message):
     __slots__ = ("tray", "fans", "command_min", "command_max", "speed_max_rad_s", "named")

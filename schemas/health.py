@@ -85,6 +85,23 @@ class FanLearning:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Sweep:
+    """What an operator may ask of a learner: to move the fans of a tray over their range.
+
+    Attributes:
+        plan: which fans it moves between which commands, and for how long.
+        running: what it does now; empty: none runs.
+        ended: how the last one ended, or why it was not begun; empty: there was none.
+        asked_t_ns: time of the last request that was taken.
+    """
+
+    plan: str
+    running: str = ""
+    ended: str = ""
+    asked_t_ns: int = 0
+
+
+@dataclass(frozen=True, kw_only=True)
 class Learning:
     """What the first twin of a tray waits for.
 
@@ -92,6 +109,7 @@ class Learning:
         tray: added by the runner of the stage.
         until_t_ns: when it will be learned; 0: not known, as that depends on the fans.
         helps: what would make it sooner, in words; empty: nothing would.
+        sweep: None: nobody may ask for one.
     """
 
     tray: str
@@ -99,6 +117,7 @@ class Learning:
     until_t_ns: int
     helps: str
     fans: tuple[FanLearning, ...]
+    sweep: Sweep | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -350,8 +350,10 @@ class Launcher:
         return child is None or child.exit_status() is not None or self._watcher.is_ready(child.process_id)
 
     def _stop_all(self) -> None:
-        """Stop in the order of the data flow: a stage ends when it has processed all input, its processes together."""
-        for stage in dict.fromkeys(slot.row.stage for slot in self._slots):
+        """Stop in the order of the data flow: a stage ends when it has processed all input, its processes together.
+        Before them the learner: a sweep that it has begun gives the fans their former commands through acquisition."""
+        stages = dict.fromkeys(slot.row.stage for slot in self._slots)
+        for stage in sorted(stages, key=lambda each: each != LEARNER):
             of_stage = [(slot, slot.child) for slot in self._slots if slot.row.stage == stage and slot.child]
             for _, child in of_stage:
                 child.terminate()

@@ -16,9 +16,10 @@ from fantwin.pipeline.learning.fan_alarms import FanAlarms
 from fantwin.pipeline.learning.healthy_history import HealthyHistory
 from fantwin.pipeline.learning.learning_schedule import FIRST_S, LearningProcess, LearningSchedule, Work
 from fantwin.pipeline.learning.ordinary_operation import OrdinaryOperation
+from fantwin.pipeline.learning.requested_sweep import RequestedSweep
 from fantwin.pipeline.learning.versions import TwinVersions, Version, VersionList, overlap
 from fantwin.pipeline.recordings.dates import format_utc
-from fantwin.pipeline.runtime.stage import Core
+from fantwin.pipeline.runtime.stage import Core, never
 from fantwin.schemas.enums import Action
 from fantwin.schemas.health import Learning
 from fantwin.schemas.messages import Message, NewTwin, Raw, Request, Score
@@ -42,13 +43,18 @@ class LearnerCore(Core):
         versions: TwinVersions,
         operation: OrdinaryOperation,
         learning: LearningProcess,
+        sweep: RequestedSweep | None = None,
+        is_replayed: Callable[[], bool] = never,
     ) -> None:
-        """operation: what the fans have done in the history. learning: makes versions."""
+        """operation: what the fans have done in the history. learning: makes versions. sweep: for operators who ask for
+        one; None: they may not. is_replayed: see Context."""
         self._fans = fans
         self._history = history
         self._versions = versions
         self._operation = operation
         self._learning = learning
+        self._sweep = sweep
+        self._is_replayed = is_replayed
         self._alarms = FanAlarms(fans)
         self._looked_ns = self._flushed_ns = 0
         self._seen_change: int | None = None
@@ -68,6 +74,8 @@ class LearnerCore(Core):
             if item.action == Action.COMMISSION:
                 self._history.begin_after(item.t_ns)
                 self._change_list(partial(self._versions.commission, item.t_ns))
+            elif self._sweep and item.action in (Action.SWEEP, Action.STOP_SWEEP):
+                self._sweep.take(item, self._looked_ns, self._why_no_sweep())
         elif item.fans != self._fans:
             pass  # of a tray that is configured otherwise
         elif isinstance(item, Score):
@@ -88,6 +96,7 @@ class LearnerCore(Core):
             self._history.flush()
         self._take_outcome()
         self._read_list()
+        self._watch_sweep()
         self._schedule.forget_what_is_over(self._listed)
         cards = self._published(now_ns)
         if self._may_start and (due := self._schedule.due(self._listed, has_alarm=bool(self._alarm_fans))):
@@ -95,14 +104,18 @@ class LearnerCore(Core):
         return cards
 
     def close(self) -> Sequence[Message]:
-        """Keep the history."""
+        """Keep the history; a sweep leaves the fans at their former commands."""
         self._learning.stop()
+        if self._sweep:
+            self._sweep.end()
         self._history.close()
         return []
 
     def abort(self) -> None:
-        """Stop learning."""
+        """Stop learning and a sweep."""
         self._learning.stop()
+        if self._sweep:
+            self._sweep.end()
 
     def notes(self) -> Sequence[str]:
         """The version in force, what it finds and when the next one is due, or what the first one waits for; and what
@@ -115,8 +128,10 @@ class LearnerCore(Core):
         if self._in_force and current and current != self._in_force:
             found.append(f"{current.name} waits: it takes over when no fan has an alarm, by the scores of all fans")
         if fans := self._alarm_fans:
-            named = f"fan {fans[0]} has" if len(fans) == 1 else f"fans {', '.join(map(str, fans))} have"
-            found.append(f"no version takes over while {named} an alarm")
+            verb = "has" if len(fans) == 1 else "have"
+            found.append(f"no version takes over while {self._operation.names.labels(fans)} {verb} an alarm")
+        if self._sweep and (moving := self._sweep.note()):
+            found.append(moving)
         work_s = self._learning.seconds
         if work_s is None:
             return found
@@ -141,6 +156,7 @@ class LearnerCore(Core):
             until_t_ns=self._history.newest_t_ns + round(left_s * NS_PER_S) if is_moved else 0,
             helps=self._operation.how_to_move if any(fan.missing for fan in fans) else "",
             fans=tuple(replace(fan, progress=min(fan.progress, recorded_s / FIRST_S)) for fan in fans),
+            sweep=self._sweep.now() if self._sweep else None,
         )
 
     def problem(self) -> str:
@@ -151,13 +167,15 @@ class LearnerCore(Core):
             *(f"learning: {why}" for why in self._schedule.failures),
             self._history.problem,
             self._ahead(),
+            self._sweep.problem() if self._sweep else "",
             f"{offered.name} is offered: {offered.why} (fantwin twins)" if offered else "",
         ]
         return "; ".join(dict.fromkeys(filter(None, problems)))
 
     @property
     def _may_start(self) -> bool:
-        return self._learning.is_free and self._is_list_read
+        is_moving = self._sweep is not None and self._sweep.is_running
+        return self._learning.is_free and self._is_list_read and not is_moving
 
     @property
     def _last(self) -> Version | None:
@@ -180,6 +198,20 @@ class LearnerCore(Core):
     def _is_tainted(self) -> bool:
         """Return whether the twin that the stages have was learned from a time that was marked as faulty."""
         return self._in_force is not None and overlap(self._in_force.learned_spans, self._listed.faulty)
+
+    def _why_no_sweep(self) -> str:
+        if self._is_replayed():
+            return "a replay presents the tray"
+        if self._last is not None:
+            return "the tray has a twin"
+        return "the first twin is being made" if self._learning.seconds is not None else ""
+
+    def _watch_sweep(self) -> None:
+        """Take its end; it stops when somebody has made the first twin by hand, as nothing shows it any more."""
+        if self._sweep:
+            self._sweep.tick()
+            if self._last is not None:
+                self._sweep.ask_to_end()
 
     def _see(self, score: Score) -> None:
         if not len(score.t_ns):

@@ -6,16 +6,13 @@ counts for checks only: whether most fans have changed alike is seen there, too.
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 import threading
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, TypeAlias
 
+from fantwin.pipeline.learning.child_command import ChildCommand
 from fantwin.pipeline.learning.healthy_history import KEPT_S, HealthyHistory
 from fantwin.pipeline.learning.history_recordings import SHORTEST_RECORDING_S
 from fantwin.pipeline.learning.ordinary_operation import OrdinaryOperation
@@ -24,9 +21,6 @@ from fantwin.pipeline.learning.versions import VersionList
 _TURN = threading.Lock()
 """one tray learns at a time, to limit memory and processor use"""
 STOP_S = 2.0
-VARIABLE = "FANTWIN_LEARNS_FOR_A_STAGE"
-"""environment variable of the child: it gives way to all else, and ends with its parent, which holds its standard
-input open"""
 
 
 class LearningProcess:
@@ -35,73 +29,37 @@ class LearningProcess:
     It runs while nothing else does, one at a time in this process.
     """
 
-    def __init__(self, config: Path, overrides: Sequence[str], tray: str, log: Path) -> None:
-        """log: file for the standard error of the last run."""
-        sets = [word for override in overrides for word in ("--set", override)]
-        self._fantwin = [sys.executable, "-P", "-m", "fantwin", "twins"]
-        self._options = ["-c", str(config), "--tray", tray, *sets]
-        self._log = log
-        self._child: subprocess.Popen[bytes] | None = None
-        self._began_s = 0.0
+    def __init__(self, tray_words: Sequence[str], log: Path) -> None:
+        """tray_words: the options that name configuration and tray. log: file for what the last run said."""
+        self._tray_words = tray_words
+        self._child = ChildCommand(_TURN, log)
 
     @property
     def is_free(self) -> bool:
         """Whether no tray of this process is learning."""
-        return not _TURN.locked()
+        return self._child.is_free
 
     def start(self, *, only_if_changed: bool) -> str:
         """Begin, if it is free; returns what went wrong, or nothing. only_if_changed: see `fantwin twins check`."""
-        if not _TURN.acquire(blocking=False):
-            return "another tray is learning"
-        try:
-            self._log.parent.mkdir(parents=True, exist_ok=True)
-            with self._log.open("wb") as log:
-                self._child = subprocess.Popen(
-                    [*self._fantwin, "check" if only_if_changed else "learn", *self._options],
-                    stdin=subprocess.PIPE,
-                    stdout=subprocess.DEVNULL,
-                    stderr=log,
-                    env={**os.environ, "OMP_NUM_THREADS": "1", VARIABLE: "1"},
-                )
-        except OSError as error:
-            _TURN.release()
-            return f"learning could not be started: {error.strerror}"
-        self._began_s = time.monotonic()
-        return ""
+        problem = self._child.begin(["twins", "check" if only_if_changed else "learn", *self._tray_words])
+        return f"`fantwin twins learn`: {problem}" if problem else ""
 
     def poll(self) -> str | None:
         """None while it works; then, once, what went wrong, or an empty string."""
-        if self._child is None or self._child.poll() is None:
-            return None
-        status = self._child.returncode
-        self._release()
+        status = self._child.ended()
         if not status:
-            return ""
-        lines = self._log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
-        return lines[-1].removeprefix("fantwin: ") if lines else f"`fantwin twins learn` ended with status {status}"
+            return None if status is None else ""
+        return self._child.last_line or f"`fantwin twins learn` ended with status {status}"
 
     @property
     def seconds(self) -> float | None:
         """How long it has been working; None: it is not."""
-        return None if self._child is None else time.monotonic() - self._began_s
+        return self._child.seconds
 
     def stop(self) -> None:
         """End it; no version is made."""
-        if self._child is None:
-            return
-        self._child.terminate()
-        try:
-            self._child.wait(STOP_S)
-        except subprocess.TimeoutExpired:
+        if not self._child.end(STOP_S):
             self._child.kill()
-            self._child.wait()
-        self._release()
-
-    def _release(self) -> None:
-        if self._child and self._child.stdin:
-            self._child.stdin.close()
-        self._child = None
-        _TURN.release()
 
 
 Work: TypeAlias = Literal["version", "check"]

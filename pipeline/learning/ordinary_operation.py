@@ -27,7 +27,7 @@ class OrdinaryOperation:
     """The commands of a tray's fans so far."""
 
     def __init__(self, tray: TrayConfig) -> None:
-        self._names = tray.names
+        self.names = tray.names
         self._range = f"{tray.command_min:g} to {tray.command_max:g}"
         self._low, self._width = tray.command_min, (tray.command_max - tray.command_min) / RANGES
         self._seconds = np.zeros((tray.fans, RANGES))
@@ -61,7 +61,7 @@ class OrdinaryOperation:
 
     def missing(self) -> list[str]:
         """What each fan has not done yet, a few words for each that lacks something."""
-        return [f"{self._names.label(fan)}: {each.missing}" for fan, each in enumerate(self.done()) if each.missing]
+        return [f"{self.names.label(fan)}: {each.missing}" for fan, each in enumerate(self.done()) if each.missing]
 
     def done(self) -> list[FanLearning]:
         """How much of what is needed each fan has done, and what it has not done yet."""
@@ -82,7 +82,7 @@ class OrdinaryOperation:
     def held(self) -> list[str]:
         """Which fans never changed their command by more than a tenth of the range, a few words for each."""
         still = np.flatnonzero(self._changes == 0).tolist()
-        return [f"{self._names.label(fan)}: {self._range_of(fan)}" for fan in still]
+        return [f"{self.names.label(fan)}: {self._range_of(fan)}" for fan in still]
 
     def _range_of(self, fan: int) -> str:
         low, high = self._lowest[fan], self._highest[fan]

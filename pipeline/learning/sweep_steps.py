@@ -11,6 +11,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.errors import UserError
 from fantwin.schemas.fan_names import NO_NAMES, FanNames
 from fantwin.schemas.messages import Array
@@ -24,11 +25,42 @@ SETTLING = 5.0
 SHORTEST_S, LONGEST_S = 0.5, 60.0
 """of a step; a fan that has not settled after the longest is slower than a fan can be"""
 SHORTEST_PROBE_S = 3.0
+PROBES = 3
+"""steps that show the time constants"""
+LEAST_SHARE = 0.2
+"""of the range: 4-pin fans turn there, some of them already at their minimum speed"""
+FANS_KEEP = "THESE FANS KEEP THE LAST COMMAND"
+"""in what is said when fans could not be left at the commands that they should have"""
 _POLL_S = 0.1
 _SETTLED = 0.02  # of the whole change: so little changes any more
 _FOLLOWS = 0.05  # of the top speed: a fan that changes less over the whole range does not follow its command
 _NOISE_SIGMAS = 5.0  # a smaller change may be noise
 _TOLERANCE = 0.02  # of the range: a device rounds its commands
+
+
+def turning(tray: TrayConfig) -> tuple[float, float]:
+    """The commands between which a tray is swept unless the user names others, lowest and highest: from a fifth of its
+    range, at which most fans turn, since a fan that stops does not cool. A tray that turns its fans both ways is swept
+    from command_min."""
+    share = 0.0 if tray.command_min < 0.0 else LEAST_SHARE
+    return tray.command_min + share * (tray.command_max - tray.command_min), tray.command_max
+
+
+def range_in_words(tray: TrayConfig, lowest: float, highest: float) -> str:
+    """With the shares of the tray's range: a lowest command of 0.2 is next to nothing where commands go to 255."""
+    low, high = ((each - tray.command_min) / (tray.command_max - tray.command_min) for each in (lowest, highest))
+    return f"commands from {lowest:g} to {highest:g}, {low:.0%} to {high:.0%} of its range"
+
+
+def holds_s(slowest_s: float) -> tuple[float, float]:
+    """How long a long step and a short one last. slowest_s: the longest time constant of the fans."""
+    return min(max(SETTLING * slowest_s, SHORTEST_S), LONGEST_S), min(max(slowest_s, SHORTEST_S), LONGEST_S)
+
+
+def duration_s(rounds: int, slowest_s: float) -> float:
+    """How long a sweep takes, about."""
+    long_s, short_s = holds_s(slowest_s)
+    return PROBES * max(long_s, SHORTEST_PROBE_S) + rounds * (len(LEVELS) * long_s + len(SHORT_LEVELS) * short_s)
 
 
 def levels_of(levels: Sequence[float], place: int) -> tuple[float, ...]:
@@ -103,8 +135,7 @@ class Excitation:
 
     def _steps(self, slowest_s: float) -> Iterator[tuple[list[float], float]]:
         """Commands of the fans and duration, s, of each step."""
-        long_s = min(max(SETTLING * slowest_s, SHORTEST_S), LONGEST_S)
-        short_s = min(max(slowest_s, SHORTEST_S), LONGEST_S)
+        long_s, short_s = holds_s(slowest_s)
         for number in range(self.rounds):
             order = -1 if number % 2 else 1
             for levels, hold_s in ((LEVELS, long_s), (SHORT_LEVELS, short_s)):

@@ -12,7 +12,7 @@ from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.site.fan_history import CURVES
 from fantwin.pipeline.site.fleet import Fan, FanGroup, FanNow
 from fantwin.pipeline.site.site_model import SiteModel
-from fantwin.schemas.health import Learning
+from fantwin.schemas.health import Learning, Sweep
 from fantwin.schemas.messages import Array
 from fantwin.schemas.units import RAD_S_PER_UNIT
 from fantwin.scoring.alarms.alarm_text import deviation_in
@@ -61,7 +61,7 @@ def fans_json(model: SiteModel, fans: Sequence[FanNow]) -> list[dict[str, Any]]:
                 "command": command,
                 "deviation_percent": deviation,
                 **_of_alarm(alarms.get((tray, number))),
-                "learning": learning[tray][number] if tray in learning else None,
+                "learning": _of_fan(learning[tray], number) if tray in learning else None,
             }
         )
     return found
@@ -104,28 +104,33 @@ def _rows(model: SiteModel) -> Mapping[str, Sequence[Row]]:
     return found
 
 
-def learning_json(model: SiteModel) -> dict[str, Sequence[dict[str, Any] | None]]:
-    """By tray, what the first twin of each of its fans waits for; empty: every tray has a twin."""
-    return {name: _of_learning(each, model.tray(name)) for name, each in model.learning().items()}
+def learning_json(model: SiteModel) -> dict[str, dict[str, Any]]:
+    """By tray, what its first twin waits for; none of a tray that has a twin, or is configured otherwise."""
+    of_trays = [(model.tray(name), each) for name, each in model.learning().items()]
+    return {tray.name: _of_learning(each, tray) for tray, each in of_trays if tray and len(each.fans) == tray.fans}
 
 
-def _of_learning(learning: Learning, tray: TrayConfig | None) -> Sequence[dict[str, Any] | None]:
-    """Of each fan; none of a tray that is configured otherwise."""
-    fans = tray.fans if tray else 0
-    if tray is None or len(learning.fans) != fans:
-        return [None] * fans
-    sweep = "" if tray.source.why_no_commands else f"fantwin command --tray {tray.name} --sweep"
-    return [
-        {
-            "progress": round(fan.progress, 4),
-            "what": learning.what,
-            "missing": fan.missing,
-            "until_t_ns": learning.until_t_ns,
-            "helps": learning.helps if fan.missing else "",
-            "command": sweep if fan.missing else "",
-        }
-        for fan in learning.fans
-    ]
+def _of_learning(learning: Learning, tray: TrayConfig) -> dict[str, Any]:
+    return {
+        "what": learning.what,
+        "until_t_ns": learning.until_t_ns,
+        "helps": learning.helps,
+        "command": "" if tray.source.why_no_commands else f"fantwin command --tray {tray.name} --sweep",
+        "sweep": sweep_json(learning.sweep) if learning.sweep else None,
+        "fans": [{"progress": round(fan.progress, 4), "missing": fan.missing} for fan in learning.fans],
+    }
+
+
+def sweep_json(sweep: Sweep) -> dict[str, str]:
+    """What an operator may ask of the learner of a tray."""
+    return {"plan": sweep.plan, "running": sweep.running, "ended": sweep.ended}
+
+
+def _of_fan(learning: Mapping[str, Any], number: int) -> dict[str, Any]:
+    """What the first twin waits for, of one fan: what would help only where it lacks something."""
+    fan = learning["fans"][number]
+    helps = {name: learning[name] if fan["missing"] else "" for name in ("helps", "command")}
+    return {**fan, "what": learning["what"], "until_t_ns": learning["until_t_ns"], **helps}
 
 
 def _known(values: Array) -> list[float | None]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 
-from fantwin.schemas.health import Health
+from fantwin.schemas.health import Health, Sweep
 from fantwin.schemas.messages import Alarm
 
 LONGEST_TEXT, MOST_CAUSES = 2000, 20
@@ -40,6 +40,11 @@ def readable_alarm(alarm: Alarm) -> Alarm:
     )
 
 
+def _readable_sweep(sweep: Sweep) -> Sweep:
+    plan, running, ended = map(_short_line, (sweep.plan, sweep.running, sweep.ended))
+    return replace(sweep, plan=plan, running=running, ended=ended)
+
+
 def readable_health(health: Health) -> Health:
     """The health with a problem and notes that are safe to show."""
     notes = tuple(replace(note, text=one_line(note.text)) for note in health.notes)
@@ -49,6 +54,7 @@ def readable_health(health: Health) -> Health:
             what=one_line(each.what),
             helps=one_line(each.helps),
             fans=tuple(replace(fan, missing=one_line(fan.missing)) for fan in each.fans),
+            sweep=each.sweep and _readable_sweep(each.sweep),
         )
         for each in health.learning
     )

@@ -24,6 +24,7 @@ from fantwin.pipeline.tray_scoring.scorer_core import ScorerCore
 from fantwin.pipeline.tray_scoring.snapshot_store import SnapshotStore
 from fantwin.pipeline.tray_scoring.tray_scorer import JudgedShare
 from fantwin.schemas.blocks import select
+from fantwin.schemas.enums import Action
 from fantwin.schemas.messages import Message, ModelCard, Prediction, Request, ScorerSnapshot
 from fantwin.scoring.score_message import unscored
 
@@ -81,13 +82,7 @@ class LearnedTwinScorer(Core):
             held, self._held = self._held, []
             return [message for prediction in held for message in self.step(prediction)]
         if isinstance(item, Request):
-            if self._core is None:
-                if len(self._requests) < MOST_REQUESTS:
-                    self._requests.append(item)
-                else:
-                    self._counts["refused_requests"] += 1
-                return []
-            return self._core.step(item)
+            return self._answer(item)
         if self._held or (item.twin and item.twin not in self._cards):
             self._held.append(item)
             if len(self._held) > MOST_HELD:
@@ -95,6 +90,18 @@ class LearnedTwinScorer(Core):
                 del self._held[0]
             return []
         return self._score(item)
+
+    def _answer(self, request: Request) -> Sequence[Message]:
+        """Answers to a request; before the first twin it waits. Those about a sweep are for the learner."""
+        if request.action in (Action.SWEEP, Action.STOP_SWEEP):
+            return []
+        if self._core is not None:
+            return self._core.step(request)
+        if len(self._requests) < MOST_REQUESTS:
+            self._requests.append(request)
+        else:
+            self._counts["refused_requests"] += 1
+        return []
 
     def tick(self, now_ns: int) -> Sequence[Message]:
         """What the core of the twin emits."""

@@ -33,7 +33,7 @@ from fantwin.pipeline.site.site_json import (
 from fantwin.pipeline.site.site_model import SiteModel
 from fantwin.schemas.enums import Action, FanState, Severity, Transition
 from fantwin.schemas.header import Header
-from fantwin.schemas.health import FanLearning, Learning
+from fantwin.schemas.health import FanLearning, Learning, Sweep
 from fantwin.schemas.messages import Diagnosis, Raw, ScorerSnapshot
 from fantwin.schemas.topics import tray_key
 from fantwin.scoring.wear.recorded_wear import shown
@@ -153,6 +153,43 @@ def test_a_fan_without_a_twin_says_what_is_learned_how_far_and_what_would_help(g
     assert Client(gateway).ask("GET", f"/api/v1/fans/{TRAY}/0")[1]["learning"] is None, "it is configured otherwise"
     gateway.feed(health("learner"))
     assert Client(gateway).ask("GET", f"/api/v1/fans/{TRAY}/0")[1]["learning"] is None, "it has a twin now"
+
+
+def test_without_a_twin_requests_are_refused_at_once_and_no_sweep_is_asked_of_a_learner_that_allows_none(gateway):
+    client = Client(gateway)
+    assert client.log_in("ann", PASSWORD) == 200
+    sweep, act = f"/api/v1/trays/{TRAY}/sweep", f"/api/v1/fans/{TRAY}/0/requests"
+    assert client.ask("POST", sweep, {})[0] == 409, "no learner is heard"
+    fans = (FanLearning(progress=0.5, missing=""),) * FANS
+    waits = Learning(tray=TRAY, what="5 of 10 minutes recorded", until_t_ns=0, helps="", fans=fans)
+    gateway.feed(health("learner", learning=(waits,)))
+    status, said, _ = client.ask("POST", act, {"action": "commission"})
+    assert (status, said["error"]) == (
+        409,
+        "tray tray1 has no twin yet (5 of 10 minutes recorded): nothing judges its fans, and there is no alarm to act "
+        "on; ask again when it has one, `fantwin status` says what that waits for",
+    )
+    for method in ("GET", "POST", "DELETE"):
+        status, said, _ = client.ask(method, sweep, {})
+        assert (status, said["error"]) == (
+            409,
+            "no sweep of tray tray1 may be started from here: set `sweep_on_request = true` in [learner], or run "
+            "`fantwin command --tray tray1 --sweep`",
+        )
+    assert gateway.sent == []
+    assert client.ask("POST", "/api/v1/trays/other/sweep", {})[0] == 404
+    gateway.feed(health("learner", learning=(replace(waits, sweep=Sweep(plan="fan 0")),)))
+    assert client.ask("GET", sweep)[1] == {"plan": "fan 0", "running": "", "ended": ""}
+    viewer = Client(gateway)
+    assert viewer.ask("POST", sweep, {})[0] == 401
+    assert viewer.log_in("vic", PASSWORD) == 200
+    assert (viewer.ask("POST", sweep, {})[0], viewer.ask("DELETE", sweep, {})[0]) == (403, 403)
+    other_site = {"Origin": "http://elsewhere"}
+    assert client.ask("POST", sweep, {}, other_site)[0] == 403
+    assert gateway.sent == []
+    gateway.feed(health("learner"), score())
+    granted_now = client.ask("POST", f"/api/v1/fans/{TRAY}/2/requests", {"action": "acknowledge"})
+    assert granted_now[0] == 200, "it has a twin now"
 
 
 def test_live_events_bring_an_alarm_and_the_samples_of_the_fan_that_is_looked_at(gateway):

@@ -6,6 +6,7 @@ import re
 import time
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -13,15 +14,16 @@ import pytest
 from playwright.sync_api import Browser, Page, expect
 
 from fantwin.pipeline.site import site_model
-from fantwin.schemas.enums import FanState, InvalidReason, Transition
-from fantwin.schemas.health import FanLearning, Learning
-from fantwin.schemas.messages import Diagnosis, Score
+from fantwin.schemas.enums import Action, FanState, InvalidReason, Transition
+from fantwin.schemas.health import FanLearning, Health, Learning, Sweep
+from fantwin.schemas.messages import Alarm, Diagnosis, Request, Score
 from fantwin.schemas.units import RAD_S_PER_UNIT
 from tests.support.made_messages import health
-from tests.support.page_browser import opened, running_browser
+from tests.support.page_browser import inaccessible, opened, running_browser
 from tests.support.running_core import TRAY
 from tests.support.running_gateway import RunningGateway
 from tests.support.site_messages import NOW_NS, alarm, score
+from tests.support.site_users import make_users
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("never_silent")]
 SPIKE_RPM = 1400.0
@@ -321,6 +323,69 @@ def test_without_a_twin_a_fan_is_learning_and_the_page_says_how_far_and_what_hel
     expect(panel).to_be_hidden()
     expect(page.locator(".fan.normal")).to_have_count(3)
     assert errors == []
+
+
+@pytest.mark.usefixtures("quickly_hashed")
+def test_an_operator_moves_the_fans_of_a_tray_without_a_twin_where_its_learner_allows_it(tmp_path, browser):
+    errors: list[str] = []
+    says, sweep = (
+        ["step 5 of 46: command 0.2 for 1.0 s, 120 s left"],
+        Sweep(plan="fan 0 of tray1: commands from 0.2 to 1"),
+    )
+    fans = (FanLearning(progress=0.3, missing="3 changes (10 needed)"), *[FanLearning(progress=1.0, missing="")] * 3)
+    waits = Learning(tray=TRAY, what="4 of 10 minutes recorded", until_t_ns=0, helps="move them", fans=fans)
+    sequence = count(1)
+
+    def learner(now: Sweep | None) -> Health:
+        return health("learner", sequence=next(sequence), learning=(replace(waits, sweep=now),))
+
+    def answer(request: Request) -> list[Alarm]:
+        """As the learner: by its health."""
+        asked.append((request.action, request.operator_name))
+        now = replace(sweep, asked_t_ns=request.t_ns)
+        if request.action == Action.SWEEP:
+            now = replace(now, running=says[0]) if says[0] else replace(now, ended="another tray is being swept: wait")
+        else:
+            now = replace(now, ended="stopped; the fans are left at these commands: fan 0 0.4")
+        gateway.core.step(learner(now))
+        return []
+
+    asked: list[tuple[Action, str]] = []
+    gateway = RunningGateway(tmp_path, answer, users=make_users(tmp_path / "users.toml"))
+    try:
+        gateway.feed(score(), learner(None))
+        ann, vic = (opened(browser, f"http://127.0.0.1:{gateway.port}/", errors, name) for name in ("ann", "vic"))
+        of_ann, of_vic = (page.get_by_role("region", name=f"Learning of {TRAY}") for page in (ann, vic))
+        expect(of_ann).to_contain_text("sweep_on_request = true")
+        expect(of_ann.get_by_role("button", name="Move the fans")).to_have_count(0)
+        gateway.feed(learner(sweep))
+        expect(of_vic).to_contain_text("vic may view but not act")
+        ann.bring_to_front()
+        of_ann.get_by_role("button", name="Move the fans").click()
+        dialog = ann.get_by_role("dialog")
+        expect(dialog).to_contain_text(sweep.plan)
+        assert asked == []
+        says[0] = ""
+        dialog.get_by_role("button", name="Move the fans").click()
+        expect(dialog).to_contain_text("another tray is being swept: wait")
+        says[0] = "step 5 of 46: command 0.2 for 1.0 s, 120 s left"
+        dialog.get_by_role("button", name="Move the fans").click()
+        expect(dialog).to_be_hidden()
+        for panel in (of_ann, of_vic):
+            expect(panel).to_contain_text(f"The fans are moved: {says[0]}.")
+        expect(of_vic.get_by_role("button")).to_have_count(0)
+        assert inaccessible(ann) == []
+        of_ann.get_by_role("button", name="Stop").click()
+        expect(of_vic).to_contain_text("The last sweep: stopped; the fans are left")
+        assert asked == [(action, "ann") for action in (Action.SWEEP, Action.SWEEP, Action.STOP_SWEEP)]
+        ann.goto(f"http://127.0.0.1:{gateway.port}/#/fan/{TRAY}/1")
+        expect(ann.locator(".fan-view")).to_contain_text(
+            "Its twin is being learned: until then nothing judges this fan"
+        )
+        expect(ann.get_by_text("Service")).to_have_count(0)
+        assert errors == []
+    finally:
+        gateway.close()
 
 
 def test_a_thousand_fans_are_tiles_and_those_in_alarm_have_cards(tmp_path, browser):

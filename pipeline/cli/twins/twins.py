@@ -18,7 +18,7 @@ from fantwin.pipeline.cli.progress import interruptible, working
 from fantwin.pipeline.config.loading import load_config
 from fantwin.pipeline.config.settings import Config, TrayConfig
 from fantwin.pipeline.errors import UsageError, UserError
-from fantwin.pipeline.learning.learning_schedule import VARIABLE
+from fantwin.pipeline.learning.child_command import VARIABLE
 from fantwin.pipeline.learning.versions import (
     DECLARED_PER_DAY,
     Check,

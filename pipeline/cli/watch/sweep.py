@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import threading
 from collections.abc import Mapping
 
@@ -23,15 +24,14 @@ from fantwin.pipeline.cli.printing import show
 from fantwin.pipeline.config.roles import OPERATOR
 from fantwin.pipeline.config.settings import Config, TrayConfig
 from fantwin.pipeline.errors import UsageError, UserError
-from fantwin.pipeline.learning.sweep_steps import Excitation, Observed, StoppedError
-from fantwin.pipeline.runtime.signals import stop_on_signals
+from fantwin.pipeline.learning.child_command import VARIABLE
+from fantwin.pipeline.learning.sweep_steps import FANS_KEEP, Excitation, Observed, StoppedError, range_in_words, turning
+from fantwin.pipeline.runtime.signals import stop_on_signals, when_stdin_closes
 from fantwin.schemas.messages import Raw
 from fantwin.schemas.topics import sweep_key
 from fantwin.schemas.units import NS_PER_S
 
 _FIRST_SAMPLE_S = 5.0
-LEAST_SHARE = 0.2
-"""of the range: 4-pin fans turn there, some of them already at their minimum speed"""
 
 
 def sweep(
@@ -61,6 +61,8 @@ def sweep(
         raise UsageError(f"--fans {fans}: tray {chosen.name} has fans 0 to {chosen.fans - 1}")
     lowest, highest = range_within(chosen, low, high, safe)
     stop = stop_on_signals()
+    if VARIABLE in os.environ:
+        when_stdin_closes(stop.set)  # the learner that started it has ended, perhaps by SIGKILL
     steps: list[str] = []
 
     def progress(line: str) -> None:
@@ -77,7 +79,7 @@ def sweep(
         bus.declare_alive(key)
         at_end = {fan: float(before[fan]) if safe is None else safe for fan in numbers}
         left_at = f"the commands {'they had before' if safe is None else 'of --safe'}: {_in_words(chosen, at_end)}"
-        progress(_range_in_words(chosen, lowest, highest))
+        progress(f"tray {chosen.name}: {range_in_words(chosen, lowest, highest)}")
         if low is None and lowest > chosen.command_min:
             progress(f"the lowest command should keep fans turning; --low {chosen.command_min:g} uses the whole range")
         progress(f"at the end and after Ctrl-C the fans get {left_at}")
@@ -101,18 +103,14 @@ def sweep(
 
 
 def range_within(tray: TrayConfig, low: float | None, high: float | None, safe: float | None) -> tuple[float, float]:
-    """The commands of a sweep, lowest and highest.
-
-    Without --low the lowest is a fifth of the tray's range, at which most fans turn: a fan that stops does not cool. A
-    tray that turns its fans both ways is swept from command_min. Without --high the highest is command_max.
+    """The commands of a sweep, lowest and highest: see `turning`.
 
     Raises:
         UsageError: one of them, or the safe command, is outside those limits; or --high alone is given, not above the
             lowest: the user must say how low commands may go.
     """
-    share = 0.0 if tray.command_min < 0.0 else LEAST_SHARE
-    turning = tray.command_min + share * (tray.command_max - tray.command_min)
-    lowest, highest = turning if low is None else low, tray.command_max if high is None else high
+    usual = turning(tray)
+    lowest, highest = usual[0] if low is None else low, usual[1] if high is None else high
     if not tray.command_min <= lowest < highest <= tray.command_max:
         raise UsageError(_wrong_range(tray, low, high, lowest))
     if safe is not None:
@@ -130,12 +128,6 @@ def _wrong_range(tray: TrayConfig, low: float | None, high: float | None, lowest
     given = " ".join(f"{name} {value:g}" for name, value in (("--low", low), ("--high", high)) if value is not None)
     limits = f"{tray.command_min:g} to {tray.command_max:g}"
     return f"{given}: name a range within {limits} of tray {tray.name}"
-
-
-def _range_in_words(tray: TrayConfig, lowest: float, highest: float) -> str:
-    """With the shares of the tray's range: a --low of 0.2 is next to nothing where commands go to 255."""
-    low, high = ((each - tray.command_min) / (tray.command_max - tray.command_min) for each in (lowest, highest))
-    return f"tray {tray.name}: commands from {lowest:g} to {highest:g}, {low:.0%} to {high:.0%} of its range"
 
 
 def _leave(line: _BusLine, tray: TrayConfig, at_end: Mapping[int, float], ended: str) -> None:
@@ -160,7 +152,7 @@ def _leave(line: _BusLine, tray: TrayConfig, at_end: Mapping[int, float], ended:
     if failed:
         by_hand = _in_words(tray, {fan: at_end[fan] for fan in failed})
         reasons = "; ".join(dict.fromkeys(failed.values()))
-        kept = f"THESE FANS KEEP THE LAST COMMAND; send these by hand: {by_hand} ({reasons})"
+        kept = f"{FANS_KEEP}; send these by hand: {by_hand} ({reasons})"
         raise UserError("; ".join(filter(None, (kept, ended))))
 
 

@@ -354,6 +354,18 @@ class Clips(BaseModel):
     clips: list[Clip]
 
 
+class Sweep(BaseModel):
+    """A sweep of the fans of a tray without a twin, which an operator may start.
+
+    plan: which fans it moves between which commands, and for how long. running: what it does now; empty: none runs.
+    ended: how the last one ended; empty: there was none.
+    """
+
+    plan: str
+    running: str
+    ended: str
+
+
 class Stage(BaseModel):
     """A stage: its state in a word, rates, losses, latency."""
 

@@ -25,7 +25,7 @@ from fantwin.pipeline.outputs.web.metrics import metrics_text
 from fantwin.pipeline.recordings.clips.clip import Clip, kept_clips
 from fantwin.pipeline.site.fan_history import HISTORY_S
 from fantwin.pipeline.site.fan_series import FanSeries
-from fantwin.pipeline.site.fans_json import fans_json
+from fantwin.pipeline.site.fans_json import fans_json, sweep_json
 from fantwin.pipeline.site.fleet import Fan, FanGroup
 from fantwin.pipeline.site.request_desk import RequestDesk, RequestForm
 from fantwin.pipeline.site.site_json import (
@@ -41,6 +41,8 @@ from fantwin.pipeline.site.site_json import (
     transition_json,
 )
 from fantwin.pipeline.site.site_model import SiteModel
+from fantwin.pipeline.site.sweep_requests import ask_for_sweep, sweep_of, why_not_judged
+from fantwin.schemas.enums import Action
 from fantwin.schemas.units import NS_PER_S
 
 MOST_LISTED = 500
@@ -74,7 +76,10 @@ _FILE: dict[int | str, dict[str, Any]] = {
 _TABLE: dict[int | str, dict[str, Any]] = {
     200: {"content": {CSV_TYPE: {"schema": {"type": "string"}}}, "description": "JSON, or a table"}
 }
-_REFUSED: dict[int | str, dict[str, Any]] = {409: {"model": typed.Refused, "description": "the scorer has refused it"}}
+_REFUSED: dict[int | str, dict[str, Any]] = {
+    409: {"model": typed.Refused, "description": "the scorer has refused it, or the tray has no twin yet"}
+}
+_NOT_SWEPT: dict[int | str, dict[str, Any]] = {409: {"model": typed.Problem, "description": "nobody may, or not now"}}
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,6 +127,10 @@ class Api:
         act = {"response_model": typed.ScorerAnswers, "responses": _REFUSED}
         acts = [Depends(self.access.operator), *shown]
         post("/fans/{tray}/{fan}/requests", self.act, dependencies=acts, **act)
+        swept = {"response_model": typed.Sweep, "responses": _NOT_SWEPT}
+        get("/trays/{tray}/sweep", self.sweep, **swept)
+        post("/trays/{tray}/sweep", self.start_sweep, dependencies=acts, **swept)
+        router.add_api_route("/trays/{tray}/sweep", self.stop_sweep, methods=["DELETE"], dependencies=acts, **swept)
         return router
 
     async def site(self) -> JSON:
@@ -269,6 +278,8 @@ class Api:
         name = self.access.visitor(request).name
         fans = range(self._tray(tray).fans) if fan == ALL_FANS else [self._fan(tray, fan).number]
         asked = form.message(-1 if fan == ALL_FANS else fan, name)
+        if why := why_not_judged(self.model, tray):
+            return JSONResponse({"error": why, "answers": []}, 409)
         self.access.log.add("request", user=name, action=form.action, fan=f"{tray} {fan}", **address_of(request))
         try:
             said = await self.desk.ask(tray, asked, fans)
@@ -276,6 +287,33 @@ class Api:
             raise HTTPException(504, str(error) or f"tray {tray}: no scorer has answered") from error
         body = answers_json(said)
         return JSONResponse(body, 409) if "error" in body else body
+
+    async def sweep(self, tray: str) -> JSON:
+        """The sweep of a tray without a twin: what it would do, what it does, how the last one ended."""
+        self._tray(tray)
+        try:
+            return sweep_json(sweep_of(self.model, tray))
+        except UserError as error:
+            raise HTTPException(409, str(error)) from error
+
+    async def start_sweep(self, tray: str, request: Request) -> JSON:
+        """Move the fans of a tray without a twin over their range, so that it can be learned."""
+        return await self._ask_for_sweep(tray, Action.SWEEP, request)
+
+    async def stop_sweep(self, tray: str, request: Request) -> JSON:
+        """Stop that: the fans get the commands that they had before."""
+        return await self._ask_for_sweep(tray, Action.STOP_SWEEP, request)
+
+    async def _ask_for_sweep(self, tray: str, action: Action, request: Request) -> JSON:
+        self._tray(tray)
+        name = self.access.visitor(request).name
+        self.access.log.add("request", user=name, action=action.name.lower(), fan=f"{tray} all", **address_of(request))
+        try:
+            return sweep_json(await ask_for_sweep(self.model, self.desk, tray, action, name))
+        except UserError as error:
+            raise HTTPException(409, str(error)) from error
+        except TimeoutError as error:
+            raise HTTPException(504, str(error)) from error
 
     def _answer(self, name: str, make: Callable[[], Any]) -> SharedAnswer:
         """The one for all who ask for this."""

@@ -74,7 +74,22 @@ function acknowledgeAll(tray, count) {
   });
 }
 
-function hint() {
+// plan: which fans move between which commands, and for how long.
+export function askForSweep(tray, plan) {
+  dialog(`Move the fans of ${tray}`, element("p", {}, plan), "Move the fans", async () => {
+    await send(`/trays/${encodeURIComponent(tray)}/sweep`, {});
+  });
+}
+
+export async function stopSweep(tray) {
+  try {
+    await send(`/trays/${encodeURIComponent(tray)}/sweep`, {}, "DELETE");
+  } catch (failure) {
+    notice(failure instanceof Refused ? failure.message : "The server cannot be reached.");
+  }
+}
+
+export function hint() {
   if (me.name) return `${me.name} may view but not act.`;
   return me.has_login ? "Log in to act." : "Nobody can act from this page: it needs users ([gateway] users in the configuration).";
 }

@@ -186,6 +186,11 @@ export class FanView {
     this.level = bytes(fleet.levels)[this.index];
     if (was !== this.class && was >= 0 && this.site.classes[was] !== this.site.classes[this.class]) learn(() => this.learn());
     this.showState(this.stateText);
+    const isLearning = this.tray in fleet.learning;
+    if (isLearning !== this.isLearning) {
+      this.isLearning = isLearning;
+      this.showAlarm();
+    }
   }
 
   showState(text) {
@@ -198,9 +203,17 @@ export class FanView {
     setText(this.state, `${group.mark} ${isAlarm ? "alarm, now " : ""}${text.replace("unknown", "not judged")}${isNear ? `, ${isNear}` : ""}`);
   }
 
+  // Without a twin no scorer answers an operator.
+  showAlarm() {
+    const alarm = this.shownAlarm;
+    keepFocus(this.alarm, () => this.alarm.replaceChildren(alarm?.listed ? card(alarm, this.viewerUrl, { isOfFan: true })
+      : this.isLearning ? element("p", { class: "muted" }, "Its twin is being learned: until then nothing judges this fan.") : buttons(this.tray, this.fan, null)));
+  }
+
   // isNew: a transition has come.
   updateAlarm(alarm, isNew = true) {
-    keepFocus(this.alarm, () => this.alarm.replaceChildren(alarm?.listed ? card(alarm, this.viewerUrl, { isOfFan: true }) : buttons(this.tray, this.fan, null)));
+    this.shownAlarm = alarm;
+    this.showAlarm();
     if (this.known && isNew && alarm) {
       this.history.update();
       this.dueMarks ||= setTimeout(() => { this.dueMarks = 0; if (this.root.isConnected) learn(() => this.load()); }, 300);

@@ -1,7 +1,9 @@
 // The first hour: which twins are being learned, how far that is for each fan, how long it takes, and what would help.
 
-import { clock, element, percent } from "./dom.js";
+import { askForSweep, hint, stopSweep } from "./actions.js";
+import { clock, element, keepFocus, percent } from "./dom.js";
 import { label } from "./names.js";
+import { me } from "./server.js";
 
 // Of a fan on a card, in a few words.
 export const learningText = (fan) => (fan ? `${percent(fan.progress)} learned` : "");
@@ -22,29 +24,39 @@ export class LearningPanel {
     this.stages = stages;
   }
 
-  // learning: of the fans of each tray without a twin. isSilent: nothing was ever heard of any fan.
+  // learning: of each tray without a twin. isSilent: nothing was ever heard of any fan.
   update(learning, isSilent) {
     const problems = isSilent ? this.stages.filter((stage) => stage.detail).map((stage) => `${stage.name}: ${stage.detail}`) : [];
-    const trays = Object.entries(learning).filter(([, fans]) => fans.some(Boolean)), shown = JSON.stringify([trays, problems, isSilent]);
+    const trays = Object.entries(learning), shown = JSON.stringify([trays, problems, isSilent, me.name, me.may_act]);
     if (shown === this.shown) return;
-    const had = this.root.contains(document.activeElement);
     this.shown = shown;
     this.root.hidden = !trays.length && !isSilent;
-    this.root.replaceChildren(...trays.map(([tray, fans]) => panel(tray, fans)), isSilent && !trays.length ? silence(problems) : "");
-    if (had) this.root.querySelector("button")?.focus();
+    keepFocus(this.root, () => this.root.replaceChildren(...trays.map(([tray, of]) => panel(tray, of)), isSilent && !trays.length ? silence(problems) : ""));
   }
 }
 
-function panel(tray, fans) {
-  const { what, until_t_ns } = fans.find(Boolean), waiting = fans.filter((fan) => fan?.missing), [first] = waiting;
-  const rows = fans.map((fan, number) => fan && element("tr", {}, element("td", { "data-label": "Fan" }, label(tray, number)),
+function panel(tray, learning) {
+  const { what, until_t_ns, fans } = learning;
+  const rows = fans.map((fan, number) => element("tr", {}, element("td", { "data-label": "Fan" }, label(tray, number)),
     element("td", { "data-label": "Progress" }, element("progress", { max: 1, value: fan.progress, "aria-label": `Progress of ${label(tray, number)}` }), ` ${percent(fan.progress)}`),
     element("td", { "data-label": "Still missing" }, fan.missing || "nothing but time")));
   return element("section", { class: "panel learning", "aria-label": `Learning of ${tray}` }, element("h2", {}, `◔ Learning the healthy twin of ${tray}`),
     element("p", {}, `${what}. Until the twin is there, nothing is judged and no alarm is raised.${until_t_ns ? ` It will be there at about ${clock(until_t_ns).slice(0, -3)}.` : ""}`),
     element("div", { class: "scroll", tabindex: 0, role: "region", "aria-label": `Progress of the fans of ${tray}` }, element("table", { class: "folding" },
       element("thead", {}, element("tr", {}, ...["Fan", "Progress", "Still missing"].map((text) => element("th", { scope: "col" }, text)))), element("tbody", {}, ...rows))),
-    first?.helps ? element("p", {}, "What would help: ", ...(first.command ? ["move the fans over their range with ", ...command(first.command)] : [first.helps]), ".") : "");
+    ...movement(tray, learning));
+}
+
+// What would move the fans: a button where the learner allows it, or else what to type; and what is moving them.
+function movement(tray, { helps, command: sweep_command, sweep, fans }) {
+  const button = (text, name, onclick) => element("button", { type: "button", class: "primary", "data-action": `${name} ${tray}`, onclick }, text);
+  if (sweep?.running) return [element("p", { role: "status" }, `The fans are moved: ${sweep.running}. `, me.may_act ? button("Stop", "stop", () => stopSweep(tray)) : "")];
+  const ended = sweep?.ended ? element("p", { role: "status" }, `The last sweep: ${sweep.ended}.`) : "";
+  if (!fans.some((fan) => fan.missing)) return [ended];
+  if (sweep) return [element("p", {}, "What would help: move the fans over their range. ", me.may_act ? button("Move the fans", "sweep", () => askForSweep(tray, sweep.plan)) : hint()), ended];
+  if (!sweep_command) return [element("p", {}, `What would help: ${helps}.`)];
+  return [element("p", {}, "What would help: move the fans over their range with ", ...command(sweep_command), ". Operators can start that here if the configuration has ",
+    element("code", {}, "sweep_on_request = true"), " in ", element("code", {}, "[learner]"), ".")];
 }
 
 function silence(problems) {

@@ -167,7 +167,7 @@ export class Overview {
   // Returns whether it is in another group than before.
   show(cell, index) {
     const shownClass = this.classes[index], level = this.levels[index], bare = this.groupOfClass[shownClass];
-    const of = bare === NOT_JUDGED && this.learning[cell.tray]?.[cell.fan] ? LEARNING : bare;
+    const of = bare === NOT_JUDGED && this.learning[cell.tray] ? LEARNING : bare;
     if (cell.class === shownClass && cell.level === level && (cell.group === LEARNING) === (of === LEARNING)) return false;
     return cell.show(shownClass, of, level, this.site.classes[shownClass]);
   }
@@ -193,7 +193,7 @@ export class Overview {
   }
 
   explainCard(card) {
-    if (card instanceof FanCard) card.explain(this.alarms.get(`${card.tray}/${card.fan}`), learningText(this.learning[card.tray]?.[card.fan]), this.silent_since_t_ns?.[card.tray]);
+    if (card instanceof FanCard) card.explain(this.alarms.get(`${card.tray}/${card.fan}`), learningText(this.learning[card.tray]?.fans[card.fan]), this.silent_since_t_ns?.[card.tray]);
   }
 
   // Cards of the fans in alarm of a large site, of those whose speeds come.

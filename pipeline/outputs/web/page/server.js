@@ -26,9 +26,9 @@ export async function learn(asked) {
   }
 }
 
-export async function send(path, body) {
+export async function send(path, body, method = "POST") {
   const headers = { "Content-Type": "application/json", "X-CSRF-Token": me.csrf_token };
-  return answered(await fetch(PREFIX + path, { method: "POST", headers, body: JSON.stringify(body) }));
+  return answered(await fetch(PREFIX + path, { method, headers, body: JSON.stringify(body) }));
 }
 
 export async function learnWhoIAm() {
