@@ -59,6 +59,7 @@ def build_tray_source(context: Context) -> SampleSource:
                 tray.name,
                 limits_of(tray),
                 run_folder=context.run_folder,
+                names=tray.names,
             ),
         )
     except UserError as error:

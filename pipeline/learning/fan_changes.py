@@ -11,6 +11,7 @@ import numpy as np
 
 from fantwin.pipeline.learning.training_data import TrainingData, twin_errors
 from fantwin.pipeline.learning.version_data import Excerpt, each_excerpt
+from fantwin.schemas.fan_names import NO_NAMES, FanNames
 
 if TYPE_CHECKING:
     from fantwin.schemas.messages import Array
@@ -94,14 +95,16 @@ def have_most_changed_alike(change: Array) -> bool:
     return 2 * int(np.count_nonzero(np.abs(change[alike]) > MOST_CHANGE)) > len(change)
 
 
-def changed_fans(change: Array, reference: str) -> str:
+def changed_fans(change: Array, reference: str, names: FanNames = NO_NAMES) -> str:
     """What has changed more than healthy fans do, in words; empty if nothing has. change: as above."""
     far = np.flatnonzero(np.abs(change) > MOST_CHANGE)
     if not len(far):
         return ""
     compared, alike = np.flatnonzero(np.isfinite(change)), fans_changed_alike(change)
     if len(alike):
-        others = "".join(f", fan {fan} is {_faster(float(change[fan]))}" for fan in compared if fan not in alike)
+        others = "".join(
+            f", {names.label(fan)} is {_faster(float(change[fan]))}" for fan in compared.tolist() if fan not in alike
+        )
         if others:
             which = f"{len(alike)} of {len(compared)} fans"
         else:
@@ -110,7 +113,7 @@ def changed_fans(change: Array, reference: str) -> str:
             f"{which} are {_faster(float(np.mean(change[alike])))} than when {reference} was made{others}; if "
             "maintenance, a filter or new firmware is the reason, put this version in force"
         )
-    named = ", ".join(f"fan {fan} is {_faster(float(change[fan]))}" for fan in far.tolist())
+    named = ", ".join(f"{names.label(fan)} is {_faster(float(change[fan]))}" for fan in far.tolist())
     inspected = "inspect it: if it is" if len(far) == 1 else "inspect them: if they are"
     return f"{named} than when {reference} was made; {inspected} healthy, put this version in force"
 

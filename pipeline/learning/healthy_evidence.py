@@ -126,7 +126,7 @@ def _of_mean(runs: Sequence[LearnedRun]) -> str:
         return ""
     than = "faster" if share > 0.0 else "slower"
     return (
-        f"{run.tray.path}: {run.tray.tray} fan {fan} is {100 * size:.2g} % {than} than its twin on "
+        f"{run.tray.path}: {run.tray.tray} {run.tray.names.label(fan)} is {100 * size:.2g} % {than} than its twin on "
         f"average, the median of all fans is {100 * median:.2g} %: {SO_LEAVE_IT_OUT}"
     )
 
@@ -138,8 +138,8 @@ def _of_alarms(runs: Sequence[DecidedRun]) -> str:
     if 2 * most <= total or len(alarms) == 1:
         return ""
     return (
-        f"{run.tray.path}: {run.tray.tray} fan {fan} has {most} of the {total} alarms that the limit by theory "
-        f"raises: {SO_LEAVE_IT_OUT}"
+        f"{run.tray.path}: {run.tray.tray} {run.tray.names.label(fan)} has {most} of the {total} alarms that the limit "
+        f"by theory raises: {SO_LEAVE_IT_OUT}"
     )
 
 

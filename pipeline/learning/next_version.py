@@ -47,6 +47,7 @@ from fantwin.pipeline.learning.versions import Check, Drop, Outcome, TwinVersion
 from fantwin.pipeline.recordings.excerpts import ExcerptReader
 from fantwin.pipeline.replay.offline.healthy_runs import HealthyPart, in_this_process
 from fantwin.pipeline.sources.tacho_evidence import tacho_hints
+from fantwin.schemas.fan_names import NO_NAMES, FanNames
 from fantwin.scoring.calibration.calibration import Calibration, needed_fan_hours
 
 if TYPE_CHECKING:
@@ -69,7 +70,13 @@ NO_CHECK = Check(t_ns=0, reference="", change=(), found="", spans=())
 
 
 def make_next_version(
-    folder: Path, tray: str, per_day: float, say: Callable[[str], None], *, only_if_changed: bool = False
+    folder: Path,
+    tray: str,
+    per_day: float,
+    say: Callable[[str], None],
+    names: FanNames = NO_NAMES,
+    *,
+    only_if_changed: bool = False,
 ) -> Version | None:
     """Make the next version and add it to the list; it is in force if it was taken.
 
@@ -82,11 +89,11 @@ def make_next_version(
     """
     versions = TwinVersions(folder, tray)
     with versions.learning():
-        return _next_version(versions, per_day, say, only_if_changed=only_if_changed)
+        return _next_version(versions, per_day, say, names, only_if_changed=only_if_changed)
 
 
 def _next_version(
-    versions: TwinVersions, per_day: float, say: Callable[[str], None], *, only_if_changed: bool
+    versions: TwinVersions, per_day: float, say: Callable[[str], None], names: FanNames, *, only_if_changed: bool
 ) -> Version | None:
     folder, listed, name = versions.folder, versions.read(), versions.next_name()
     healthy = healthy_recordings(folder, listed.excluded_spans)
@@ -97,14 +104,14 @@ def _next_version(
         shutil.rmtree(left, ignore_errors=True)
     with tempfile.TemporaryDirectory(prefix=WORK_PREFIX, dir=folder) as place:
         parts = Path(place), name, versions.file, listed
-        work = _Work(*parts, healthy, near_alarms, per_day, say) if near_alarms else None
+        work = _Work(*parts, healthy, near_alarms, per_day, say, names) if near_alarms else None
         check = work.checked_alike() if work else None
         if work is None or check is None:
             looked_t_ns = near_alarms[-1].span[1] if near_alarms else 0
             if only_if_changed and near_alarms and _is_too_little_new(healthy, listed):
                 versions.add_check((listed.check or NO_CHECK).model_copy(update={"near_t_ns": looked_t_ns}))
                 return None
-            work = _Work(*parts, healthy, [], per_day, say)
+            work = _Work(*parts, healthy, [], per_day, say, names)
             check = work.checked().model_copy(update={"near_t_ns": looked_t_ns})
         is_needed = work.needs_offer() if check.found else not only_if_changed
         if not is_needed:
@@ -141,11 +148,12 @@ class _Work:
         near_alarms: Sequence[HistoryRecording],
         per_day: float,
         say: Callable[[str], None],
+        names: FanNames = NO_NAMES,
     ) -> None:
         """file_of: the file of a version. listed: the versions before this one. healthy, near_alarms: what it is made
         from."""
         self._place, self._name, self._file_of, self._listed = place, name, file_of, listed
-        self._before, self._per_day, self._say = listed.current, per_day, say
+        self._before, self._per_day, self._say, self._names = listed.current, per_day, say, names
         self._near_alarms = set(near_alarms)
         self._recordings = recordings = sorted([*healthy, *near_alarms], key=lambda each: each.span)
         self._rate_hz, self._fans = _rate_and_fan_count((healthy or near_alarms)[-1])
@@ -199,7 +207,7 @@ class _Work:
     def _changed(self, change: Array, since: Version) -> str:
         """What has changed, in words; near alarms only what most fans have alike."""
         counts = not self._near_alarms or have_most_changed_alike(change)
-        return changed_fans(change, since.name) if counts else ""
+        return changed_fans(change, since.name, self._names) if counts else ""
 
     def _unchanged_t_ns(self) -> int:
         """Until then the fans are known to have been as when the reference was made."""

@@ -21,9 +21,10 @@ from fantwin.pipeline.recordings.time_range import Recorded, RecordedRange
 from fantwin.pipeline.site.buckets import Buckets, Points
 from fantwin.pipeline.site.fan_history import COLUMNS, CURVES, DEVIATION, SERIES, channels_of, in_series, values_of
 from fantwin.pipeline.site.fleet import Fan
+from fantwin.pipeline.site.site_json import mark_json
 from fantwin.pipeline.site.site_model import SiteModel
 from fantwin.schemas.channels import BY_NAME, measured_columns
-from fantwin.schemas.messages import OVERVIEW_ROW_NS, Alarm, Array, Overview, Raw, Score
+from fantwin.schemas.messages import OVERVIEW_ROW_NS, Array, Overview, Raw, Score
 from fantwin.schemas.units import NS_PER_S, RAD_S_PER_UNIT
 from fantwin.scoring.alarms.current_alarms import current_alarm
 from fantwin.scoring.diagnosis.causes import short_name
@@ -156,7 +157,7 @@ class FanSeries:
                 causes.append(_step(alarm.t_ns, alarm.causes))
             elif not alarm.active and causes and causes[-1]["probabilities"]:
                 causes.append(_step(alarm.t_ns, ()))
-        return {"marks": [_mark(alarm) for alarm in marks], "causes": causes}
+        return {"marks": [{"t_s": alarm.t_ns / NS_PER_S, **mark_json(alarm)} for alarm in marks], "causes": causes}
 
 
 def _add_block(buckets: Buckets, block: Recorded, fan: int, end_ns: int, *, has_samples: bool) -> None:
@@ -211,16 +212,3 @@ def _or_null(values: Array) -> list[float | None]:
 def _step(t_ns: int, causes: Sequence[Any]) -> dict[str, Any]:
     probabilities = {short_name(each.cause): each.probability for each in causes}
     return {"t_s": t_ns / NS_PER_S, "probabilities": probabilities}
-
-
-def _mark(alarm: Alarm) -> dict[str, Any]:
-    return {
-        "t_s": alarm.t_ns / NS_PER_S,
-        "onset_t_ns": alarm.onset_t_ns,
-        "transition": alarm.transition.name.lower(),
-        "severity": alarm.severity.name.lower(),
-        "active": alarm.active,
-        "message": alarm.message,
-        "operator_name": alarm.operator_name,
-        "comment": alarm.comment,
-    }

@@ -140,7 +140,14 @@ def sparks_json(model: SiteModel) -> dict[str, Any]:
         _, each_second = np.unique(curves.t_ns // NS_PER_S, return_index=True)
         thinned = Curves(curves.t_ns[each_second], curves.values[each_second], curves.channels)
         found = curves_json(thinned, tray)
-        sparks.append({"tray": fan.tray, "fan": fan.number, **{name: found[name] for name in SPARK_CURVES}})
+        sparks.append(
+            {
+                "tray": fan.tray,
+                "fan": fan.number,
+                "name": model.about(fan).name,
+                **{name: found[name] for name in SPARK_CURVES},
+            }
+        )
     return {"fans": sparks}
 
 
@@ -183,7 +190,21 @@ def clip_json(clip: Clip) -> dict[str, Any]:
         "bytes": clip.size_bytes,
         "acknowledged": clip.is_acknowledged,
         "problem": clip.problem,
-        "alarms": [{"fan": each.fan, "onset_t_ns": each.onset_t_ns, "t_ns": each.t_ns} for each in clip.alarms],
+        "alarms": [each.about() for each in clip.alarms],
+    }
+
+
+def mark_json(alarm: Alarm) -> dict[str, Any]:
+    """What has happened to the alarm of a fan."""
+    return {
+        "name": alarm.fan_name,
+        "onset_t_ns": alarm.onset_t_ns,
+        "transition": alarm.transition.name.lower(),
+        "severity": alarm.severity.name.lower(),
+        "active": alarm.active,
+        "message": alarm.message,
+        "operator_name": alarm.operator_name,
+        "comment": alarm.comment,
     }
 
 
@@ -194,14 +215,7 @@ def transition_json(number: int, alarm: Alarm, feedback: Feedback = Feedback.NON
         "t_ns": alarm.t_ns,
         "tray": alarm.header.tray,
         "fan": alarm.fan,
-        "name": alarm.fan_name,
-        "onset_t_ns": alarm.onset_t_ns,
-        "transition": alarm.transition.name.lower(),
-        "severity": alarm.severity.name.lower(),
-        "active": alarm.active,
-        "message": alarm.message,
-        "operator_name": alarm.operator_name,
-        "comment": alarm.comment,
+        **mark_json(alarm),
         "feedback": feedback.name.lower(),
         "causes": [{"cause": short_name(each.cause), "probability": each.probability} for each in alarm.causes],
     }

@@ -17,6 +17,7 @@ from typing import ClassVar, Protocol, TypeAlias
 from pydantic import BaseModel
 
 from fantwin.schemas.channels import FanValues
+from fantwin.schemas.fan_names import NO_NAMES, FanNames
 from fantwin.schemas.tacho import Tacho
 from fantwin.schemas.units import RAD_S_PER_UNIT
 
@@ -114,6 +115,7 @@ class SourceContext:
     """limits of accepted readings, for a source that reports refused ones to their sender; None: not known"""
     run_folder: Path | None = None
     """folder where it may keep files; None: nowhere"""
+    names: FanNames = NO_NAMES
 
     @property
     def units_per_rpm(self) -> float:

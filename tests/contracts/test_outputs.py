@@ -86,6 +86,9 @@ class GatewayOutput(Output):
         alarm, fan, transition = found[0]["alarms"][0], found[1], found[2]["transitions"][0]
         assert (site["names"][2], site["places"][2]) == (fan["name"], fan["place"]) == (alarm["name"], alarm["place"])
         assert alarm["about"] == "90 rpm below the twin"
+        spark = client.ask("GET", "/api/v1/sparks")[1]["fans"][2]
+        (mark,) = client.ask("GET", f"/api/v1/fans/{TRAY}/2/series?from=0")[1]["marks"]
+        assert (spark["name"], mark["name"]) == (fan["name"], fan["name"])
         return "\n".join([alarm["message"], fan["name"], fan["place"], transition["name"], transition["message"]])
 
     def alarms(self) -> Alarms:

@@ -379,7 +379,7 @@ def test_clips_of_alarms_are_listed_and_downloaded_and_nothing_else_of_the_disk_
     folder = tmp_path / "runs" / "clips"
     folder.mkdir(parents=True)
     content = "a recording " * 1000
-    alarms = (ClipAlarm(3, RAISED_NS, RAISED_NS, acknowledged=True),)
+    alarms = (ClipAlarm(3, RAISED_NS, RAISED_NS, "rear", acknowledged=True),)
     size, window = len(content), (RAISED_NS, RAISED_NS + 9, RAISED_NS)
     kept = Clip("tray1-3-x.mcap", TRAY, *window, alarms, is_due=False, size_bytes=size)
     others = [replace(kept, name="../secret.json"), replace(kept, name="gone.mcap"), replace(kept, tray="tray9")]
@@ -393,7 +393,7 @@ def test_clips_of_alarms_are_listed_and_downloaded_and_nothing_else_of_the_disk_
     assert client.ask("GET", f"/api/v1/clips/{kept.name}")[0] == 401
     (listed, *more) = client.ask("GET", "/api/v1/clips", headers=viewer)[1]["clips"]
     assert (listed["name"], listed["bytes"], listed["acknowledged"]) == (kept.name, size, True)
-    assert listed["alarms"] == [{"fan": 3, "onset_t_ns": RAISED_NS, "t_ns": RAISED_NS}]
+    assert listed["alarms"] == [{"fan": 3, "name": "rear", "onset_t_ns": RAISED_NS, "t_ns": RAISED_NS}]
     assert more == []
     status, body, headers = client.ask("GET", f"/api/v1/clips/{kept.name}", headers=viewer)
     assert (status, body) == (200, content)

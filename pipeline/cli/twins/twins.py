@@ -30,6 +30,7 @@ from fantwin.pipeline.learning.versions import (
 )
 from fantwin.pipeline.recordings.dates import format_local
 from fantwin.pipeline.runtime.signals import when_stdin_closes
+from fantwin.schemas.fan_names import NO_NAMES, FanNames
 from fantwin.schemas.units import NS_PER_S
 
 CONSEQUENCE = "alarms are discarded and what was learned of the fans begins again, unless only the calibration differs"
@@ -103,7 +104,7 @@ def twins(
         if versions.read().is_tainted:
             said.append(f"{use} was learned from a time span that is marked as faulty: another version will replace it")
     listed = versions.read()
-    lines = [*said, *list_lines(listed)]
+    lines = [*said, *list_lines(listed, of.names)]
     if not listed.versions:
         lines.append(
             f"{of.name} has no twin yet: `fantwin up` makes the first; `fantwin status` says what it waits for"
@@ -123,9 +124,9 @@ def _learn(settings: Config, of: TrayConfig, *, only_if_changed: bool, json_outp
     folder = learning_folder(settings.run_folder, of.name)
     doing = f"{'checking' if only_if_changed else 'learning'} the twin of {of.name}"
     with interruptible("no version was made"), working(doing) as say:
-        version = make_next_version(folder, of.name, DECLARED_PER_DAY, say, only_if_changed=only_if_changed)
+        version = make_next_version(folder, of.name, DECLARED_PER_DAY, say, of.names, only_if_changed=only_if_changed)
     listed = TwinVersions(folder, of.name).read()
-    lines = [check_line(listed.check) if listed.check else NO_REFERENCE] if only_if_changed else []
+    lines = [check_line(listed.check, of.names) if listed.check else NO_REFERENCE] if only_if_changed else []
     if version:
         lines += [*version_lines(version, listed), *offer_lines(listed)]
     elif listed.waiting:
@@ -177,7 +178,7 @@ NO_REFERENCE = (
 )
 
 
-def list_lines(listed: VersionList) -> list[str]:
+def list_lines(listed: VersionList, names: FanNames) -> list[str]:
     """A line for each version, more for the newest and for the one in force; an offer beside the one in force; faulty
     time spans; and the last check."""
     lines: list[str] = []
@@ -185,7 +186,7 @@ def list_lines(listed: VersionList) -> list[str]:
         of_version = version_lines(version, listed)
         lines += of_version if version in (listed.current, listed.versions[-1]) else of_version[:1]
     marked = (f"marked as faulty: {format_local(first)} to {format_local(last)}" for first, last in listed.faulty)
-    return [*lines, *offer_lines(listed), *marked, *([check_line(listed.check)] if listed.check else [])]
+    return [*lines, *offer_lines(listed), *marked, *([check_line(listed.check, names)] if listed.check else [])]
 
 
 def list_as_json(listed: VersionList) -> dict[str, Any]:
@@ -208,13 +209,14 @@ def check_as_json(check: Check) -> dict[str, Any]:
     return {**check.model_dump(), "reference": check.reference or None}
 
 
-def check_line(check: Check) -> str:
+def check_line(check: Check, names: FanNames = NO_NAMES) -> str:
     """What the last check of the fans found."""
     if not check.reference:
         return NO_REFERENCE
     fans = [fan for fan, each in enumerate(check.change) if each is None]
-    named = f"; fan{'s' * (len(fans) > 1)} {', '.join(map(str, fans))}"
-    missing = f"{named}: too few readings at commands that {check.reference} was trained on" if fans else ""
+    missing = (
+        f"; {names.labels(fans)}: too few readings at commands that {check.reference} was trained on" if fans else ""
+    )
     changes = f"speed of the fans since {check.reference}: {_percents(check.change)}{missing}"
     return f"checked up to {format_local(check.t_ns)}: {changes}"
 

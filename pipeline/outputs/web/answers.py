@@ -220,6 +220,7 @@ class Mark(BaseModel):
     """A transition of the alarm of a fan, or an act of an operator on it."""
 
     t_s: float
+    name: str
     onset_t_ns: int
     transition: str
     severity: str
@@ -262,6 +263,7 @@ class Spark(BaseModel):
 
     tray: str
     fan: int
+    name: str
     t_s: list[float]
     measured: list[float | None]
     predicted: list[float | None]
@@ -331,6 +333,7 @@ class ClippedAlarm(BaseModel):
     """An alarm in a clip."""
 
     fan: int
+    name: str
     onset_t_ns: int
     t_ns: int
 

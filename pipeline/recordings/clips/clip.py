@@ -17,6 +17,7 @@ from fantwin.pipeline.recordings.dates import format_utc
 from fantwin.pipeline.recordings.reading import read_metadata
 from fantwin.pipeline.recordings.records import RecordingError
 from fantwin.pipeline.recordings.run_recordings import CLIPS
+from fantwin.schemas.fan_names import fan_label
 from fantwin.schemas.messages import Alarm
 from fantwin.schemas.units import NS_PER_S
 
@@ -35,7 +36,13 @@ class ClipAlarm:
     onset_t_ns: int
     t_ns: int
     """when it was raised"""
+    name: str = ""
+    """of the fan"""
     acknowledged: bool = False
+
+    def about(self) -> dict[str, Any]:
+        """Which alarm it is, for machines."""
+        return {"fan": self.fan, "name": self.name, "onset_t_ns": self.onset_t_ns, "t_ns": self.t_ns}
 
 
 @dataclass(frozen=True)
@@ -72,7 +79,7 @@ class Clip:
 
     def about(self) -> dict[str, Any]:
         """What the metadata of the file say of it."""
-        of_alarms = [{"fan": each.fan, "onset_t_ns": each.onset_t_ns, "t_ns": each.t_ns} for each in self.alarms]
+        of_alarms = [each.about() for each in self.alarms]
         return {"tray": self.tray, "since_ns": self.since_ns, "until_ns": self.until_ns, "alarms": of_alarms}
 
 
@@ -125,7 +132,10 @@ def clip_lines(metadata: Mapping[str, str]) -> list[str]:
         if about is None:
             return []
         tray = about["tray"]
-        return [f"alarm clip: {tray} fan {each['fan']}, raised {format_utc(each['t_ns'])}" for each in about["alarms"]]
+        return [
+            f"alarm clip: {tray} {fan_label(each['fan'], each['name'])}, raised {format_utc(each['t_ns'])}"
+            for each in about["alarms"]
+        ]
     except (ValueError, TypeError, KeyError, OverflowError):
         return ["alarm clip, whose metadata are damaged"]
 

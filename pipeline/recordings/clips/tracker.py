@@ -161,7 +161,7 @@ class ClipTracker:
             clip = Clip(clip_name(alarm, self._clips), alarm.header.tray, since_ns, until_ns, judged_since_ns, ())
         self._clips[clip.name] = replace(
             clip,
-            alarms=(*clip.alarms, ClipAlarm(*name, alarm.t_ns)),
+            alarms=(*clip.alarms, ClipAlarm(*name, alarm.t_ns, alarm.fan_name)),
             since_ns=min(clip.since_ns, since_ns),
             until_ns=max(clip.until_ns, until_ns),
             judged_since_ns=min(clip.judged_since_ns, judged_since_ns),

@@ -241,7 +241,7 @@ def _computed(path: Path, part: HealthyPart) -> Iterator[TrayRun]:
             fans = modelled_fans(twin)
             bin_ns = bin_ns_of(first.period_ns, float(fans.held_s.min()))
             bins = Bins(bin_ns, fans.top_rad_s, fans.reads_balance, twin.unseen_error)
-            recorded = RecordedTray(path, tray.name, tray.fans, tray.speed_unit)
+            recorded = RecordedTray(path, tray.name, tray.fans, tray.speed_unit, tray.names)
             binned = chain.from_iterable(map(bins.take, chain([first], blocks)))
             yield TrayRun(recorded, bin_ns, first.period_ns, binned)
 

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from fantwin.schemas.fan_names import NO_NAMES, FanNames
 from fantwin.schemas.messages import Array
 from fantwin.schemas.units import SpeedUnit
 from fantwin.scoring.model.bins import Bin
@@ -32,6 +33,7 @@ class RecordedTray:
     tray: str
     fans: int
     speed_unit: SpeedUnit
+    names: FanNames = NO_NAMES
 
 
 @dataclass(frozen=True)

@@ -49,6 +49,7 @@ class ModbusSource(PollingSource):
         self._config = config
         self._port = str(context.folder / config.port) if config.port else ""
         self._units_per_rpm = context.units_per_rpm
+        self._names = context.names
         self._requests = _requests(config.fan)
         self._client: ModbusBaseSyncClient | None = None
 
@@ -81,7 +82,8 @@ class ModbusSource(PollingSource):
         command = tuple(_value(words, fan.unit, fan.command) for fan in fans)
         if any(map(math.isnan, command)):
             why = f": {refused[0]}" if refused else ""
-            raise DeviceError(f"the command of fan {[*map(math.isnan, command)].index(True)} cannot be read{why}")
+            unread = self._names.label([*map(math.isnan, command)].index(True))
+            raise DeviceError(f"the command of {unread} cannot be read{why}")
         return Reading(
             command=command,
             speed=tuple(_value(words, fan.unit, fan.speed) * self._units_per_rpm for fan in fans),
@@ -93,9 +95,9 @@ class ModbusSource(PollingSource):
     def write(self, command: tuple[float, ...]) -> None:
         """Write commands to the registers that are declared for them."""
         wanted = [(fan, value) for fan, value in zip(self._config.fan, command, strict=True) if not math.isnan(value)]
-        for number, (fan, _) in enumerate(wanted):
-            if fan.write is None:
-                raise DeviceError(f"fan {number} has no register for commands (write)")
+        for number, (fan, value) in enumerate(zip(self._config.fan, command, strict=True)):
+            if fan.write is None and not math.isnan(value):
+                raise DeviceError(f"{self._names.label(number)} has no register for commands (write)")
         for fan, value in wanted:
             assert fan.write is not None
             self._write(fan.unit, fan.write, value)

@@ -22,6 +22,7 @@ from fantwin.pipeline.learning.healthy_history import healthy_recordings, record
 from fantwin.pipeline.learning.next_version import make_next_version
 from fantwin.pipeline.learning.version_data import Excerpt, spread_parts
 from fantwin.pipeline.learning.versions import Check, TwinVersions
+from fantwin.schemas.fan_names import FanNames
 from fantwin.schemas.messages import Array
 from fantwin.schemas.units import NS_PER_S
 from fantwin.twin.models.physical import PhysicalModel
@@ -152,7 +153,8 @@ def test_a_fan_that_is_not_comparable_is_no_change_and_does_not_hide_others() ->
     worn = changed_fans(np.array([0.01, 0.04, 0.032, 0.03]), "t-1")  # all were changed, and the first is worn
     assert worn.startswith("3 of 4 fans are 3.4 % faster than when t-1 was made, fan 0 is 1.0 % faster; if maintenance")
     assert changed_fans(np.array([-0.04, 0.0, 0.001, -0.04]), "t-1").startswith("fan 0 is 4.0 % slower, fan 3 is 4.0")
-    assert changed_fans(np.array([-0.05, np.nan]), "t-1").startswith("fan 0 is 5.0 % slower")
+    named = changed_fans(np.array([-0.05, np.nan]), "t-1", FanNames(("CPU",)))
+    assert named.startswith("CPU (fan 0) is 5.0 % slower")
 
 
 def test_a_fan_with_a_fault_does_not_hide_what_the_others_have_alike() -> None:
@@ -183,3 +185,4 @@ def test_the_list_of_versions_holds_no_nan_and_the_text_names_the_fan() -> None:
     assert check_line(check).endswith(
         "since t-1: +1.2 %, not comparable; fan 1: too few readings at commands that t-1 was trained on"
     )
+    assert "; rear (fan 1): too few readings" in check_line(check, FanNames(("CPU", "rear")))

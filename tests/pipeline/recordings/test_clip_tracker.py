@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -164,4 +165,7 @@ def test_only_clips_with_a_file_are_listed_and_damaged_lists_have_none(tmp_path:
         (tmp_path / clip.name).touch()
     assert [clip.alarms[0].fan for clip in kept_clips(tmp_path)] == [1, 0]
     assert kept_clips(tmp_path / "none") == []
+    follow(other := tracker(), alarm(fan_name="CPU"))
+    (named,) = other.clips
+    assert clip_lines({"clip": json.dumps(named.about())})[0].startswith("alarm clip: tray1 CPU (fan 0), raised ")
     assert clip_lines({"clip": '{"tray": "tray1", "alarms": 3}'}) == ["alarm clip, whose metadata are damaged"]

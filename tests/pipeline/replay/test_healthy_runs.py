@@ -27,6 +27,7 @@ from fantwin.pipeline.replay.offline.healthy_runs import (
     learn,
 )
 from fantwin.pipeline.replay.offline.kept_bins import KeptBins, RecordedTray, TrayRun
+from fantwin.schemas.fan_names import FanNames
 from fantwin.scoring.calibration.calibration import is_exceeded
 from fantwin.scoring.model.bins import Bins, bin_ns_of
 from fantwin.scoring.model.learned import RunSums
@@ -206,7 +207,7 @@ def test_a_limit_that_more_false_alarms_than_declared_have_raised_keeps_the_rate
     assert not is_exceeded(others, calibration.fan_hours, per_day)
 
 
-TRAY = RecordedTray(Path("a.mcap"), "tray1", 2, "rpm")
+TRAY = RecordedTray(Path("a.mcap"), "tray1", 2, "rpm", FanNames(("", "", "GPU")))
 
 
 class ToldRuns:
@@ -277,7 +278,7 @@ def test_a_fan_that_differs_from_the_others_or_has_most_of_the_alarms_is_named()
     assert outlier_warnings(alike) == []
     slower = told(ToldRuns([[0.5]] * 5, 72.0, [0.01, 0.012, -0.12, 0.02, 0.005]), 1.0)
     assert outlier_warnings(slower) == [
-        "a.mcap: tray1 fan 2 is 12 % slower than its twin on average, the median of all fans is 1.2 %: "
+        "a.mcap: tray1 GPU (fan 2) is 12 % slower than its twin on average, the median of all fans is 1.2 %: "
         "if something was wrong there, calibrate without this recording"
     ]
     (warning,) = outlier_warnings(told(ToldRuns([[1.2], [1.1] * 9], 72.0), 1.0))

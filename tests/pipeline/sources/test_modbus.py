@@ -13,6 +13,7 @@ from fantwin.pipeline.sources.modbus.source import ModbusSource
 from fantwin.pipeline.sources.polling import DeviceError
 from fantwin.pipeline.sources.source import SourceContext
 from fantwin.schemas import channels as of
+from fantwin.schemas.fan_names import FanNames
 from fantwin.simulation.tray import SimulatedTray, TraySettings
 from tests.support.modbus_server import (
     COMMAND,
@@ -49,12 +50,15 @@ def drive() -> Drive:
     return Drive(SimulatedTray(TraySettings(fans=1, rate_hz=100.0)))
 
 
+NAMES = FanNames(("CPU", "rear"))
+
+
 def config(port: int, *fans: dict[str, Any], **settings: Any) -> ModbusConfig:
     return ModbusConfig.model_validate({"line": f"127.0.0.1:{port}", "fan": fans or (FAN,), **settings})
 
 
 def device(port: int, *fans: dict[str, Any], **settings: Any) -> ModbusSource:
-    made = ModbusSource(config(port, *fans, **settings), SourceContext(len(fans) or 1, "rpm", Path()))
+    made = ModbusSource(config(port, *fans, **settings), SourceContext(len(fans) or 1, "rpm", Path(), names=NAMES))
     made.connect()
     return made
 
@@ -66,7 +70,7 @@ def test_what_a_drive_refuses_is_nan_or_an_error_and_a_command_must_be_there() -
         assert math.isnan(made.read().speed[0])
         made.disconnect()
         made = device(port, FAN | {"command": {"address": REFUSED, "table": "input"}})
-        with pytest.raises(DeviceError, match=r"command of fan 0 cannot be read: unit 3 refuses input register 200"):
+        with pytest.raises(DeviceError, match=r"of CPU \(fan 0\) cannot be read: unit 3 refuses input register 200"):
             made.read()
         made.disconnect()
         made = device(port)
@@ -74,6 +78,10 @@ def test_what_a_drive_refuses_is_nan_or_an_error_and_a_command_must_be_there() -
             made.write((1.5,))
         with pytest.raises(DeviceError, match=r"-10 does not fit into u16 of register 100"):
             made.write((-0.01,))
+        made.disconnect()
+        made = device(port, FAN, without)
+        with pytest.raises(DeviceError, match=r"^rear \(fan 1\) has no register for commands"):
+            made.write((math.nan, 0.5))
         made.disconnect()
         assert config(port, without).why_no_commands == "no fan of its source has a register `write`"
 
