@@ -28,8 +28,8 @@ from bench.runtime.stage_memory import free_endpoint, memory_mb
 from bench.training.published_fan import RATE_HZ, ROUGH_RANGE, published_fan, random_stairs
 from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.config.settings import BusConfig
+from fantwin.pipeline.learning.child_command import VARIABLE
 from fantwin.pipeline.learning.healthy_history import HealthyHistory
-from fantwin.pipeline.learning.learning_schedule import VARIABLE
 from fantwin.pipeline.learning.versions import TwinVersions, learning_folder
 from fantwin.pipeline.selftest.scratch_site import FANTWIN
 from fantwin.pipeline.site.site_watcher import SiteWatcher

@@ -166,7 +166,7 @@ def scored(core: ScorerCore, item: Any) -> list[dict[str, Any]]:
 
 
 def state_of(core: ScorerCore) -> Any:
-    *_, snapshot = core.last_snapshot()
+    (snapshot,) = (each for each in core.last_snapshot() if isinstance(each, ScorerSnapshot))
     state = json.loads(snapshot.state_json)
     return [state["alarms"]["conditions"], state["alarms"].get("answered")]
 

@@ -251,7 +251,7 @@ def test_row_13_a_snapshot_that_is_ahead_of_a_clock_that_was_set_back_keeps_no_f
 def test_samples_that_come_again_to_the_core_of_the_next_twin_are_not_scored_again(twin: str) -> None:
     before = core_of(3)
     feed(before, [prediction_of(np.zeros((100, 3)))])
-    *_, snapshot = before.last_snapshot()
+    (snapshot,) = (each for each in before.last_snapshot() if isinstance(each, ScorerSnapshot))
     successor = ScorerCore(
         3,
         "rad/s",

@@ -179,7 +179,7 @@ def feed(core: ScorerCore, items: Iterable[Prediction | Request]) -> tuple[list[
 
 def snapshot_of(core: ScorerCore) -> ScorerSnapshot:
     """The snapshot that it saves at the end."""
-    *_, snapshot = core.close()
+    (snapshot,) = (each for each in core.close() if isinstance(each, ScorerSnapshot))
     return snapshot
 
 
