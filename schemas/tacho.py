@@ -10,6 +10,8 @@ from typing import Annotated, Any, ClassVar, Literal, Self, TypeAlias
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, TypeAdapter, model_validator
 
 LONGEST_WINDOW_S = 60.0
+REVOLUTION_S = 0.05
+"""time of a revolution at 1,200 rpm: the window of an average that is the time of one, or the speed of a moment"""
 
 
 class Tacho(BaseModel):

@@ -4,6 +4,9 @@ A counting tacho shows multiples of its resolution, one pulse more or less in it
 the next count is complete. Both show in any recording in which the fan changes its speed now and then. A resolution of
 q rad/s means 2 pi / q pulses per revolution and second of window: the two cannot be separated, so a fan is taken to
 have the usual two pulses where the window then is no shorter than the time between changes.
+
+A device that shows each reading for a while, however it was measured, repeats it without grading. Readings do not tell
+whether it is the speed of a moment or a mean: it is taken for the former, as of chips that measure one revolution.
 """
 
 from __future__ import annotations
@@ -16,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fantwin.schemas.fan_names import NO_NAMES, FanNames
-from fantwin.schemas.tacho import Tacho, tacho_of_each_fan
+from fantwin.schemas.tacho import REVOLUTION_S, Tacho, tacho_of_each_fan
 from fantwin.schemas.units import RAD_S_PER_UNIT
 
 Array = NDArray[np.float64]
@@ -35,14 +38,16 @@ HELD_IN_STEPS = 1.5
 LONGEST_STEP = 5.0
 """longest step, in median steps; the time of a change is not known across a longer one"""
 SIMILAR = 0.1
+CLEAR_MOVE = 3.0
+"""smallest differences of readings in a move across which a reading that is not held would have shown others"""
 
 
 @dataclass(frozen=True)
 class TachoEvidence:
     """A tacho that would explain the readings of a fan, and what speaks for it.
 
-    resolution_rad_s: nearly all readings are multiples of it. change_s: nearly all changes are multiples of this time
-    apart; None where each sample may be a reading of its own.
+    resolution_rad_s: nearly all readings are multiples of it; 0 where they are not graded. change_s: nearly all changes
+    are multiples of this time apart; None where each sample may be a reading of its own.
     """
 
     tacho: Tacho
@@ -50,13 +55,19 @@ class TachoEvidence:
     change_s: float | None
 
     def __str__(self) -> str:
+        if not self.resolution_rad_s:
+            held = f"readings change every {self.change_s:.2f} s only, and are not counts"
+            as_toml = (
+                f"`tacho = {self.tacho.as_toml}` in [[tray]]; `window_s = {self.tacho.held_s:g}` if they are means"
+            )
+            return f"{held}: shown for {self.tacho.held_s:g} s ({as_toml})"
         graded = f"readings are multiples of {self.resolution_rad_s / RAD_S_PER_RPM:.3g} rpm"
         changing = f" and change every {self.change_s:.2f} s" if self.change_s else ""
         return f"{graded}{changing}: a {self.tacho} (`tacho = {self.tacho.as_toml}` in [[tray]])"
 
 
 def find_tacho(t_s: Array, speed_rad_s: Array) -> TachoEvidence | None:
-    """The counting tacho that the readings of a fan speak for; None where they do not speak for one.
+    """The tacho that counts, or holds its readings, for which those of a fan speak; None where they speak for neither.
 
     t_s: (n,) increasing. speed_rad_s: (n,), NaN where missing.
     """
@@ -66,10 +77,10 @@ def find_tacho(t_s: Array, speed_rad_s: Array) -> TachoEvidence | None:
         return None
     changed = np.flatnonzero(np.diff(speed) != 0.0) + 1
     resolution = _resolution_rad_s(speed, changed)
-    if resolution is None:
-        return None
     step_s = float(np.median(np.diff(t_s)))
     change_s = _change_s(t_s, changed, step_s)
+    if resolution is None:
+        return _held(t_s, speed, changed, change_s)
     if change_s is None and not _could_count(speed, changed, resolution, step_s):
         return None
     window_s = 2.0 * math.pi / (USUAL_PULSES * resolution)
@@ -104,7 +115,26 @@ def tacho_hints(
     return [f"{names.labels(numbers)}: {evidence}; declared is {its}" for (evidence, its), numbers in lines.items()]
 
 
+def _held(t_s: Array, speed: Array, changed: NDArray[np.intp], change_s: float | None) -> TachoEvidence | None:
+    """Readings that are shown for a time, without grading: nearly all clear moves come a period after the last change.
+
+    A slow fan, and a device that reports only a larger change, move at other times, too. What a tacho shows until the
+    next pulse changes with each revolution or two.
+    """
+    if change_s is None or change_s * float(np.median(np.abs(speed))) < 4.0 * math.pi:
+        return None
+    moves = np.abs(speed[changed] - speed[changed - 1])
+    is_clear = moves[1:] >= CLEAR_MOVE * max(float(moves.min()), PRINTED_RAD_S)
+    apart = np.diff(t_s[changed])[is_clear]
+    if len(apart) < FEWEST_CHANGES or np.mean(apart <= 1.5 * change_s) < NEARLY_ALL:
+        return None
+    update_s = float(f"{change_s:.2g}")
+    return TachoEvidence(Tacho(kind="average", window_s=REVOLUTION_S, update_s=update_s), 0.0, change_s)
+
+
 def _agree(declared: Tacho, found: Tacho) -> bool:
+    if not found.resolution_rad_s:
+        return declared.kind == "period" or math.isclose(declared.held_s, found.held_s, rel_tol=SIMILAR)
     if declared.kind == "average" and not declared.resolution_rad_s:
         return declared.held_s > 0.0 and math.isclose(declared.held_s, found.held_s, rel_tol=SIMILAR)
     if declared.kind not in ("count", "average"):

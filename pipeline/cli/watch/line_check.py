@@ -37,6 +37,7 @@ FASTEST_FAN_RAD_S = 5000.0
 """48,000 rpm: a larger speed was given in another unit"""
 RATE_TOLERANCE = 0.01
 LISTEN_FOR_TACHOS_S = 60
+LISTENED_ENOUGH = 0.9
 PUSHED_LATER = "clients push its samples: they are checked only while `fantwin up` runs; run doctor again then"
 _KEYS = ("name", "place")
 Finding = tuple[bool, str]
@@ -208,8 +209,11 @@ def _tachos(t_s: Array, speed_rad_s: Array, tray: TrayConfig) -> Iterator[Findin
     if seen.any() and not hints:
         yield True, f"tachos of {tray.names.labels(np.flatnonzero(seen).tolist())}: they read as declared"
     if not seen.all() and (hints or (tray.tacho is None and not tray.stated_tachos)):
-        unseen = f"{tray.names.labels(np.flatnonzero(~seen).tolist())}: not shown whether the tacho counts"
-        yield True, f"{unseen}; listen while the speeds change: --listen-s {LISTEN_FOR_TACHOS_S}"
+        unseen = f"{tray.names.labels(np.flatnonzero(~seen).tolist())}: not shown whether the tacho counts or holds"
+        how = f"listen while the speeds change: --listen-s {LISTEN_FOR_TACHOS_S}"
+        if t_s[-1] - t_s[0] > LISTENED_ENOUGH * LISTEN_FOR_TACHOS_S:
+            how = "write `tacho` in [[tray]] if its manual says so; `fantwin commission` looks again"
+        yield True, f"{unseen}; {how}"
 
 
 def _speeds(speed_rad_s: Array, unit: SpeedUnit) -> str:

@@ -9,10 +9,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
-from fantwin.schemas.tacho import Tacho
-
-REVOLUTION_S = 0.05
-"""time of a revolution at 1,200 rpm: chips measure the time of one, and the speed is not known here"""
+from fantwin.schemas.tacho import REVOLUTION_S, Tacho
 
 
 @dataclass(frozen=True)

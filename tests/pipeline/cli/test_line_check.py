@@ -83,7 +83,18 @@ def test_tachos_that_count_are_found_in_what_a_line_sends(tacho: str | None, is_
     *_, (ok, text) = _findings(line, config.trays[0], config, None)
     assert ok == is_fine and said in text
     *_, (ok, short) = _findings(line[:20], config.trays[0], config, None)
-    assert ok and short.startswith("commands" if tacho else "fans 0, 1: not shown whether the tacho counts; listen")
+    unseen = "fans 0, 1: not shown whether the tacho counts or holds; "
+    assert ok and short.startswith("commands" if tacho else f"{unseen}listen while the speeds change: --listen-s 60")
+    *_, (ok, steady) = _findings(line_of(at_s, np.full(600, 150.0)), config.trays[0], config, None)
+    assert ok and steady.startswith("commands" if tacho else f"{unseen}write `tacho` in [[tray]]"), "it has listened"
+
+
+def test_a_speed_that_is_shown_once_a_second_is_found_in_what_a_line_sends_twice_a_second() -> None:
+    config, at_s = config_of(), np.arange(120) / 2.0
+    line = line_of(at_s, 150.0 + 100.0 * np.sin(2.0 * np.pi * np.floor(at_s) / 31.0))
+    *_, (ok, text) = _findings(line, config.trays[0], config, None)
+    assert not ok
+    assert '`tacho = { kind = "average", window_s = 0.05, update_s = 1.0 }` in [[tray]]' in text
 
 
 @pytest.mark.parametrize(

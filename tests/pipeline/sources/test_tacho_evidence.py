@@ -24,7 +24,7 @@ def readings(tacho: Tacho, rate_hz: float, duration_s: float = 300.0, seed: int 
         ]
         shown = (pulses[0] - pulses[1]) * tacho.resolution_rad_s
     else:
-        shown = np.interp(t_s, fine_s, speed)
+        shown = np.interp(t_s if not tacho.held_s else np.floor(t_s / tacho.held_s) * tacho.held_s, fine_s, speed)
     printed = RAD_S_PER_RPM * np.floor(shown / RAD_S_PER_RPM + 1e-6)
     printed[rng.uniform(size=len(t_s)) < 0.02] = np.nan
     return t_s, printed
@@ -47,6 +47,38 @@ def test_a_window_that_slides_and_other_pulses_follow_from_the_time_between_chan
     one_pulse = find_tacho(*readings(Tacho(kind="count", window_s=1.0, pulses=1), 10.0))
     assert one_pulse is not None
     assert one_pulse.tacho == Tacho(kind="count", window_s=1.0, pulses=1)
+
+
+@pytest.mark.parametrize(("rate_hz", "noise_rpm"), [(2.0, 0.0), (2.0, 3.0), (10.0, 0.0)])
+def test_readings_that_are_held_are_found_without_grading(rate_hz: float, noise_rpm: float) -> None:
+    """A drive that shows its speed once a second; polled twice a second, it was taken for instantaneous."""
+    held = Tacho(kind="average", window_s=0.05, update_s=1.0)
+    t_s, speed = readings(held, rate_hz)
+    speed += noise_rpm * RAD_S_PER_RPM * np.random.default_rng(4).normal(size=400)[np.floor(t_s).astype(int)]
+    found = find_tacho(t_s, speed)
+    assert found is not None
+    assert found.tacho == held
+    assert tacho_hints(t_s, speed[:, np.newaxis], INSTANTANEOUS, [0]) == [
+        "fan 0: readings change every 1.00 s only, and are not counts: shown for 1 s (`tacho = "
+        '{ kind = "average", window_s = 0.05, update_s = 1.0 }` in [[tray]]; `window_s = 1` if they are means); '
+        "declared is instantaneous"
+    ]
+    means = (Tacho(kind="average", window_s=1.0),)
+    assert tacho_hints(t_s, speed[:, np.newaxis], means, [0]) == []
+
+
+def test_slow_fans_reports_of_larger_changes_and_times_of_a_revolution_are_not_held_readings() -> None:
+    t_s, printed = readings(Tacho(), 2.0)
+    slow = RAD_S_PER_RPM * np.floor(1000.0 + 0.02 * (printed / RAD_S_PER_RPM - 1000.0))
+    assert find_tacho(t_s, slow) is None
+    fast_t_s, fast = readings(Tacho(), 20.0)
+    reported = fast.copy()
+    for row in range(1, len(fast)):
+        if not abs(fast[row] - reported[row - 1]) >= 10.0 * RAD_S_PER_RPM:
+            reported[row] = reported[row - 1]
+    assert find_tacho(fast_t_s, reported) is None
+    turns = readings(Tacho(kind="average", window_s=0.05, update_s=0.1), 50.0)
+    assert find_tacho(turns[0], 0.1 * turns[1]) is None
 
 
 def test_speeds_that_are_merely_printed_in_rpm_or_noisy_or_constant_speak_for_nothing() -> None:
