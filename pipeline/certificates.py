@@ -7,6 +7,7 @@ What cannot be used is refused in one line that names the file, says why, and ne
 from __future__ import annotations
 
 import ipaddress
+import os
 import re
 import ssl
 from collections.abc import Callable, Sequence
@@ -30,7 +31,7 @@ from cryptography.hazmat.primitives.serialization import (
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from fantwin.pipeline.errors import UserError
-from fantwin.pipeline.files import PRIVATE, PUBLIC, is_read_by_others, write_whole
+from fantwin.pipeline.files import PRIVATE, PUBLIC, closed_to, is_read_by_others, write_whole
 
 LONGEST_NAME = 64
 """characters of a common name"""
@@ -121,6 +122,8 @@ def check_pair(certificate: Path, key: Path, ca: Path | None = None, *, needs_rs
         private = _parsed(
             key, lambda text: load_pem_private_key(text, None), lambda text: load_der_private_key(text, None), "key"
         )
+    except PermissionError as error:
+        raise UserError(f"{key}: {closed_to(key, os.geteuid())}") from error
     except OSError as error:
         raise UserError(f"{key}: {error.strerror}") from error
     except TypeError as error:

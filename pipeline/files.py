@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import pwd
 import secrets
+import shlex
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -25,6 +27,24 @@ def is_read_by_others(status: os.stat_result) -> bool:
     it belongs to root, as where a service manager or a cluster hands it to a process of another user."""
     forbidden = _OTHERS if status.st_uid == 0 != os.geteuid() else _GROUP_OR_OTHERS
     return bool(stat.S_IMODE(status.st_mode) & forbidden)
+
+
+def closed_to(path: Path, uid: int) -> str:
+    """Whose a file is that a process of another user cannot read, and what to do."""
+    name = user_name(uid)
+    try:
+        owner = user_name(path.stat().st_uid)
+    except OSError:
+        return f"{name} may not look into its folder: chmod o+x {shlex.quote(str(path.parent))}"
+    return f"it belongs to {owner}, and {name} may not read it: chown {name} {shlex.quote(str(path))}"
+
+
+def user_name(uid: int) -> str:
+    """Of a user of this system; the number if he has none."""
+    try:
+        return pwd.getpwuid(uid).pw_name
+    except KeyError:
+        return str(uid)
 
 
 def replace_file(path: Path, content: bytes, mode: int | None = None) -> None:

@@ -139,7 +139,6 @@ def build(context: Context) -> BuiltStage:
     from fantwin.pipeline.outputs.web.access import Access  # noqa: PLC0415
     from fantwin.pipeline.outputs.web.api import Api  # noqa: PLC0415
     from fantwin.pipeline.outputs.web.app import MOST_CONNECTIONS, application  # noqa: PLC0415
-    from fantwin.pipeline.site.tokens import Tokens  # noqa: PLC0415
     from fantwin.pipeline.site.users import Users  # noqa: PLC0415
 
     alarms = AlarmHistory(context.own_file(FILE))
@@ -163,8 +162,7 @@ def build(context: Context) -> BuiltStage:
     if config.certificate and config.key:
         certificate = context.resolve(config.certificate)
         tls, shown = server_context(certificate, context.resolve(config.key)), read_certificate(certificate)
-    known = context.resolve(config.users) if config.users else None
-    access = Access(config, Users(known) if known else None, Tokens(known) if known else None)
+    access = Access(config, Users(context.resolve(config.users)) if config.users else None)
     listening = listen(config.host, config.port + context.shard_number - 1, "gateway")
     urls = viewer_urls(viewers) if viewers else {}
     app = application(Api(model, access, feed, desk, urls, series, clip_folders), config)
@@ -175,8 +173,7 @@ def build(context: Context) -> BuiltStage:
 def check(context: Context) -> list[str]:
     """Problems with the gateway: its port is taken by another program, or a file cannot be read."""
     from fantwin.pipeline.certificates import check_pair, require_valid  # noqa: PLC0415  slow to import
-    from fantwin.pipeline.site.tokens import read_tokens, tokens_file  # noqa: PLC0415
-    from fantwin.pipeline.site.users import read_users  # noqa: PLC0415
+    from fantwin.pipeline.site.users import read_accounts  # noqa: PLC0415
 
     config: GatewayConfig = context.config
     attempts: list[Callable[[], object]] = []
@@ -184,8 +181,7 @@ def check(context: Context) -> list[str]:
         files = context.resolve(config.certificate), context.resolve(config.key)
         attempts.append(lambda: require_valid(check_pair(*files)))
     if config.users:
-        attempts.append(partial(read_users, context.resolve(config.users)))
-        attempts.append(partial(read_tokens, tokens_file(context.resolve(config.users))))
+        attempts.append(partial(read_accounts, context.resolve(config.users)))
     if not context.is_running and "port" in config.model_fields_set:
         attempts.append(lambda: listen(config.host, config.port + context.shard_number - 1, "gateway").close())
     return refusals(*attempts)

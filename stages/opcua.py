@@ -109,7 +109,7 @@ def check(context: Context) -> list[str]:
         return [problem]
     from fantwin.pipeline.certificates import check_pair, require_valid  # noqa: PLC0415  slow to import
     from fantwin.pipeline.http_server import listen  # noqa: PLC0415
-    from fantwin.pipeline.site.users import read_users  # noqa: PLC0415
+    from fantwin.pipeline.site.users import read_accounts  # noqa: PLC0415
 
     config: OpcuaConfig = context.config
     attempts: list[Callable[[], object]] = []
@@ -118,7 +118,7 @@ def check(context: Context) -> list[str]:
         attempts.append(lambda: require_valid(check_pair(*files, needs_rsa=True)))
     if config.users:
         users = context.resolve(config.users)
-        attempts.append(lambda: read_users(users))
+        attempts.append(lambda: read_accounts(users))
     if not context.is_running:
         attempts.append(lambda: listen(config.host, config.port + context.shard_number - 1, "opcua").close())
     problems = refusals(*attempts)

@@ -1,22 +1,28 @@
-"""The users of a site, who look and act on the page or by OPC UA: a file with role and password hash of each.
+"""The users of a site, who look and act on the page or by OPC UA, and the tokens by which programs do so without a
+login: one file, with the role of each, and the hash of its password or token.
 
-Passwords are hashed with argon2id, whose parameters are those of the library (RFC 9106, low-memory profile).
+Passwords are hashed with argon2id, whose parameters are those of the library (RFC 9106, low-memory profile). A token is
+256 random bits, so a plain hash of it tells nothing.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import re
+import secrets
+import time
 import tomllib
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from fantwin.pipeline.errors import UserError
-from fantwin.pipeline.files import PRIVATE, is_read_by_others, replace_file
+from fantwin.pipeline.files import PRIVATE, closed_to, is_read_by_others, replace_file
 
 if TYPE_CHECKING:
     from argon2 import PasswordHasher
@@ -27,7 +33,9 @@ SHORTEST_PASSWORD, LONGEST_PASSWORD = 12, 128
 GUESSED_WORDS = ("fantwin", "password", "operator", "viewer", "ventilator", "admin")
 """with the name of the user, these do not count in a password"""
 FEWEST_OTHERS = 5
-_ENTRIES = {"role", "password_hash"}
+PREFIX = "fantwin_"
+"""begins each token: scanners of leaked secrets find it"""
+_OF_USER, _OF_TOKEN = {"role", "password_hash"}, {"role", "sha256", "expires"}
 
 
 class UserRole(StrEnum):
@@ -46,33 +54,57 @@ class User:
     password_hash: str
 
 
-class Users:
-    """The file, read again when it changes. While it is missing, or others may read it, there are no users."""
+@dataclass(frozen=True)
+class Token:
+    """Of a program. expires: UTC; None: never."""
 
-    def __init__(self, path: Path) -> None:
+    name: str
+    role: UserRole
+    sha256: str
+    expires: datetime | None
+
+    def is_valid(self, now_s: float) -> bool:
+        """Whether it has not ended."""
+        return self.expires is None or now_s < self.expires.timestamp()
+
+
+@dataclass
+class Accounts:
+    """What a file holds, by name; no token has the name of a user."""
+
+    users: dict[str, User] = field(default_factory=dict[str, User])
+    tokens: dict[str, Token] = field(default_factory=dict[str, Token])
+
+
+class Users:
+    """The file, read again when it changes. While it is missing, or others may read it, there is nobody."""
+
+    def __init__(self, path: Path, now_s: Callable[[], float] = time.time) -> None:
         """Read it.
 
         Raises:
             UserError: it cannot be read, others may read it, or it is no such file.
         """
-        self._path = path
+        self._path, self._now_s = path, now_s
         self._hasher = hasher()
         self._nobody_hash = self._hasher.hash("nobody has this password")
         self._stamp: tuple[int, ...] = ()
-        self._users: Mapping[str, User] = {}
+        self._accounts = Accounts()
+        self._by_hash: dict[str, Token] = {}
         self.problem = ""
         """why the file cannot be read; empty if it can"""
         self._read()
 
     def of(self, name: str) -> User | None:
         """A user; None: there is none of this name."""
-        try:
-            self._read()
-            self.problem = ""
-        except UserError as error:
-            self._stamp, self._users = (), {}
-            self.problem = f"nobody can log in or act: {error}"
-        return self._users.get(name)
+        self._read_again()
+        return self._accounts.users.get(name)
+
+    def of_token(self, text: str) -> Token | None:
+        """The token that a program has sent; None: it is none, or has ended."""
+        self._read_again()
+        found = self._by_hash.get(_hashed(text))
+        return found if found and found.is_valid(self._now_s()) else None
 
     def verified(self, name: str, password: str) -> User | None:
         """The user with this name and password; None: there is none. It takes as long for a name that is not there."""
@@ -90,6 +122,14 @@ class Users:
             return False
         return user is not None
 
+    def _read_again(self) -> None:
+        try:
+            self._read()
+            self.problem = ""
+        except UserError as error:
+            self._stamp, self._accounts, self._by_hash = (), Accounts(), {}
+            self.problem = f"nobody can log in or act, with a token neither: {error}"
+
     def _read(self) -> None:
         try:
             found = self._path.stat()
@@ -97,7 +137,8 @@ class Users:
             raise _unreadable(self._path, error) from error
         stamp = (found.st_mtime_ns, found.st_ctime_ns, found.st_ino)  # a change of its rights sets st_ctime_ns alone
         if stamp != self._stamp:
-            self._users = read_users(self._path)
+            self._accounts = read_accounts(self._path)
+            self._by_hash = {each.sha256: each for each in self._accounts.tokens.values()}
             self._stamp = stamp
 
 
@@ -108,55 +149,59 @@ def hasher() -> PasswordHasher:
     return PasswordHasher()
 
 
-def read_private_tables(path: Path) -> dict[str, Any]:
-    """The tables of a TOML file that only its owner may read.
-
-    Raises:
-        UserError: others may read it.
-        OSError, TOMLDecodeError, UnicodeDecodeError: it cannot be read.
-    """
-    with path.open("rb") as file:
-        if is_read_by_others(os.fstat(file.fileno())):
-            raise UserError(f"{path}: others may read it: chmod 600 {path}")
-        return tomllib.load(file)
+def new_token(name: str, role: UserRole, expires: datetime | None) -> tuple[str, Token]:
+    """A token and what is kept of it."""
+    text = PREFIX + secrets.token_urlsafe(32)
+    return text, Token(name, role, _hashed(text), expires)
 
 
-def write_private_tables(path: Path, lines: Iterable[str], what: str) -> None:
-    """Replace such a file as a whole. what: is in it, for errors.
-
-    Raises:
-        UserError: it cannot be written.
-    """
-    try:
-        replace_file(path, "".join(lines).encode(), PRIVATE)
-    except OSError as error:
-        raise UserError(f"{path}: the {what} cannot be written: {error.strerror}") from error
-
-
-def read_users(path: Path) -> dict[str, User]:
-    """All users of a file, by name.
+def read_accounts(path: Path) -> Accounts:
+    """What a file holds.
 
     Raises:
         UserError: as `Users`.
     """
     try:
-        tables = read_private_tables(path)
+        with path.open("rb") as file:
+            if is_read_by_others(os.fstat(file.fileno())):
+                raise UserError(f"{path}: others may read it: chmod 600 {path}")
+            tables = tomllib.load(file)
     except (OSError, tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise _unreadable(path, error) from error
-    return {name: _user(path, name, table) for name, table in tables.items()}
+    found = Accounts()
+    for name, table in tables.items():
+        made = _account(path, name, table)
+        if isinstance(made, Token):
+            found.tokens[name] = made
+        else:
+            found.users[name] = made
+    return found
 
 
-def write_users(path: Path, users: Mapping[str, User]) -> None:
+def write_accounts(path: Path, accounts: Accounts, beside: Path | None = None) -> None:
     """Replace the file as a whole; only its owner may read it.
+
+    beside: a new file gets the owner of this folder, where the process may say so: root adds users for a service.
 
     Raises:
         UserError: it cannot be written.
     """
-    lines = ["# users of the site: `fantwin users`\n"]
-    for name, user in sorted(users.items()):
+    lines = ["# users and tokens of the site: `fantwin users`\n"]
+    for name, user in sorted(accounts.users.items()):
         lines.append(f"\n[{json.dumps(name)}]\nrole = {json.dumps(user.role)}\n")
         lines.append(f"password_hash = {json.dumps(user.password_hash)}\n")
-    write_private_tables(path, lines, "users")
+    for name, token in sorted(accounts.tokens.items()):
+        expires = token.expires.isoformat() if token.expires else ""
+        lines.append(f"\n[{json.dumps(name)}]\nrole = {json.dumps(token.role)}\n")
+        lines.append(f'sha256 = "{token.sha256}"\nexpires = "{expires}"\n')
+    is_new = not path.exists()
+    try:
+        replace_file(path, "".join(lines).encode(), PRIVATE)
+        if is_new and beside is not None and os.geteuid() == 0:
+            owner = beside.stat()
+            os.chown(path, owner.st_uid, owner.st_gid)
+    except OSError as error:
+        raise UserError(f"{path}: the users cannot be written: {error.strerror}") from error
 
 
 def checked_password(password: str, name: str) -> str:
@@ -180,14 +225,28 @@ def checked_password(password: str, name: str) -> str:
     return password
 
 
+def _hashed(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
 def _unreadable(path: Path, error: Exception) -> UserError:
     if isinstance(error, FileNotFoundError):
         return UserError(f"{path}: there is no such file: `fantwin users add NAME` makes it")
+    if isinstance(error, PermissionError):
+        return UserError(f"{path}: {closed_to(path, os.geteuid())}")
     return UserError(f"{path}: the users cannot be read: {getattr(error, 'strerror', None) or error}")
 
 
-def _user(path: Path, name: str, table: Any) -> User:
-    known = [role.value for role in UserRole]
-    if not (isinstance(table, dict) and set(table) == _ENTRIES and table["role"] in known and NAME.fullmatch(name)):
-        raise UserError(f"{path}: [{name}] is no user: it needs role ({' or '.join(known)}) and password_hash")
-    return User(name, UserRole(table["role"]), str(table["password_hash"]))
+def _account(path: Path, name: str, table: Any) -> User | Token:
+    try:
+        if not NAME.fullmatch(name) or set(table) not in (_OF_USER, _OF_TOKEN):
+            raise ValueError
+        role = UserRole(table["role"])
+        if "sha256" not in table:
+            return User(name, role, str(table["password_hash"]))
+        expires = datetime.fromisoformat(table["expires"]).astimezone(UTC) if table["expires"] else None
+        return Token(name, role, str(table["sha256"]), expires)
+    except (TypeError, ValueError) as error:
+        raise UserError(
+            f"{path}: [{name}] is no user and no token: make it again with `fantwin users add` or `add-token`"
+        ) from error

@@ -19,8 +19,7 @@ from starlette.requests import Request
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.outputs.web.live_feed import SharedAnswer
 from fantwin.pipeline.site import security_log
-from fantwin.pipeline.site.tokens import new_token, read_tokens, tokens_file, write_tokens
-from fantwin.pipeline.site.users import UserRole
+from fantwin.pipeline.site.users import UserRole, new_token, read_accounts, write_accounts
 from tests.support.running_core import TRAY
 from tests.support.running_gateway import Client, RunningGateway
 from tests.support.site_certificates import SiteCertificates
@@ -122,10 +121,10 @@ def test_a_new_password_and_another_login_end_the_session_of_before(gateway, use
 
 def token(users: Path, name: str = "grafana", role: UserRole = UserRole.VIEWER, **left: float) -> dict[str, str]:
     """The header of a program whose token is added to the file."""
-    path, expires = tokens_file(users), datetime.now(UTC) + timedelta(**left) if left else None
-    text, made = new_token(name, role, expires)
-    write_tokens(path, {**read_tokens(path), name: made})
-    assert text not in path.read_text(encoding="utf-8")
+    accounts = read_accounts(users)
+    text, accounts.tokens[name] = new_token(name, role, datetime.now(UTC) + timedelta(**left) if left else None)
+    write_accounts(users, accounts)
+    assert text not in users.read_text(encoding="utf-8")
     return {"Authorization": f"Bearer {text}"}
 
 
@@ -161,7 +160,9 @@ def test_a_token_that_is_removed_or_made_up_is_refused_even_where_nobody_logs_in
     program, other = token(users), token(users, "other")
     stream = events(gateway, **program)
     assert stream.readline() == b"event: fleet\n"
-    write_tokens(tokens_file(users), {"other": read_tokens(tokens_file(users))["other"]})
+    accounts = read_accounts(users)
+    del accounts.tokens["grafana"]
+    write_accounts(users, accounts)
     while stream.readline():
         gateway.feed(alarm())  # live events end with it
     answers = [Client(gateway).ask("GET", "/api/v1/site", headers=program) for _ in range(6)]
@@ -170,9 +171,10 @@ def test_a_token_that_is_removed_or_made_up_is_refused_even_where_nobody_logs_in
     assert int(answers[-1][2]["retry-after"]) > 0
     assert Client(gateway).ask("GET", "/api/v1/site", headers=other)[0] == 200, "the right one need not wait"
     assert {"what": "token refused", "path": "/api/v1/site", "address": "127.0.0.1"}.items() <= said(capfd)[-1].items()
-    tokens_file(users).chmod(0o644)
-    assert Client(gateway).ask("GET", "/api/v1/site", headers=other)[0] in (401, 429)
-    assert "no token is accepted" in gateway.problem()
+    users.chmod(0o644)
+    status, answer, _ = Client(gateway).ask("GET", "/api/v1/site", headers=other)
+    assert (status, "the file of users cannot be read" in answer["error"]) == (503, True)
+    assert "with a token neither" in gateway.problem()
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from argon2 import PasswordHasher
 
-from fantwin.pipeline.site.users import User, UserRole, write_users
+from fantwin.pipeline.site.users import Accounts, User, UserRole, write_accounts
 
 PASSWORD = "correct horse battery"
 OPERATOR, VIEWER = "ann", "vic"
@@ -20,5 +20,5 @@ def quick_hasher() -> PasswordHasher:
 def make_users(path: Path, password: str = PASSWORD, **roles: UserRole) -> Path:
     """A file with these users, or with the operator ann and the viewer vic."""
     hashed = quick_hasher().hash(password)
-    write_users(path, {name: User(name, role, hashed) for name, role in (roles or ROLES).items()})
+    write_accounts(path, Accounts({name: User(name, role, hashed) for name, role in (roles or ROLES).items()}))
     return path

@@ -26,6 +26,7 @@ from fantwin.pipeline.cli.watch.service_files import (
     Service,
     may_be_read,
     owner_of,
+    unreadable_files,
     written_below,
 )
 from fantwin.pipeline.errors import UsageError, UserError
@@ -106,6 +107,10 @@ def _install(config: Path, user: str | None, *, is_dry: bool, json_output: bool)
         raise UserError(
             f"{closed} is closed to the user {made.user}: chmod o+x {closed}, or name another user with --user"
         )
+    closed_files = unreadable_files(here.config, made.user)
+    if elsewhere := [each for each in closed_files if not each.is_relative_to(made.config.parent)]:
+        copied = shlex.join(["cp", *map(str, elsewhere), str(made.config.parent)])
+        raise UserError(f"{elsewhere[0]}: the user {made.user} may not read it: {copied}, and name the copy")
     Launcher(here.config, here.overrides, typer.echo).refuse_unusable_twins()
     if lacks := what_lacks(here.config):
         makes = next_commands(here.config)[-1][0]
@@ -117,7 +122,7 @@ def _install(config: Path, user: str | None, *, is_dry: bool, json_output: bool)
         commands += [["udevadm", "control", "--reload"], ["udevadm", "trigger", "--subsystem-match=hwmon", "--settle"]]
     commands += [
         ["mkdir", "-p", str(folder)],
-        ["chown", "-R", f"{made.user}:{made.group}", str(folder)],
+        ["chown", "-R", f"{made.user}:{made.group}", str(folder), *map(str, closed_files)],
         ["systemctl", "daemon-reload"],
         ["systemctl", "enable", UNIT],
         ["systemctl", "restart", UNIT],

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import grp
+import os
 import pwd
 import re
+import stat
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -199,11 +201,34 @@ def _command_line(words: Sequence[str]) -> str:
     return ":" + " ".join(map(_escaped, (*through, *words)))
 
 
+def unreadable_files(config: Config, user: str) -> list[Path]:
+    """The files that the configuration names, or that are in folders that it names, which a user may not read."""
+    named = {path for path in _named(config) if not path.is_relative_to("/sys")}
+    files = {each for path in named for each in ([path] if path.is_file() else path.rglob("*")) if each.is_file()}
+    try:
+        of_user = pwd.getpwnam(user)
+    except KeyError:  # it is made later
+        uid, groups = -1, list[int]()
+    else:
+        uid, groups = of_user.pw_uid, os.getgrouplist(user, of_user.pw_gid)
+    return sorted(each for each in {config.path.resolve(), *files} if not _is_readable(each.stat(), uid, groups))
+
+
+def _is_readable(status: os.stat_result, uid: int, groups: Sequence[int]) -> bool:
+    needed = stat.S_IRUSR if status.st_uid == uid else stat.S_IRGRP if status.st_gid in groups else stat.S_IROTH
+    return uid == 0 or bool(status.st_mode & needed)
+
+
+def _named(config: Config) -> set[Path]:
+    """What the settings name by a path, and is there."""
+    named = {(config.folder / path).resolve() for path in _paths((config.bus, config.trays, config.sections))}
+    return {path for path in named if path.exists()}
+
+
 def _folders_read(config: Config) -> set[Path]:
     """The folders of what the settings name by a path and is there: files such as those of users are replaced, by which
     a file that was bound alone would stay the old one."""
-    named = {(config.folder / path).resolve() for path in _paths((config.bus, config.trays, config.sections))}
-    return {path if path.is_dir() else path.parent for path in named if path.exists()}
+    return {path if path.is_dir() else path.parent for path in _named(config)}
 
 
 def _paths(settings: object) -> Iterator[Path]:

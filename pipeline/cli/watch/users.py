@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
 from datetime import UTC, datetime, timedelta
 from enum import StrEnum
 from pathlib import Path
@@ -17,8 +16,18 @@ from fantwin.pipeline.config.loading import load_config
 from fantwin.pipeline.errors import UsageError, UserError
 from fantwin.pipeline.outputs.opcua.config import OpcuaConfig
 from fantwin.pipeline.outputs.web.config import GatewayConfig
-from fantwin.pipeline.site.tokens import Token, new_token, read_tokens, tokens_file, write_tokens
-from fantwin.pipeline.site.users import NAME, User, UserRole, checked_password, hasher, read_users, write_users
+from fantwin.pipeline.site.users import (
+    NAME,
+    Accounts,
+    Token,
+    User,
+    UserRole,
+    checked_password,
+    hasher,
+    new_token,
+    read_accounts,
+    write_accounts,
+)
 
 
 class UserAction(StrEnum):
@@ -64,10 +73,9 @@ def users(
     path = settings.folder / named
     if days is not None and action != UserAction.ADD_TOKEN:
         raise UsageError("--days is of a token: it needs add-token")
-    found = read_users(path) if path.exists() else {}
-    tokens = read_tokens(tokens_file(path))
+    found = read_accounts(path) if path.exists() else Accounts()
     if action == UserAction.LIST:
-        _list(path, found, tokens, json_output=json_output)
+        _list(path, found, json_output=json_output)
         return
     if name is None:
         raise UsageError(f"give a name: fantwin users {action} NAME")
@@ -76,27 +84,25 @@ def users(
             raise UserError(
                 f'{config}: [gateway] names no file of users, so its API takes no token: add users = "{named}"'
             )
-        if action == UserAction.ADD_TOKEN and name in found:
+        if action == UserAction.ADD_TOKEN and name in found.users:
             raise UserError(f"{path}: {name} is a user: give the token another name, which is shown where it acts")
-        done = _change_tokens(tokens_file(path), tokens, action, name, role, days)
-        if not path.exists():  # the gateway needs it, also for programs alone
-            write_users(path, found)
-        show(done, *(str(each) for each in done.values()), json_output=json_output)
-        return
-    if action == UserAction.ADD and name in tokens:
-        raise UserError(f"{tokens_file(path)}: {name} is a token: give the user another name")
-    if action == UserAction.REMOVE:
-        if found.pop(name, None) is None:
-            raise UserError(f"{path}: no user {name!r}: there is {', '.join(found) or 'none'}")
-        done = "removed"
+        done = _change_tokens(path, found.tokens, action, name, role, days)
+        lines = [*done.values()]
     else:
-        found[name] = _asked_for(name, role)
-        done = f"{found[name].role} now"
-    write_users(path, found)
-    show({"name": name, "done": done}, f"{path}: {name}: {done}", json_output=json_output)
+        if action == UserAction.ADD and name in found.tokens:
+            raise UserError(f"{path}: {name} is a token: give the user another name")
+        if action == UserAction.ADD:
+            found.users[name] = _asked_for(name, role)
+        elif found.users.pop(name, None) is None:
+            raise UserError(f"{path}: no user {name!r}: there is {', '.join(found.users) or 'none'}")
+        done = {"name": name, "done": "removed" if action == UserAction.REMOVE else f"{found.users[name].role} now"}
+        lines = [f"{path}: {name}: {done['done']}"]
+    write_accounts(path, found, next(each for each in (settings.run_folder, settings.folder) if each.exists()))
+    show(done, *lines, json_output=json_output)
 
 
-def _list(path: Path, users: Mapping[str, User], tokens: Mapping[str, Token], *, json_output: bool) -> None:
+def _list(path: Path, found: Accounts, *, json_output: bool) -> None:
+    users, tokens = found.users, found.tokens
     ends = {name: token.expires.isoformat() if token.expires else None for name, token in tokens.items()}
     listed = [{"kind": "user", "name": user.name, "role": str(user.role)} for user in users.values()]
     of_programs = [
@@ -124,7 +130,6 @@ def _change_tokens(
         expires = datetime.now(UTC).replace(microsecond=0) + timedelta(days=days) if days is not None else None
         text, tokens[name] = new_token(name, _role(name, role), expires)
         done = {"token": text}
-    write_tokens(path, tokens)
     return done
 
 

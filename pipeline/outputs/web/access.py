@@ -23,7 +23,6 @@ from fastapi import HTTPException, Request
 
 from fantwin.pipeline.outputs.web.config import GatewayConfig
 from fantwin.pipeline.site.security_log import LoginFailures, SecurityLog
-from fantwin.pipeline.site.tokens import Tokens
 from fantwin.pipeline.site.users import NAME, User, UserRole, Users
 
 IDLE_S = 30 * 60.0
@@ -99,6 +98,7 @@ MOST_LOGINS = 16
 """that wait for their password to be checked, which takes memory and time"""
 _OWN_SITE = {"same-origin"}
 _OF_PROXIES = ("forwarded", "x-forwarded-for", "x-forwarded-host", "x-real-ip", "via")
+_UNREADABLE = "nobody can log in or use a token: the file of users cannot be read; health says why"
 _ANY_TOKEN = ""
 """stands for the name of a user where wrong tokens are counted: no user has it"""
 
@@ -120,12 +120,11 @@ class Access:
         self,
         config: GatewayConfig,
         users: Users | None,
-        tokens: Tokens | None = None,
         log: SecurityLog | None = None,
     ) -> None:
-        """users, tokens: None where a proxy knows the users, or nobody may act."""
+        """users: None where a proxy knows the users, or nobody may act."""
         self._config = config
-        self._users, self._tokens = users, tokens
+        self._users = users
         self.sessions = LoginSessions()
         self.log = log or SecurityLog()
         self._failures = LoginFailures()
@@ -139,8 +138,8 @@ class Access:
 
     @property
     def problem(self) -> str:
-        """What is wrong with the files of users and tokens; empty if nothing is."""
-        return "; ".join(each.problem for each in (self._users, self._tokens) if each and each.problem)
+        """What is wrong with the file of users; empty if nothing is."""
+        return self._users.problem if self._users else ""
 
     @property
     def cookie_name(self) -> str:
@@ -157,13 +156,13 @@ class Access:
         """Who sends a request.
 
         Raises:
-            HTTPException: 401 or 429, a program sends a token that is none.
+            HTTPException: 401, 429 or 503, a program sends a token that is none, or cannot be looked up.
         """
         if self._config.user_header:
             return self._of_proxy(request)
         kind, _, token = request.headers.get("authorization", "").partition(" ")
-        if self._tokens is not None and kind.lower() == "bearer":
-            return self._of_token(self._tokens, token.strip(), request)
+        if self._users is not None and kind.lower() == "bearer":
+            return self._of_token(self._users, token.strip(), request)
         cookie = request.cookies.get(self.cookie_name, "")
         session = self.sessions.of(cookie) if cookie else None
         user = self._users.of(session.user) if session and self._users else None
@@ -237,7 +236,7 @@ class Access:
             raise HTTPException(503, "too many logins at once: try again")
         user = users.of(name)
         if users.problem:
-            raise HTTPException(503, "nobody can log in: the file of users cannot be read; health says why")
+            raise HTTPException(503, _UNREADABLE)
         if wait_s := self._failures.begin(name, where["address"]):
             self.log.add("login refused: too many wrong passwords", user=name, **where)
             raise HTTPException(429, "too many wrong passwords: try again later", {"Retry-After": f"{wait_s:.0f}"})
@@ -253,9 +252,11 @@ class Access:
         self._failures.succeed(name, where["address"])
         return user
 
-    def _of_token(self, tokens: Tokens, text: str, request: Request) -> Visitor:
+    def _of_token(self, users: Users, text: str, request: Request) -> Visitor:
         """A program with a token; a session that it has beside it does not count."""
-        found = tokens.of(text)
+        found = users.of_token(text)
+        if users.problem:
+            raise HTTPException(503, _UNREADABLE)
         if found is not None:
             return Visitor(found.name, may_read=True, may_act=found.role == UserRole.OPERATOR)
         where = address_of(request)

@@ -81,6 +81,30 @@ def test_it_is_installed_started_shown_and_removed(host: Host, tmp_path: Path) -
     assert error_of("service", "uninstall") == "the service is not installed"
 
 
+@pytest.mark.skipif(os.getuid() != 0, reason="only root has files that belong to others")
+def test_the_service_may_read_what_root_has_made_for_it(host: Host, tmp_path: Path) -> None:
+    """root owns the configuration, so the service has a user of its own, to whom a private file is closed."""
+    config = tmp_path / "fantwin.toml"
+    config.write_text(config.read_text().replace("[gateway]\n", '[gateway]\nusers = "users.toml"\n'))
+    add_user = fantwin("users", "add", "ann", typed="correct horse battery\n")
+    assert add_user.exit_code == 0, add_user.exception
+    done = fantwin("service", "install", "--dry-run")
+    assert f"chown -R fantwin:fantwin {tmp_path}/runs {tmp_path}/users.toml" in done.stdout.splitlines()
+    os.chown(tmp_path / "users.toml", 7, 7)
+    fantwin("users", "add", "vic", typed="correct horse battery\n")
+    assert (tmp_path / "users.toml").stat().st_uid == 7, "who may read it can read it still"
+    (tmp_path / "users.toml").unlink()
+    (tmp_path / "runs").mkdir()
+    os.chown(tmp_path / "runs", 7, 7)
+    fantwin("users", "add-token", "grafana")
+    assert (tmp_path / "users.toml").stat().st_uid == 7, "new ones are of whose the run folder is"
+    (tmp_path / "users.toml").rename(tmp_path.parent / "users.toml")
+    config.write_text(config.read_text().replace('"users.toml"', '"../users.toml"'))
+    there = tmp_path.parent / "users.toml"
+    copied = f"cp {there} {tmp_path}, and name the copy"
+    assert error_of("service", "install") == f"{there}: the user fantwin may not read it: {copied}"
+
+
 def test_a_dry_run_prints_the_files_and_commands_and_changes_nothing(host: Host, tmp_path: Path) -> None:
     done = fantwin("service", "install", "--dry-run")
     assert done.exit_code == 0 and "ProtectKernelTunables=no" in done.stdout
