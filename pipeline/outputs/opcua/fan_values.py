@@ -9,17 +9,21 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
+
+import numpy as np
 
 from fantwin.pipeline.site.fan_history import CURVES
 from fantwin.pipeline.site.fleet import SILENT, Fan, FanNow
 from fantwin.pipeline.site.site_model import TrayNow
 from fantwin.schemas.enums import InvalidReason
+from fantwin.schemas.messages import Array
 from fantwin.schemas.units import RAD_S_PER_UNIT
 
 GOOD, SILENT_TRAY, OLD = "Good", "UncertainNoCommunicationLastUsableValue", "UncertainLastUsableValue"
 NONE_YET, NO_VALUE = "BadWaitingForInitialData", "BadNoData"
 _LINE_IS_SILENT = (InvalidReason.STALE, InvalidReason.GAP)
+_Numbers: TypeAlias = tuple[Array, Array]
 
 
 class Value(NamedTuple):
@@ -65,7 +69,11 @@ VARIABLES = {
 class FanValues:
     """All fans at one moment."""
 
-    def __init__(self, trays: Sequence[TrayNow] = (), states: Sequence[FanNow] = ()) -> None:
+    def __init__(
+        self, trays: Sequence[TrayNow] = (), states: Sequence[FanNow] = (), before: FanValues | None = None
+    ) -> None:
+        """before: whose numbers are the last usable ones of fans of which no sample arrives."""
+        self._usable = {each.tray: _usable(each, before._usable.get(each.tray) if before else None) for each in trays}
         self._trays: Mapping[str, TrayNow] = {each.tray: each for each in trays}
         self._states: Mapping[Fan, FanNow] = {each.fan: each for each in states}
 
@@ -82,11 +90,22 @@ class FanValues:
             is_judged = tray.is_heard and bool(tray.is_judged[fan.number])
             return Value(is_judged, GOOD, state.since_t_ns if state else tray.t_ns)
         variable = VARIABLES[name]
-        value = float(tray.values[fan.number, CURVES.index(variable.curve)])
+        place = fan.number, CURVES.index(variable.curve)
+        values, times_ns = self._usable[fan.tray]
+        value, t_ns = float(values[place]), int(times_ns[place])
         value /= RAD_S_PER_UNIT["rpm"] if variable.is_speed else 1.0
-        if math.isnan(value):
+        reason = int(tray.invalid_reason[fan.number])
+        is_silent = not tray.is_heard or reason == InvalidReason.STALE
+        if math.isnan(value) or (t_ns != tray.t_ns and not is_silent and name != "Speed"):
             return Value(None, NO_VALUE, tray.t_ns)
-        if not tray.is_heard:
-            return Value(value, SILENT_TRAY, tray.t_ns)
-        is_old = int(tray.invalid_reason[fan.number]) in _LINE_IS_SILENT
-        return Value(value, OLD if is_old else GOOD, tray.t_ns)
+        return Value(value, SILENT_TRAY if is_silent else OLD if reason in _LINE_IS_SILENT else GOOD, t_ns)
+
+
+def _usable(tray: TrayNow, before: _Numbers | None) -> _Numbers:
+    """The newest number of each curve, and the time of its sample: of before where no sample has arrived."""
+    values = tray.values[:, : len(CURVES)]
+    times_ns = np.full(values.shape, tray.t_ns)
+    if before is None:
+        return values, times_ns
+    is_old = np.isnan(values) & np.isin(tray.invalid_reason, _LINE_IS_SILENT)[:, np.newaxis]
+    return np.where(is_old, before[0], values), np.where(is_old, before[1], times_ns)

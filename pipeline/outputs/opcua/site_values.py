@@ -41,7 +41,7 @@ class SiteValues:
 
     def newest(self) -> FanValues:
         """Of all fans; in any thread."""
-        return FanValues(self._model.trays_now(), self._model.every_fan())
+        return FanValues(self._model.trays_now(), self._model.every_fan(), self._values)
 
     def use(self, values: FanValues) -> None:
         """Show these from now on."""
