@@ -21,7 +21,7 @@ from fantwin.schemas.streams import StreamId, StreamState, output_streams
 from fantwin.schemas.topics import CATCH_UP_MESSAGES, HEALTH_CHUNK, health_key
 
 MOST_PRODUCERS = 64
-"""of one key are remembered. Every `fantwin alarms ack` is a producer of its own."""
+"""of one key are remembered. Every `fantwin alarms acknowledge` is a producer of its own."""
 MOST_HEALTH_PRODUCERS = 1024
 """of all health keys of a site together"""
 SILENT_S = 60.0

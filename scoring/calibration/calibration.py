@@ -93,12 +93,14 @@ class ObservedRate:
         declared = "no rate is declared" if self.declared_per_day is None else f"declared {self.declared_per_day:.3g}"
         if not self.fan_hours:
             return f"{count}, and how long fans were judged is not known; {declared}"
-        found = f"{count} in {_number(self.fan_hours)} judged fan-hours: {self._rate(self.false_alarms)}"
+        found = f"{count} in {_number(self.fan_hours)} judged fan-hours"
+        are, them = ("is", "it") if self.unmarked == 1 else ("are", "them")
+        unmarked = f"; {self.unmarked} more {are} not marked" if self.unmarked else ""
+        if not self.says_something:
+            return f"{found}, too few to tell a rate{unmarked}; {declared}"
         if self.unmarked:
-            are, them = ("is", "it") if self.unmarked == 1 else ("are", "them")
-            possible = self._rate(self.false_alarms + self.unmarked)
-            found += f"; {self.unmarked} more {are} not marked, with {them} {possible}"
-        return f"{found}; {declared}"
+            unmarked += f", with {them} {self._rate(self.false_alarms + self.unmarked)}"
+        return f"{found}: {self._rate(self.false_alarms)}{unmarked}; {declared}"
 
     def as_json(self) -> dict[str, Any]:
         """Convert for machines; rates are null where no fan was judged."""

@@ -283,6 +283,23 @@ def test_an_operator_acts_under_his_own_name_and_nobody_else_acts(gateway):
     assert (last.action, last.onset_t_ns, last.comment) == (Action.FALSE_ALARM, NOW_NS, "the door was open")
 
 
+def test_a_fan_is_found_by_its_name_as_by_its_number(opened, tmp_path):
+    named = [{"name": "CPU"}, {}, {"name": "rear top"}, {}]
+    gateway = opened(tmp_path, granted, named, users=make_users(tmp_path / "users.toml"))
+    gateway.feed(score(), alarm())
+    operator = Client(gateway)
+    assert operator.log_in("ann", PASSWORD) == 200
+    by_name = f"/api/v1/fans/{TRAY}/rear%20top"
+    assert operator.ask("GET", by_name)[1]["fan"] == operator.ask("GET", f"/api/v1/fans/{TRAY}/2")[1]["fan"] == 2
+    csv = operator.ask("GET", f"{by_name}/series?format=csv")[2]["content-disposition"]
+    assert csv == f'attachment; filename="{TRAY}-fan2.csv"'
+    assert operator.ask("POST", f"{by_name}/requests", {"action": "acknowledge"})[0] == 200
+    assert [each.fan for each in gateway.sent] == [2]
+    for wrong, why in (("4", "has fans 0 to 3"), ("front", "there are CPU (fan 0), rear top (fan 2)")):
+        status, body, _ = operator.ask("GET", f"/api/v1/fans/{TRAY}/{wrong}")
+        assert (status, why in body["error"]) == (404, True), body
+
+
 def test_forged_sessions_and_posts_from_other_sites_get_nowhere(gateway):
     path, asked = f"/api/v1/fans/{TRAY}/2/requests", {"action": "acknowledge"}
     operator = Client(gateway)

@@ -103,7 +103,7 @@ def record(chain: Chain) -> None:
             lambda: any(each.newest.fan == FAULTY and each.newest.active for each in watcher.current_alarms()),
             "it is raised",
         )
-        run(*chain.words("alarms"), "ack", TRAY, FAULTY, "--operator", "Ann")
+        run(*chain.words("alarms"), "acknowledge", TRAY, FAULTY, "--operator", "Ann")
         run(*chain.words("alarms"), "shelve", TRAY, 1 - FAULTY, "--for", "1m", "--operator", "Bob")
         chain.kill(watcher, "scorer")
         eventually(lambda: not any(each.newest.active for each in watcher.current_alarms()), "it is cleared")

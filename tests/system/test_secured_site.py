@@ -49,7 +49,7 @@ def run(chain: Chain) -> None:
         chain.kill(watcher, "scorer")
         (alarm,) = eventually(watcher.current_alarms, "an alarm stands")
         assert (alarm.newest.header.tray, alarm.newest.fan) == (TRAY, FAULTY)
-        acknowledged = as_typed(*chain.words("alarms"), "ack", TRAY, FAULTY, "--timeout", DEADLINE_S)
+        acknowledged = as_typed(*chain.words("alarms"), "acknowledge", TRAY, FAULTY, "--timeout", DEADLINE_S)
         assert acknowledged.returncode == 0, acknowledged.stderr
         assert not any(view.health.problem for view in watcher.stages() if "certificate" in view.health.problem)
     doctor = as_typed(*chain.words("doctor"), "--listen-s", 0, "--json")

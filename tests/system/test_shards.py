@@ -164,7 +164,7 @@ def counter(shards: Shards, stage: str, name: str) -> int:
 def alarm_is_raised_and_acknowledged(shards: Shards) -> Alarm:
     shards.feed(20)
     eventually(lambda: shards.heard(Transition.DIAGNOSED), "the fault has an alarm and a cause")
-    asked = as_typed("alarms", "ack", "b", FAULTY, "--timeout", DEADLINE_S, *shards.words("here"))
+    asked = as_typed("alarms", "acknowledge", "b", FAULTY, "--timeout", DEADLINE_S, *shards.words("here"))
     assert asked.returncode == 0, asked.stderr
     (acknowledged,) = eventually(lambda: shards.heard(Transition.ACKNOWLEDGED), "it is acknowledged")
     assert (acknowledged.header.tray, acknowledged.fan, acknowledged.active) == ("b", FAULTY, True)

@@ -77,10 +77,10 @@ def operate(chain: Chain) -> list[dict[str, Any]]:
     """Acknowledge and shelve the alarm, take another fan out of service; returns the alarms after that."""
     (alarm,) = eventually(lambda: current_alarms(chain), "an alarm stands")
     assert (alarm["tray"], alarm["fan"], alarm["active"], alarm["presented"]) == (TRAY, FAULTY, True, True)
-    ask(chain, "ack", TRAY, FAULTY, "--operator", "Ann")
+    ask(chain, "acknowledge", TRAY, FAULTY, "--operator", "Ann")
     ask(chain, "shelve", TRAY, FAULTY, "--for", "30m", "--operator", "Bob")
     ask(chain, "out-of-service", TRAY, 5)
-    refused = as_typed(*chain.words("alarms"), "ack", TRAY, FAULTY, "--timeout", DEADLINE_S)
+    refused = as_typed(*chain.words("alarms"), "acknowledge", TRAY, FAULTY, "--timeout", DEADLINE_S)
     expected = f"fantwin: {TRAY}: fan {FAULTY}: refused: it is acknowledged already\n"
     assert (refused.returncode, refused.stderr) == (1, expected)
     alarms = current_alarms(chain)

@@ -37,7 +37,7 @@ _SECONDS = {"s": 1, "m": 60, "h": 3600, "d": 86400}
 class OperatorAction(StrEnum):
     """The actions, as they are typed."""
 
-    ACK = "ack"
+    ACKNOWLEDGE = "acknowledge"
     SHELVE = "shelve"
     UNSHELVE = "unshelve"
     OUT_OF_SERVICE = "out-of-service"
@@ -50,7 +50,7 @@ class OperatorAction(StrEnum):
     @property
     def action(self) -> Action:
         """The action of the request message."""
-        return Action.ACKNOWLEDGE if self is OperatorAction.ACK else Action[self.name]
+        return Action[self.name]
 
 
 def alarms(
@@ -121,7 +121,7 @@ def alarms(
         show_history(recordings or (), settings, json_output=json_output)
         return
     if asked is None and (duration or comment or operator or onset):
-        raise UsageError("--for, --comment, --operator and --onset need an action: fantwin alarms ack TRAY FAN")
+        raise UsageError("--for, --comment, --operator and --onset need an action: fantwin alarms acknowledge TRAY FAN")
     if asked is None:
         stop = stop_on_signals()
         with join_bus(settings, listens=False) as bus:

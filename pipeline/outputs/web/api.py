@@ -144,7 +144,7 @@ class Api:
         found = [each for each in self.model.every_fan() if tray in ("", each.fan.tray) and state in (None, each.group)]
         return JSONResponse({"fans": fans_json(self.model, found[:limit])})  # to check 5,000 of them takes long
 
-    async def fan(self, tray: str, fan: int) -> JSON:
+    async def fan(self, tray: str, fan: str) -> JSON:
         """One fan with its alarm, its twin and its wear."""
         return fan_in_full(self.model, self._fan(tray, fan))
 
@@ -152,7 +152,7 @@ class Api:
         self,
         request: Request,
         tray: str,
-        fan: int,
+        fan: str,
         begin_s: Annotated[
             float | None, Query(ge=0, le=4e9, alias="from", description="seconds since 1970; default: an hour")
         ] = None,
@@ -182,7 +182,7 @@ class Api:
         finally:
             self._waiting.discard(request)
         if isinstance(made, str):
-            headers = {"Content-Disposition": f'attachment; filename="{tray}-fan{fan}.csv"'}
+            headers = {"Content-Disposition": f'attachment; filename="{tray}-fan{found.number}.csv"'}
             return Response(made, media_type=CSV_TYPE, headers=headers)
         return JSONResponse(made)
 
@@ -229,12 +229,14 @@ class Api:
         """The stages: state, rates, losses, latency."""
         return {"stages": stages_json(self.model.stages())}
 
-    async def events(self, request: Request, fan: Annotated[str, Query(description="TRAY/NUMBER")] = "") -> Response:
+    async def events(
+        self, request: Request, fan: Annotated[str, Query(description="TRAY/NUMBER or TRAY/NAME")] = ""
+    ) -> Response:
         """Live events, with the samples of a fan if it is named."""
         looked_at = None
         if fan:
             tray, _, number = fan.rpartition("/")
-            looked_at = self._fan(tray, int(number) if number.isdecimal() and len(number) < 6 else -1)
+            looked_at = self._fan(tray, number)
         first = encoded("fleet", fleet_json(self.model))
         return EventStream(
             self.feed.events(first, looked_at, partial(self.access.may_still_read, request)),
@@ -273,14 +275,16 @@ class Api:
         response.delete_cookie(**self.access.cookie)
         return {}
 
-    async def act(self, tray: str, fan: int | Literal["all"], form: RequestForm, request: Request) -> Any:
+    async def act(self, tray: str, fan: str, form: RequestForm, request: Request) -> Any:
         """Send an operator's request about a fan, or all fans of a tray, and answer what the scorer says."""
         name = self.access.visitor(request).name
-        fans = range(self._tray(tray).fans) if fan == ALL_FANS else [self._fan(tray, fan).number]
-        asked = form.message(-1 if fan == ALL_FANS else fan, name)
+        one = None if fan == ALL_FANS else self._fan(tray, fan).number
+        fans = range(self._tray(tray).fans) if one is None else [one]
+        asked = form.message(-1 if one is None else one, name)
         if why := why_not_judged(self.model, tray):
             return JSONResponse({"error": why, "answers": []}, 409)
-        self.access.log.add("request", user=name, action=form.action, fan=f"{tray} {fan}", **address_of(request))
+        about = f"{tray} {ALL_FANS if one is None else one}"
+        self.access.log.add("request", user=name, action=form.action, fan=about, **address_of(request))
         try:
             said = await self.desk.ask(tray, asked, fans)
         except TimeoutError as error:
@@ -325,11 +329,12 @@ class Api:
         listed = [(folder, clip) for folder in self.clip_folders for clip in kept_clips(folder)]
         return [(folder, clip) for folder, clip in listed if self.model.tray(clip.tray)]
 
-    def _fan(self, tray: str, fan: int) -> Fan:
-        found = self._tray(tray)
-        if not 0 <= fan < found.fans:
-            raise HTTPException(404, f"no such fan: {tray} has fans 0 to {found.fans - 1}")
-        return Fan(tray, fan)
+    def _fan(self, tray: str, fan: str) -> Fan:
+        """By its number or its name."""
+        try:
+            return Fan(tray, self._tray(tray).fan_called(fan))
+        except UserError as error:
+            raise HTTPException(404, f"no such fan: {error}") from error
 
     def _tray(self, name: str) -> TrayConfig:
         found = self.model.tray(name)

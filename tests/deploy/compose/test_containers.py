@@ -142,7 +142,7 @@ def test_a_scorer_that_is_killed_goes_on_with_its_alarm():
 
 
 def test_an_operator_may_act_and_a_viewer_may_not():
-    words = ("alarms", "ack", "tray1", "2", "-c", site.CONFIG)
+    words = ("alarms", "acknowledge", "tray1", "2", "-c", site.CONFIG)
     refused = site.fantwin(*words)
     print(refused.stderr.strip())
     assert refused.returncode == 1

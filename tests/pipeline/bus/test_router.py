@@ -85,7 +85,7 @@ def test_clients_that_start_before_the_router_connect_once_it_runs(endpoint):
 @pytest.mark.parametrize(
     "words",
     [
-        *("status --once", "status --wear", "alarms", "alarms ack tray1 0 --timeout 1"),
+        *("status --once", "status --wear", "alarms", "alarms acknowledge tray1 0 --timeout 1"),
         *("command --fan 0 0.5", "command --sweep"),
     ],
 )

@@ -138,7 +138,7 @@ def test_the_list_shows_current_alarms_and_with_all_also_those_that_are_over(sit
     eventually(lambda: not site.core.conditions.alarm_state(5).active, "it has cleared")
     before_ns = time.time_ns()
     assert [(a["tray"], a["fan"], a["active"]) for a in site.listed()] == [(TRAY, 3, True), (TRAY, 5, False)]
-    site.ask("ack", TRAY, 5)
+    site.ask("acknowledge", TRAY, 5)
     (alarm,) = site.listed()
     assert (alarm["fan"], alarm["severity"], alarm["presented"]) == (3, "alarm", True)
     assert alarm["causes"][0] == {"cause": "drag_up", "probability": 0.83, "evidence": "drag +50 %"}
@@ -161,7 +161,7 @@ def test_row_01_no_alarms_is_not_said_while_a_fan_is_not_judged(site):
 
 def test_an_acknowledgement_names_who_and_a_shelved_alarm_is_listed_and_not_presented(site):
     site.raise_alarm(3)
-    output = site.ask("ack", TRAY, 3, "--operator", "Ann", "--comment", "on my way")
+    output = site.ask("acknowledge", TRAY, 3, "--operator", "Ann", "--comment", "on my way")
     assert output == f"{TRAY}: fan 3: acknowledged\n"
     assert site.core.conditions.alarm_state(3).comment == "on my way"
     (answer,) = json.loads(site.ask("shelve", TRAY, 3, "--for", "30m", "--json"))["answers"]
@@ -176,12 +176,12 @@ def test_an_acknowledgement_names_who_and_a_shelved_alarm_is_listed_and_not_pres
 
 def test_a_request_for_all_fans_succeeds_if_it_is_granted_for_at_least_one_and_asking_is_no_loss(site):
     site.raise_alarm(3)
-    lines = site.ask("ack", TRAY).splitlines()
+    lines = site.ask("acknowledge", TRAY).splitlines()
     assert lines[3] == f"{TRAY}: fan 3: acknowledged"
     assert lines[4] == f"{TRAY}: fan 4: refused: no alarm has been raised"
     assert len(lines) == FANS
-    assert site.refused("ack", TRAY) == f"{TRAY}: ack refused for all fans"
-    assert site.refused("ack", TRAY, 2) == f"{TRAY}: fan 2: refused: no alarm has been raised"
+    assert site.refused("acknowledge", TRAY) == f"{TRAY}: acknowledge refused for all fans"
+    assert site.refused("acknowledge", TRAY, 2) == f"{TRAY}: fan 2: refused: no alarm has been raised"
     for action in ("out-of-service", "in-service"):
         site.ask(action, TRAY, 1)
     site.end()
@@ -201,7 +201,7 @@ def test_watching_prints_what_happens_as_it_happens(site):
         assert watching.stderr.readline().endswith(f"  {TRAY}: every fan is judged now\n")
         site.core.has_alarm = site.core.has_alarm - {3}
         cleared = json.loads(watching.stdout.readline())
-        site.ask("ack", TRAY, 3, "--operator", "Ann")
+        site.ask("acknowledge", TRAY, 3, "--operator", "Ann")
         acknowledged = json.loads(watching.stdout.readline())
         site.end()
         assert f"site '{SITE}': no scorer is alive: alarms are unknown until one is back" in watching.stderr.readline()
@@ -235,7 +235,7 @@ def test_row_10_an_answer_of_a_stranger_is_none_and_a_scorer_that_does_not_answe
 
         bus.subscribe(tray_key(SITE, TRAY, "request"), grant)
         eventually(site.runner._bus._session.info.peers_zid, "they have met")
-        refusal = site.refused("ack", TRAY, 3, "--timeout", 1)
+        refusal = site.refused("acknowledge", TRAY, 3, "--timeout", 1)
     assert heard.is_set()
     assert refusal == (
         f"tray {TRAY}: no answer for fan 3 within 1 s: perhaps no scorer runs, for example because the tray has no "
@@ -243,7 +243,7 @@ def test_row_10_an_answer_of_a_stranger_is_none_and_a_scorer_that_does_not_answe
     )
 
 
-@pytest.mark.parametrize("words", [(), ("ack", TRAY, 3)], ids=["list", "ack"])
+@pytest.mark.parametrize("words", [(), ("acknowledge", TRAY, 3)], ids=["list", "acknowledge"])
 def test_without_a_scorer_one_line_says_that_nothing_is_known(endpoint, words, monkeypatch):
     monkeypatch.setattr("fantwin.pipeline.cli.watch.scorers._DISCOVERY_S", 0.3)
     error = error_of("alarms", *words, "-c", DEMO / "demo.toml", "--set", f"bus.endpoint='{endpoint}'")

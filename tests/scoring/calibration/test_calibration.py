@@ -71,6 +71,13 @@ def test_a_rate_says_nothing_before_it_can_be_compared(hours, false, declared, e
     assert rate(false, hours=hours, declared=declared).as_json()["enough"] is enough
 
 
+def test_a_few_minutes_are_too_few_to_tell_a_rate() -> None:
+    found = rate(1, unmarked=1, hours=0.083, declared=1.0)
+    assert found.text == (
+        "1 false alarm in 0.083 judged fan-hours, too few to tell a rate; 1 more is not marked; declared 1"
+    )
+
+
 def test_where_no_time_is_known_there_is_no_rate() -> None:
     found = rate(1, hours=0.0, declared=None)
     assert found.text == "1 false alarm, and how long fans were judged is not known; no rate is declared"
