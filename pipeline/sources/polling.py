@@ -16,8 +16,9 @@ import math
 import threading
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from typing import NamedTuple
 
 from pydantic import Field
 
@@ -58,6 +59,14 @@ class DeviceError(UserError):
     def __init__(self, reason: str, *, is_lost: bool = False) -> None:
         super().__init__(reason)
         self.is_lost = is_lost
+
+
+class Doubt(NamedTuple):
+    """A speed that a fan hardly has. read: what was read, and where. remedy: the setting with which it is one; empty if
+    none is known."""
+
+    read: str
+    remedy: str = ""
 
 
 class _Write:
@@ -121,6 +130,10 @@ class PollingSource(ABC):
     def check(self) -> list[str]:
         """Problems that would keep it from being read now, one line each."""
         return []
+
+    def doubts(self, fastest_rpm: float) -> Mapping[int, Doubt]:
+        """By fan, the last speeds that are none, 0, too small or too large, where the source can say why."""
+        return {}
 
     def start(self, deliver: Callable[[SourceEvent], None]) -> None:
         """Poll in a thread; wait for a device that is not there yet."""

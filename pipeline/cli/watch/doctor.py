@@ -26,7 +26,7 @@ from fantwin.pipeline.bus.session import join_bus
 from fantwin.pipeline.cli.exposure import exposure_problem, is_exposed
 from fantwin.pipeline.cli.options import DEFAULT_CONFIG, JsonOption, SetOption
 from fantwin.pipeline.cli.printing import show
-from fantwin.pipeline.cli.watch.line_check import check_line
+from fantwin.pipeline.cli.watch.line_check import Finding, check_line
 from fantwin.pipeline.cli.watch.message_check import send_test_messages
 from fantwin.pipeline.config.registry import RECORDER, STAGES
 from fantwin.pipeline.config.roles import READERS, role_names
@@ -45,6 +45,7 @@ _NOT_LISTED = {"all", "dev", "bench"}  # a sum of others, or for tests and bench
 _GRANTED = "the router grants its rights"
 _NOT_GRANTED = "the router does not grant the rights of its role: restart the router with this configuration"
 _MIN_FREE_BYTES = 1 << 30
+_KINDS = {True: ("ok  ", "green"), None: ("WARN", "bold yellow"), False: ("FIX ", "bold red")}
 _LOOKS = 4
 """for the sessions of a site, GOSSIP_S apart"""
 
@@ -121,18 +122,17 @@ def doctor(
         typer.echo(schema_text(), nl=False)
     else:
         found = list(_findings(config, overrides, listen_s, trays or []))
-        good, problems = ([line for ok, line in found if ok is wanted] for wanted in (True, False))
-        lines = [Text.assemble(("ok  ", "green"), f" {line}") for line in good]
-        lines += [Text.assemble(("FIX ", "bold red"), f" {line}") for line in problems]
-        show({"ok": not problems, "problems": problems, "good": good}, *lines, json_output=json_output)
+        by_kind = {kind: [line for is_kind, line in found if is_kind is kind] for kind in _KINDS}
+        lines = [Text.assemble(_KINDS[kind], f" {line}") for kind, listed in by_kind.items() for line in listed]
+        good, warnings, problems = by_kind.values()
+        said = {"ok": not problems, "problems": problems, "warnings": warnings, "good": good}
+        show(said, *lines, json_output=json_output)
         if problems:
             raise typer.Exit(1)
 
 
-def _findings(
-    config: Path | None, overrides: list[str] | None, listen_s: float, trays: list[str]
-) -> Iterator[tuple[bool, str]]:
-    """(in order or not, one line) for each check. trays: those whose lines are checked; empty for all."""
+def _findings(config: Path | None, overrides: list[str] | None, listen_s: float, trays: list[str]) -> Iterator[Finding]:
+    """The finding of each check. trays: those whose lines are checked; empty for all."""
     yield True, f"Python {sys.version.split()[0]}"
     yield from _check_packages()
     if config is None and not DEFAULT_CONFIG.exists():
@@ -155,7 +155,7 @@ def _findings(
     yield from _check_stages(settings, running, listen_s, lines)
 
 
-def _check_packages() -> Iterator[tuple[bool, str]]:
+def _check_packages() -> Iterator[Finding]:
     """Every package that fantwin's own metadata requires; one that only an extra requires may be missing."""
     try:
         requirements = requires("fantwin") or []
@@ -163,21 +163,28 @@ def _check_packages() -> Iterator[tuple[bool, str]]:
         yield False, "fantwin is not installed: in its checkout, pip install -e ."
         return
     extras: dict[str, list[str]] = {}
+    needed: list[str] = []
     for requirement in requirements:
         name = re.split(r"[^A-Za-z0-9._-]", requirement)[0]
         if extra := re.search(r"\bextra\s*==\s*['\"]([^'\"]+)", requirement):
             extras.setdefault(extra[1], []).append(name)
-        elif installed := _version(name):
-            yield True, f"{name} {installed}"
         else:
-            yield False, f"{name} is not installed; {how_to_install('fantwin')}"
+            needed.append(name)
+    if missing := [name for name in needed if not _version(name)]:
+        yield False, f"{', '.join(missing)}: not installed; {how_to_install('fantwin')}"
+    else:
+        yield True, f"{len(needed)} packages that it needs are installed"
+    there: list[str] = []
     for extra in sorted(extras.keys() - _NOT_LISTED):
-        missing = ", ".join(name for name in extras[extra] if not _version(name))
-        state = f"not installed ({missing}); {how_to_install(f'fantwin[{extra}]')}" if missing else "installed"
-        yield True, f"extra {extra!r}: {state}"
+        if missing := [name for name in extras[extra] if not _version(name)]:
+            yield True, f"extra {extra!r}: not installed ({', '.join(missing)}); {how_to_install(f'fantwin[{extra}]')}"
+        else:
+            there.append(extra)
+    if there:
+        yield True, f"extras installed: {', '.join(there)}"
 
 
-def _check_run_folder(folder: Path) -> Iterator[tuple[bool, str]]:
+def _check_run_folder(folder: Path) -> Iterator[Finding]:
     existing = next(parent for parent in (folder, *folder.parents) if parent.exists())
     if not existing.is_dir() or not os.access(existing, os.W_OK | os.X_OK):
         yield False, f"run_folder {folder}: {existing} is not a folder this user may write to; name another"
@@ -187,7 +194,7 @@ def _check_run_folder(folder: Path) -> Iterator[tuple[bool, str]]:
     yield not advice, f"run_folder {folder}: {free / 1e9:.1f} GB free{advice}"
 
 
-def _check_bus(settings: Config, running: list[Session]) -> Iterator[tuple[bool, str]]:
+def _check_bus(settings: Config, running: list[Session]) -> Iterator[Finding]:
     """Whether processes can meet at the endpoint. Adds the sessions of the site that run there."""
     config, endpoint = settings.bus, settings.bus.endpoint
     if problem := endpoint_problem(endpoint):
@@ -200,15 +207,24 @@ def _check_bus(settings: Config, running: list[Session]) -> Iterator[tuple[bool,
         return
     try:
         running += running_sessions(settings)
-        site = f"site {settings.site!r} runs there" if running else "fantwin answers there"
-        yield True, f"bus.endpoint {endpoint}: {site}"
+        if not running and config.mode == "peer" and (others := sorted(_other_sites(settings))):
+            yield (
+                None,
+                (
+                    f"bus.endpoint {endpoint}: site {others[0]!r} runs there, not {settings.site!r}: two sites on one "
+                    "host need two ports: choose another"
+                ),
+            )
+        else:
+            site = f"site {settings.site!r} runs there" if running else "fantwin answers there"
+            yield True, f"bus.endpoint {endpoint}: {site}"
     except NoAnswerError as error:
         yield False, str(error)
     except BusError:
         yield False, foreign_program(endpoint, is_secure=config.security is not None)
 
 
-def _check_certificates(settings: Config) -> Iterator[tuple[bool, str]]:
+def _check_certificates(settings: Config) -> Iterator[Finding]:
     """The certificates of the processes of this configuration that this host has; whether the router grants each of
     them what its role needs."""
     security, site = settings.bus.security, SiteRoles.of(settings)
@@ -239,18 +255,29 @@ def _check_certificates(settings: Config) -> Iterator[tuple[bool, str]]:
 
 def running_sessions(settings: Config) -> list[Session]:
     """The sessions of the site that run, by name; those are waited for that the first one met still introduces."""
+    found = filter(None, map(Session.of_key, _alive(settings, settings.site)))
+    return sorted(found, key=lambda session: session.name)
+
+
+def _other_sites(settings: Config) -> set[str]:
+    """The sites whose sessions are at the endpoint of this one."""
+    return {key.split("/")[1] for key in _alive(settings, "*")} - {settings.site}
+
+
+def _alive(settings: Config, site: str) -> set[str]:
+    """The tokens of sessions. site: its name, or *."""
     found: set[str] = set()
     with join_bus(settings, listens=False) as bus:
         bus.wait_for_others(threading.Event())
         for _ in range(_LOOKS):
-            found |= bus.alive(sessions_key(settings.site))
+            found |= bus.alive(sessions_key(site))
             time.sleep(GOSSIP_S)
-    return sorted(filter(None, map(Session.of_key, found)), key=lambda session: session.name)
+    return found
 
 
 def _check_stages(
     config: Config, running: Sequence[Session], listen_s: float, lines: Collection[str]
-) -> Iterator[tuple[bool, str]]:
+) -> Iterator[Finding]:
     """lines: the trays whose devices are checked."""
     found: dict[str, list[str]] = {}
     """by problem: the processes that have it"""

@@ -12,7 +12,7 @@ import queue
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from fantwin.pipeline.bus.session import join_bus
 from fantwin.pipeline.config.settings import Config, TrayConfig
 from fantwin.pipeline.prediction.tray_twin import TrayTwin, load_tray_twin, twin_path
 from fantwin.pipeline.runtime.stage import Context, StageError, load_stage
-from fantwin.pipeline.sources.polling import PollingSource
+from fantwin.pipeline.sources.polling import Doubt, PollingSource
 from fantwin.pipeline.sources.tacho_evidence import find_tacho, tacho_hints
 from fantwin.pipeline.timebase.device_clock import UINT32
 from fantwin.pipeline.timebase.grid_timing import GridTiming, grid_rate_hz, is_too_slow, leaves_gaps
@@ -35,13 +35,16 @@ FIRST_SAMPLE_S = 6.0
 """a microcontroller restarts when its port is opened, and sends its first sample after some seconds"""
 FASTEST_FAN_RAD_S = 5000.0
 """48,000 rpm: a larger speed was given in another unit"""
+NO_SPEED_RAD_S = 0.05
 RATE_TOLERANCE = 0.01
+MOST_RANGES = 8
+"""lines with commands and speeds; where fans differ more, one has them all"""
 LISTEN_FOR_TACHOS_S = 60
 LISTENED_ENOUGH = 0.9
 PUSHED_LATER = "clients push its samples: they are checked only while `fantwin up` runs; run doctor again then"
 _KEYS = ("name", "place")
-Finding = tuple[bool, str]
-"""in order or not, and one line"""
+Finding = tuple[bool | None, str]
+"""in order, not in order, or (None) to be looked at, and one line"""
 
 
 def check_line(context: Context, config: Config, seconds: float, *, is_running: bool) -> list[Finding]:
@@ -52,10 +55,9 @@ def check_line(context: Context, config: Config, seconds: float, *, is_running: 
     tray = context.tray
     if tray.source.takes_pushed and not is_running:
         return [(True, f"{tray.name}: {PUSHED_LATER}")]
-    samples, problem, called = (
-        (_from_bus(config, tray, seconds), "", ()) if is_running else _from_source(context, seconds)
-    )
-    found = [(False, f"{tray.name}: {problem}")] if problem else []
+    heard = _Heard(_from_bus(config, tray, seconds)) if is_running else _from_source(context, seconds)
+    samples, problem, called, doubts = heard
+    found: list[Finding] = [(False, f"{tray.name}: {problem}")] if problem else []
     if not samples:
         return found or [(False, f"{tray.name}: no sample in {FIRST_SAMPLE_S:g} s")]
     twin = None
@@ -64,7 +66,7 @@ def check_line(context: Context, config: Config, seconds: float, *, is_running: 
             twin = load_tray_twin(twin_path(tray, context.folder), tray.fans)
     if any(name for name, _ in called) and not any(tray.names.names):
         found.append((True, f"{tray.name}: its device names the fans: to show these, write {_as_toml(called)}"))
-    return [*found, *((ok, f"{tray.name}: {line}") for ok, line in _findings(samples, tray, config, twin))]
+    return [*found, *((ok, f"{tray.name}: {line}") for ok, line in _findings(samples, tray, config, twin, doubts))]
 
 
 def _as_toml(called: Sequence[tuple[str, str]]) -> str:
@@ -78,9 +80,17 @@ def _as_toml(called: Sequence[tuple[str, str]]) -> str:
     return f"fan = [{', '.join(f'{{ {each} }}' for each in fans)}]"
 
 
-def _from_source(context: Context, seconds: float) -> tuple[list[Raw], str, Sequence[tuple[str, str]]]:
-    """The samples that acquisition would publish, what it would report as its problem, and what the device calls the
-    fans and their places."""
+class _Heard(NamedTuple):
+    """The samples that acquisition would publish, what it would report as its problem, what the device calls the fans
+    and their places, and its doubts of what it reads."""
+
+    samples: list[Raw]
+    problem: str = ""
+    called: Sequence[tuple[str, str]] = ()
+    doubts: Mapping[int, Doubt] = {}
+
+
+def _from_source(context: Context, seconds: float) -> _Heard:
     settings = context.config.model_copy(update={"block_s": 0.0})
     built = load_stage("acquisition").build(Context(**(vars(context) | {"config": settings})))
     core, source = built.core, built.source
@@ -99,10 +109,15 @@ def _from_source(context: Context, seconds: float) -> tuple[list[Raw], str, Sequ
             core.tick(time.time_ns())
     finally:
         source.stop()
-    problem = core.problem()
+    problem = core.problem().replace("; waiting for it", "")  # the doctor does not
     device = source.source if isinstance(source, SampleBlocks) else source
-    called = device.fans_called if isinstance(device, PollingSource) else ()
-    return samples, problem or refusal(core.counters()), called
+    if not isinstance(device, PollingSource):
+        return _Heard(samples, problem or refusal(core.counters()))
+    tray = context.tray
+    doubts = device.doubts(tray.speed_max * RAD_S_PER_UNIT[tray.speed_unit] / RAD_S_PER_UNIT["rpm"])
+    if not any(doubt.remedy for doubt in doubts.values()):  # which says it better
+        problem = problem or refusal(core.counters())
+    return _Heard(samples, problem, device.fans_called, doubts)
 
 
 def refusal(counters: Mapping[str, int]) -> str:
@@ -114,6 +129,9 @@ def refusal(counters: Mapping[str, int]) -> str:
     of_setting = any(counters.get(name) for name in _OF_A_SETTING)
     if not of_setting and refused <= max(1, _DISTURBED_SHARE * counters.get("samples", 0)):
         return ""
+    if not refused:
+        beyond = f"{counters['absurd_speed']} speeds are beyond speed_max and count as missing"
+        return f"{beyond}: correct speed_max, speed_unit, or which number the source reads"
     named = ", ".join(f"{name} {n}" for name, n in counters.items() if n and name not in _NOT_NAMED)
     return f"{refused} of the inputs cannot be used: {named}; see docs/reference/wire-protocol.md"
 
@@ -134,7 +152,10 @@ def _from_bus(config: Config, tray: TrayConfig, seconds: float) -> list[Raw]:
         return [*first, *arriving.take()]
 
 
-def _findings(samples: Sequence[Raw], tray: TrayConfig, config: Config, twin: TrayTwin | None) -> Iterator[Finding]:
+def _findings(
+    samples: Sequence[Raw], tray: TrayConfig, config: Config, twin: TrayTwin | None, doubts: Mapping[int, Doubt]
+) -> Iterator[Finding]:
+    """doubts: of the device, by fan."""
     fitting = [sample for sample in samples if sample.fans == tray.fans]
     if not fitting:
         yield False, f"samples of {samples[0].fans} fans, [[tray]] says fans = {tray.fans}: correct one of them"
@@ -145,7 +166,7 @@ def _findings(samples: Sequence[Raw], tray: TrayConfig, config: Config, twin: Tr
     yield _rate(times, config, twin)
     command = np.concatenate([sample.command for sample in fitting])
     speed_rad_s = np.concatenate([sample.speed_rad_s for sample in fitting])
-    yield from _ranges(command, speed_rad_s, tray, twin)
+    yield from _ranges(command, speed_rad_s, tray, twin, doubts)
     times_us = np.concatenate([times.times_of(sample) for sample in fitting])
     steps_us = (np.diff(times_us, prepend=times_us[:1]) + UINT32 // 2) % UINT32 - UINT32 // 2  # a clock may wrap
     yield from _tachos(np.cumsum(steps_us) / 1e6, speed_rad_s, tray)
@@ -174,30 +195,55 @@ def _rate(times: SampleTimes, config: Config, twin: TrayTwin | None) -> Finding:
     return True, f"{apart}: grid of {timing.rate_hz:g} Hz, gaps are longer than {timing.gap_limit_ns / NS_PER_S:g} s"
 
 
-def _ranges(command: Array, speed_rad_s: Array, tray: TrayConfig, twin: TrayTwin | None) -> Iterator[Finding]:
+def _ranges(
+    command: Array, speed_rad_s: Array, tray: TrayConfig, twin: TrayTwin | None, doubts: Mapping[int, Doubt]
+) -> Iterator[Finding]:
     """Commands and speeds. command, speed_rad_s: (n, fans)."""
     per_unit = RAD_S_PER_UNIT[tray.speed_unit]
-    silent = np.flatnonzero(~np.isfinite(speed_rad_s).any(axis=0)).tolist()
-    if silent:
-        yield False, f"no speed of {tray.names.labels(silent)}: is its tacho connected?"
+    for fan, doubt in doubts.items():
+        if doubt.remedy:
+            yield False, f"{tray.label(fan)}: {doubt.read}: {doubt.remedy}"
+    misread = {fan for fan, doubt in doubts.items() if doubt.remedy}
+    silent = set(np.flatnonzero(~np.isfinite(speed_rad_s).any(axis=0)).tolist()) - misread
+    for fan in sorted(silent & doubts.keys()):
+        yield False, f"no speed of {tray.label(fan)}: {doubts[fan].read}"
+    if unknown := sorted(silent - doubts.keys()):
+        yield False, f"no speed of {tray.names.labels(unknown)}: is its tacho connected?"
     low, high = float(command.min()), float(command.max())
     if twin and not (twin.card.command_range[0] <= high and low <= twin.card.command_range[1]):
         known = "{:g} to {:g}".format(*twin.card.command_range)
         yield False, f"commands {low:g} to {high:g}, and the twin knows {known}: do device and twin have one unit?"
-    if len(silent) == speed_rad_s.shape[1]:
+    shown = [fan for fan in range(tray.fans) if fan not in silent | misread]
+    if not shown:
         return
-    fastest_rad_s = float(np.nanmax(np.abs(speed_rad_s)))
+    fastest_rad_s = float(np.nanmax(np.abs(speed_rad_s[:, shown])))
     limit_rad_s = min(FASTEST_FAN_RAD_S, 3.0 * twin.card.top_speed_rad_s if twin else FASTEST_FAN_RAD_S)
     if fastest_rad_s > limit_rad_s:
         other = "rpm" if tray.speed_unit == "rad/s" else "rad/s"
         known = f"; the twin knows {twin.card.top_speed_rad_s / per_unit:.0f}" if twin else ""
         yield False, f'speeds up to {fastest_rad_s / per_unit:.0f} {tray.speed_unit}{known}: is speed_unit "{other}"?'
         return
+    is_still = np.nanmax(np.abs(np.nan_to_num(speed_rad_s)), axis=0) < NO_SPEED_RAD_S
+    for fan in [each for each in shown if is_still[each] and command[:, each].min() > max(tray.command_min, 0.0)]:
+        shown.remove(fan)
+        where = f" ({doubts[fan].read})" if fan in doubts else ""
+        yield None, f"{tray.label(fan)} reads 0 at command {command[-1, fan]:g}: does it turn?{where}"
+    lines: dict[str, list[int]] = {}
+    for fan in shown:
+        lines.setdefault(_range_of(command[:, [fan]], speed_rad_s[:, [fan]], tray), []).append(fan)
+    if len(lines) > MOST_RANGES and shown:
+        lines = {_range_of(command[:, shown], speed_rad_s[:, shown], tray): shown}
+    for line, fans in lines.items():
+        yield True, f"{tray.names.labels(fans)}: {line}: is this so?"
+
+
+def _range_of(command: Array, speed_rad_s: Array, tray: TrayConfig) -> str:
+    """Of some fans. command, speed_rad_s: (n, fans)."""
     speeds = _speeds(speed_rad_s, tray.speed_unit)
     if tray.speed_unit == "rad/s":  # numbers in rpm that are taken for rad/s are plausible, and ten times too large
         speeds += f" ({_speeds(speed_rad_s, 'rpm')})"
-    commands = f"commands {low:g} to {high:g} (of {tray.command_min:g} to {tray.command_max:g})"
-    yield True, f"{commands}, speeds {speeds}: are these what the fans do?"
+    limits = f"of {tray.command_min:g} to {tray.command_max:g}"
+    return f"commands {command.min():g} to {command.max():g} ({limits}), speeds {speeds}"
 
 
 def _tachos(t_s: Array, speed_rad_s: Array, tray: TrayConfig) -> Iterator[Finding]:

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.extras import require
 from fantwin.pipeline.sources.modbus.config import ModbusConfig, ModbusFan, Register
-from fantwin.pipeline.sources.polling import DeviceError, PollingSource
+from fantwin.pipeline.sources.polling import DeviceError, Doubt, PollingSource
 from fantwin.pipeline.sources.source import Reading, SourceContext
 from fantwin.schemas.channels import CHANNELS, Channel
 
@@ -30,6 +30,15 @@ TIMEOUT_S = 0.5
 """longest wait for the answer to a request"""
 _FORMATS = {"u16": ">H", "s16": ">h", "u32": ">I", "s32": ">i", "f32": ">f"}
 
+
+_EXCEPTIONS = {
+    1: "it does not know this function: is it the other table?",
+    2: "it has no such register",
+    3: "it does not take this value",
+    4: "it has failed to do it",
+}
+SLOWEST_RPM = 30.0
+"""a smaller speed other than 0 was hardly measured"""
 
 _Place: TypeAlias = tuple[int, str, int]
 """of a register: the unit id of its device, its table, and the address"""
@@ -52,6 +61,10 @@ class ModbusSource(PollingSource):
         self._names = context.names
         self._requests = _requests(config.fan)
         self._client: ModbusBaseSyncClient | None = None
+        self._words: dict[_Place, int] = {}
+        """those that were read last"""
+        self._refused: list[str] = []
+        """requests that the device refused then"""
 
     @property
     def name(self) -> str:
@@ -74,8 +87,7 @@ class ModbusSource(PollingSource):
 
     def read(self) -> Reading:
         """Commands, speeds and what else has registers."""
-        words: dict[_Place, int] = {}
-        refused: list[str] = []
+        words, refused = self._words, self._refused = dict[_Place, int](), list[str]()
         for first, count in self._requests:
             self._ask(first, count, words, refused)
         fans = self._config.fan
@@ -91,6 +103,30 @@ class ModbusSource(PollingSource):
                 each.name: _column(words, fans, each) for each in CHANNELS if any(fan.channel(each) for fan in fans)
             },
         )
+
+    def doubts(self, fastest_rpm: float) -> dict[int, Doubt]:
+        """See the base. Its remedy is another word order, type or scale with which the same words are a speed."""
+        found: dict[int, Doubt] = {}
+        for number, fan in enumerate(self._config.fan):
+            speed, where = fan.speed, f"{fan.speed.table} register {fan.speed.address} ({fan.speed.type})"
+            words = _words_of(self._words, fan.unit, speed)
+            if words is None:
+                found[number] = Doubt("; ".join(self._refused) or f"nothing is in {where}")
+                continue
+            value = _value(self._words, fan.unit, speed)
+            if SLOWEST_RPM <= abs(value) <= fastest_rpm:
+                continue
+            fits = (
+                remedy
+                for other, remedy in _others(speed)
+                if SLOWEST_RPM <= (rpm := _value(self._words, fan.unit, other)) <= fastest_rpm
+                for remedy in (f"{remedy} makes it {rpm:.0f} rpm",)
+            )
+            shown = " ".join(f"0x{word:04x}" for word in words)
+            found[number] = Doubt(
+                f"{where} holds {shown}, which is {value:.3g} rpm", next(fits, "") if any(words) else ""
+            )
+        return found
 
     def write(self, command: tuple[float, ...]) -> None:
         """Write commands to the registers that are declared for them."""
@@ -139,7 +175,7 @@ class ModbusSource(PollingSource):
         read = client.read_holding_registers if table == "holding" else client.read_input_registers
         answer = self._answer(unit, lambda: read(address, count=count, device_id=unit))
         if answer.isError():
-            refused.append(f"unit {unit} refuses {table} register {address} (exception {answer.exception_code})")
+            refused.append(f"unit {unit} refuses {table} register {address} ({_why(answer, address)})")
             return
         for number, word in enumerate(answer.registers[:count]):
             words[unit, table, address + number] = word
@@ -152,7 +188,7 @@ class ModbusSource(PollingSource):
         answer = self._answer(unit, lambda: client.write_registers(register.address, packed, device_id=unit))
         if answer.isError():
             raise DeviceError(
-                f"unit {unit} refuses {value:g} for register {register.address} (exception {answer.exception_code})"
+                f"unit {unit} refuses {value:g} for register {register.address} ({_why(answer, register.address)})"
             )
 
     def _answer(self, unit: int, request: Any) -> Any:
@@ -206,13 +242,44 @@ def _requests(fans: tuple[ModbusFan, ...]) -> list[tuple[_Place, int]]:
 
 def _value(words: dict[_Place, int], unit: int, register: Register) -> float:
     """NaN where a register was refused, or holds no number."""
-    found = [words.get((unit, register.table, register.address + word)) for word in range(_size(register))]
+    found = _words_of(words, unit, register)
+    if found is None:
+        return math.nan
     if register.word_order == "little":
         found.reverse()
-    if None in found:
-        return math.nan
     (number,) = struct.unpack(_FORMATS[register.type], struct.pack(f">{len(found)}H", *found))
     return number * register.scale + register.offset if math.isfinite(number) else math.nan
+
+
+def _words_of(words: dict[_Place, int], unit: int, register: Register) -> list[int] | None:
+    """As the device gives them; None where one was refused."""
+    found = [words.get((unit, register.table, register.address + word)) for word in range(_size(register))]
+    known = [word for word in found if word is not None]
+    return known if len(known) == len(found) else None
+
+
+def _others(register: Register) -> Iterator[tuple[Register, str]]:
+    """Other readings of the same words, the likeliest mistakes first, each with what the configuration says then."""
+    if _size(register) == 2:
+        order = "little" if register.word_order == "big" else "big"
+        types = (register.type, "u32" if register.type == "f32" else "f32")
+        for kind, words in ((types[0], order), (types[1], register.word_order), (types[1], order)):
+            settings = {"type": kind, "word_order": words}
+            named = [f'{name} = "{value}"' for name, value in settings.items() if value != getattr(register, name)]
+            yield register.model_copy(update=settings), ", ".join(named)
+    for share in (0.1, 0.01):
+        scale = float(f"{register.scale * share:.9g}")
+        yield register.model_copy(update={"scale": scale}), f"scale = {scale:g}"
+
+
+def _why(answer: Any, address: int) -> str:
+    """An exception in words."""
+    code = answer.exception_code
+    why = f"exception {code}: {_EXCEPTIONS[code]}" if code in _EXCEPTIONS else f"exception {code}"
+    if code == 2 and 30_000 < address < 50_000:
+        number = address % 10_000
+        why += f"; addresses begin at 0 and have no leading {address // 10_000}: {number}, or {number - 1}"
+    return why
 
 
 def _packed(register: Register, number: float) -> list[int]:

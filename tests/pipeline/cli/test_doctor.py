@@ -57,9 +57,9 @@ def test_an_installation_in_order_is_fine_and_each_package_that_fantwin_needs_is
     assert code == 0
     assert "no fantwin.toml in this folder, and none given with -c: only the installation was checked" in found["good"]
     assert found["ok"] and found["problems"] == []
-    assert {*NEEDED} <= {line.split()[0] for line in found["good"]}
-    listed = {line.split("'")[1] for line in found["good"] if line.startswith("extra ")}
-    assert listed == set(PROJECT["optional-dependencies"]) - {"all", "dev", "bench"}
+    assert f"{len(NEEDED)} packages that it needs are installed" in found["good"]
+    (line,) = (line for line in found["good"] if line.startswith("extras installed: "))
+    assert {*line.split(": ")[1].split(", ")} == set(PROJECT["optional-dependencies"]) - {"all", "dev", "bench"}
 
 
 def test_a_bus_that_others_reach_without_certificates_is_a_problem(demo):
@@ -140,6 +140,11 @@ def test_the_ports_of_the_own_running_site_are_no_problem_and_those_of_a_strange
         assert f"viewer: viewer.grpc_port: port {viewer_port} on 127.0.0.1 is taken" in found["problems"][0]
         assert f"bus.endpoint {endpoint}: fantwin answers there" in found["good"]
 
+        bus.declare_alive(Session.of_this_process("scorer", Shard("all", ()), 1, "scorer-all-1").key("hall"))
+        code, found = demo(*settings)
+        (other,) = found["warnings"]
+        assert other.startswith(f"bus.endpoint {endpoint}: site 'hall' runs there, not 'demo': ")
+
         session = Session.of_this_process("viewer", Shard("all", ()), 1, "viewer-all-1")
         bus.declare_alive(session.key("demo"))
         code, found = demo(*settings)
@@ -151,8 +156,8 @@ def test_the_ports_of_the_own_running_site_are_no_problem_and_those_of_a_strange
 @pytest.mark.parametrize(
     ("missing", "kind", "line"),
     [
-        (NEEDED[0], "problems", f"{NEEDED[0]} is not installed; {how_to_install('fantwin')}"),
-        (NEEDED[-1], "problems", f"{NEEDED[-1]} is not installed; {how_to_install('fantwin')}"),
+        (NEEDED[0], "problems", f"{NEEDED[0]}: not installed; {how_to_install('fantwin')}"),
+        (NEEDED[-1], "problems", f"{NEEDED[-1]}: not installed; {how_to_install('fantwin')}"),
         ("sushy", "good", f"extra 'devices': not installed (sushy); {how_to_install('fantwin[devices]')}"),
     ],
 )

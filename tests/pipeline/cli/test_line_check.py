@@ -52,7 +52,7 @@ def line_of(at_s: Array, speed_rad_s: Array, fans: int = 2) -> list[Raw]:
 def found(rate_hz: float, speed_rad_s: float = 300.0, fans: int = 2, **keys: object) -> list[tuple[bool, str]]:
     config, numbers = config_of(**keys), np.arange(max(3, round(2 * rate_hz)))
     line = line_of(numbers / rate_hz, speed_rad_s + numbers, fans)
-    return list(_findings(line, config.trays[0], config, None))
+    return list(_findings(line, config.trays[0], config, None, {}))
 
 
 @pytest.mark.parametrize(("line_hz", "grid_hz", "gap_s"), [(1, 1, "5"), (10, 10, "0.5"), (100, 100, "0.1")])
@@ -60,7 +60,7 @@ def test_a_line_that_fits_is_shown_with_its_grid_and_ranges(line_hz: float, grid
     rate, ranges, _ = found(line_hz, tray__0__speed_unit="rpm")
     assert rate == (True, f"{line_hz} samples a second: grid of {grid_hz} Hz, gaps are longer than {gap_s} s")
     assert ranges[0]
-    assert ranges[1].startswith("commands 0.5 to 0.5 (of 0 to 1), speeds 2865 to ")
+    assert ranges[1].startswith("fans 0, 1: commands 0.5 to 0.5 (of 0 to 1), speeds 2865 to ")
 
 
 @pytest.mark.parametrize(
@@ -80,19 +80,23 @@ def test_tachos_that_count_are_found_in_what_a_line_sends(tacho: str | None, is_
     at_s = np.arange(600) / 10.0
     speed = 150.0 + 100.0 * np.sin(2.0 * np.pi * np.floor(at_s) / 31.0)
     line = line_of(at_s, np.pi * np.floor(speed / np.pi))
-    *_, (ok, text) = _findings(line, config.trays[0], config, None)
+    *_, (ok, text) = _findings(line, config.trays[0], config, None, {})
     assert ok == is_fine and said in text
-    *_, (ok, short) = _findings(line[:20], config.trays[0], config, None)
+    *_, (ok, short) = _findings(line[:20], config.trays[0], config, None, {})
     unseen = "fans 0, 1: not shown whether the tacho counts or holds; "
-    assert ok and short.startswith("commands" if tacho else f"{unseen}listen while the speeds change: --listen-s 60")
-    *_, (ok, steady) = _findings(line_of(at_s, np.full(600, 150.0)), config.trays[0], config, None)
-    assert ok and steady.startswith("commands" if tacho else f"{unseen}write `tacho` in [[tray]]"), "it has listened"
+    assert ok and short.startswith(
+        "fans 0, 1: commands" if tacho else f"{unseen}listen while the speeds change: --listen-s 60"
+    )
+    *_, (ok, steady) = _findings(line_of(at_s, np.full(600, 150.0)), config.trays[0], config, None, {})
+    assert ok and steady.startswith("fans 0, 1: commands" if tacho else f"{unseen}write `tacho` in [[tray]]"), (
+        "it has listened"
+    )
 
 
 def test_a_speed_that_is_shown_once_a_second_is_found_in_what_a_line_sends_twice_a_second() -> None:
     config, at_s = config_of(), np.arange(120) / 2.0
     line = line_of(at_s, 150.0 + 100.0 * np.sin(2.0 * np.pi * np.floor(at_s) / 31.0))
-    *_, (ok, text) = _findings(line, config.trays[0], config, None)
+    *_, (ok, text) = _findings(line, config.trays[0], config, None, {})
     assert not ok
     assert '`tacho = { kind = "average", window_s = 0.05, update_s = 1.0 }` in [[tray]]' in text
 
@@ -149,7 +153,7 @@ def test_a_port_is_listened_to_as_acquisition_does() -> None:
             {"samples": 199, "refused_input": 1, "absurd_command": 1},
             "1 of the inputs cannot be used: absurd_command 1;",
         ),
-        ({"samples": 200, "absurd_speed": 4}, "absurd_speed 4;"),
+        ({"samples": 200, "absurd_speed": 4}, "4 speeds are beyond speed_max and count as missing: correct speed_max"),
     ],
 )
 def test_a_line_that_was_cut_once_is_no_fault_of_the_configuration(counters: dict[str, int], words: str) -> None:

@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import math
+import re
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from fantwin.pipeline.cli.watch.line_check import check_line
+from fantwin.pipeline.config.loading import parse_config
+from fantwin.pipeline.runtime.stage import Context
+from fantwin.pipeline.sources.found import as_toml
 from fantwin.pipeline.sources.modbus.config import ModbusConfig
 from fantwin.pipeline.sources.modbus.source import ModbusSource
 from fantwin.pipeline.sources.polling import DeviceError
@@ -74,7 +79,9 @@ def test_what_a_drive_refuses_is_nan_or_an_error_and_a_command_must_be_there() -
             made.read()
         made.disconnect()
         made = device(port)
-        with pytest.raises(DeviceError, match=r"unit 3 refuses 1.5 for register 100 \(exception 3\)"):
+        with pytest.raises(
+            DeviceError, match=r"unit 3 refuses 1.5 for register 100 \(exception 3: it does not take this value\)"
+        ):
             made.write((1.5,))
         with pytest.raises(DeviceError, match=r"-10 does not fit into u16 of register 100"):
             made.write((-0.01,))
@@ -84,6 +91,43 @@ def test_what_a_drive_refuses_is_nan_or_an_error_and_a_command_must_be_there() -
             made.write((math.nan, 0.5))
         made.disconnect()
         assert config(port, without).why_no_commands == "no fan of its source has a register `write`"
+
+
+def test_doctor_names_the_setting_of_a_speed_that_is_none_and_what_was_read() -> None:
+    """Five fans of one device, of which one is right: word order, scale, a register of something else, none at all."""
+    plain = {"command": FAN["command"], "unit": 3}
+    fans = [
+        FAN,
+        plain | {"speed": {"address": VOLTAGE, "type": "u32", "scale": 0.001}},
+        plain | {"speed": {"address": SPEED, "scale": 20.0}},
+        plain | {"speed": {"address": WANTED + 1}},
+        plain | {"speed": {"address": 40_200}},
+    ]
+    with modbus_server({3: drive()}) as port:
+        tray = {
+            "name": "ahu",
+            "fan": [{"name": name} for name in ("right", "order", "scale", "still", "none")],
+            "speed_unit": "rpm",
+            "speed_max": 4000.0,
+            "source": {"kind": "modbus", "line": f"127.0.0.1:{port}", "fan": fans},
+        }
+        settings = parse_config(f"tray = [{as_toml(tray)}]", Path("fantwin.toml"), (), ("acquisition", "resampler"))
+        context = Context("site", settings.trays, settings.sections["acquisition"], Path(), Path(), 0)
+        found = check_line(context, settings, 1.0, is_running=False)
+    by_kind = {
+        kind: [line.removeprefix("ahu: ") for each, line in found if each is kind] for kind in (True, None, False)
+    }
+    order, scale, none = by_kind[False]
+    assert order.startswith("order (fan 1): holding register 14 (u32) holds 0x3e5a 0x0008, which is 1.05e+06 rpm: ")
+    assert order.endswith('rpm: word_order = "little" makes it 540 rpm')
+    assert re.fullmatch(r"scale \(fan 2\): .*: scale = 2 makes it \d+ rpm", scale)
+    prefix = "no speed of none (fan 4): unit 3 refuses holding register 40200 (exception 2: it has no such register; "
+    assert none == f"{prefix}addresses begin at 0 and have no leading 4: 200, or 199)"
+    (still,) = by_kind[None]
+    assert re.match(r"still \(fan 3\) reads 0 at command 0\.\d+: does it turn\? \(holding register 101 ", still)
+    assert [line.split(":")[0] for line in by_kind[True] if ", speeds" in line] == ["right (fan 0)"]
+    gone = check_line(context, settings, 1.0, is_running=False)
+    assert [(ok, line.endswith("cannot be opened or reached")) for ok, line in gone] == [(False, True)]
 
 
 def over_serial(line: SerialLine, **settings: Any) -> tuple[ModbusConfig, SourceContext]:
@@ -103,7 +147,9 @@ def test_registers_of_all_types_are_read_by_one_request_and_a_command_moves_the_
         second = made.read()
         assert second.command == (0.9,)
         assert second.speed[0] % 2.0 == 0.0
-        with pytest.raises(DeviceError, match=r"unit 3 refuses 1.5 for register 100 \(exception 3\)"):
+        with pytest.raises(
+            DeviceError, match=r"unit 3 refuses 1.5 for register 100 \(exception 3: it does not take this value\)"
+        ):
             made.write((1.5,))
         made.disconnect()
     # unit, function, address, count or value, CRC: seven registers from 10 on, and 900 to register 100
