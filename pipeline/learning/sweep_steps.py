@@ -25,6 +25,8 @@ SETTLING = 5.0
 SHORTEST_S, LONGEST_S = 0.5, 60.0
 """of a step; a fan that has not settled after the longest is slower than a fan can be"""
 SHORTEST_PROBE_S = 3.0
+PROBED = 4.0
+"""time constants that a probe lasts at least"""
 PROBES = 3
 """steps that show the time constants"""
 LEAST_SHARE = 0.2
@@ -124,6 +126,7 @@ class Excitation:
         slowest_s = np.nanmax([*time_constants_s.values(), SHORTEST_S / SETTLING])
         steps = list(self._steps(float(slowest_s)))
         left_s = sum(hold_s for _, hold_s in steps)
+        self.progress(f"{len(steps)} steps, {left_s / 60.0:.1f} min")
         for number, (commands, hold_s) in enumerate(steps, 1):
             shown = f"{min(commands):g}" if len(set(commands)) == 1 else f"{min(commands):g} to {max(commands):g}"
             self.progress(f"step {number} of {len(steps)}: command {shown} for {hold_s:.1f} s, {left_s:.0f} s left")
@@ -180,7 +183,10 @@ class Excitation:
             self._wait(_POLL_S)
             waited_s += _POLL_S
             seen = self.line.observed()
-            if waited_s >= SHORTEST_PROBE_S and has_settled(seen.t_s, seen.speed_rad_s[:, self.fans]):
+            speeds = seen.speed_rad_s[:, self.fans]
+            slowest_s = max([s for s in time_constants(seen.t_s, speeds) if np.isfinite(s)], default=0.0)
+            # Readings that a device holds look settled long before the fan has.
+            if waited_s >= max(SHORTEST_PROBE_S, PROBED * slowest_s) and has_settled(seen.t_s, speeds):
                 break
         self._check_obeyed(np.full(len(self.fans), command))
         seen = self.line.observed()

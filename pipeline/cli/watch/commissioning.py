@@ -154,12 +154,20 @@ class Commissioning:
         Each sweep has a recording of its own, so that a twin is not trained on the time when other trays were swept.
         The limits need other speeds than those that the plant happens to have in some minutes: hence the second sweep.
         """
+        rounds, minutes = self._plan.rounds, self._plan.operation_s / 60.0
+        of_rounds = f"{rounds} round{'s' * (rounds > 1)}"
+        self._commands.say(
+            f"plan: of each tray a sweep of {of_rounds} to train on and one of 1 round to validate; then "
+            f"{minutes:.3g} min of ordinary operation of all, and training"
+        )
+        self._commands.say("a round takes 75 time constants of the slowest fan, which each sweep measures first")
         for work in self.left:
             with self._failing(work):
                 if TRAINING not in work.so_far.recorded:
                     self._sweep(work, TRAINING, options, self._plan.rounds)
                     self._check_tachos(work)
                 if VALIDATION not in work.so_far.recorded:
+                    self._commands.say(f"tray {work.name}: the second sweep, 1 round, to validate")
                     self._sweep(work, VALIDATION, options, 1)
         if self._lacks(CALIBRATION):
             seen = {work.name: OrdinaryOperation(work.tray) for work in self.left}

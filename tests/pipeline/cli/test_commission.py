@@ -169,6 +169,10 @@ def test_one_tray_after_the_other_is_swept_into_recordings_of_its_own(played: Pl
     assert played.of("command") == [
         f" --sweep --tray {tray} --low 0.3 --rounds {rounds}" for tray in "ab" for rounds in (2, 1)
     ]
+    assert result.output.startswith(
+        "plan: of each tray a sweep of 2 rounds to train on and one of 1 round to validate; "
+    )
+    assert "tray a: the second sweep, 1 round, to validate" in result.output
     assert played.of("train") == [
         " runs/1.mcap --validate runs/2.mcap --tray a -o a.onnx",
         " runs/3.mcap --validate runs/4.mcap --tray b -o b.onnx",

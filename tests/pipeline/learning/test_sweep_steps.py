@@ -43,6 +43,20 @@ def test_each_level_lasts_until_the_slowest_fan_has_settled(slowest_s: float) ->
     assert said[-1].startswith("step 23 of 23: command ")
 
 
+def test_readings_that_a_device_holds_for_a_second_do_not_end_a_probe_too_early() -> None:
+    """Two equal readings were taken for a speed that has settled, so that one fan had 3.5 s and later 5.5 s."""
+
+    class Holds(FirstOrderFans):
+        def observed(self) -> Observed:
+            seen = super().observed()
+            shown = np.searchsorted(seen.t_s, np.floor(seen.t_s))
+            return seen._replace(speed_rad_s=seen.speed_rad_s[shown])
+
+    found, said = swept(Holds([3.0]))
+    assert 2.9 <= found[0] <= 4.1, "at most one reading late"
+    assert f"23 steps, {75.0 * found[0] / 60.0:.1f} min" in said
+
+
 @pytest.mark.parametrize("fans", [1, 5])
 def test_each_fan_passes_all_levels_of_the_range_and_the_load_of_all_does_not_follow_any_one_of_them(
     fans: int,
