@@ -24,6 +24,7 @@ from fantwin.schemas.model_uncertainty import ModelUncertainty
 from fantwin.schemas.reference_conditions import ReferenceConditions
 from fantwin.schemas.standstill import Standstill
 from fantwin.schemas.tacho import INSTANTANEOUS, Tacho, Tachos, tacho_of_each_fan
+from fantwin.schemas.units import RAD_S_PER_UNIT
 
 CARD_PROPERTY = "fantwin.card"
 GRAPH_INPUTS = ("state", "command", "step_s", "parameters")
@@ -90,9 +91,10 @@ class TrainingCard:
     """How the twin was trained.
 
     physics: whether they were refined together with the network. duration_s: duration of the training. fans: the fan
-    numbers in the recordings, in the order of the card's lists; empty: counted from 0. networks: how many were trained;
-    the twin is the mean of those that ended about as well as the best. iterations: of all of them. of_type: name of the
-    twin of the type whose network it has, if only its physics are of these fans; else empty.
+    numbers in the recordings, in the order of the card's lists; empty: counted from 0. fan_names: what the recordings
+    call them, each empty where it has none; empty: none has one. networks: how many were trained; the twin is the mean
+    of those that ended about as well as the best. iterations: of all of them. of_type: name of the twin of the type
+    whose network it has, if only its physics are of these fans; else empty.
     """
 
     trainer: str
@@ -104,6 +106,7 @@ class TrainingCard:
     fans: tuple[int, ...] = ()
     networks: Count = 1
     of_type: str = ""
+    fan_names: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, config=_CONFIG)
@@ -272,6 +275,8 @@ class TwinCard:
                 raise ValueError(f"balance.{name} must have one value for each fan")
         if len(self.fan_numbers) != self.fans:
             raise ValueError("training.fans must name each fan, or none")
+        if len(self.training.fan_names) not in (0, self.fans):
+            raise ValueError("training.fan_names must have one name for each fan, or none")
         tacho_of_each_fan(self.tacho, self.fans)
         if self.drive is not None and len(self.drive.lowest_command) != self.fans:
             raise ValueError("drive.lowest_command must have one value for each fan")
@@ -280,6 +285,25 @@ class TwinCard:
         if not self.command_range[0] < self.command_range[1]:
             raise ValueError("command_range must be in ascending order")
         return self
+
+    def __str__(self) -> str:
+        """The most important in a few lines, with speeds in rpm."""
+        of, rpm = self.validation, RAD_S_PER_UNIT["rpm"]
+        figures = {"rmse_rpm": of.rmse, "max_error_rpm": of.max_error}
+        shown = {name: value / rpm for name, value in figures.items() if value is not None}
+        shown |= {"sigma_rpm": max(self.sigma_rad_s) / rpm} | ({} if of.r2 is None else {"r2": of.r2})
+        fans = f"{self.fans} fan{'s' * (self.fans != 1)}"
+        fans += f" ({', '.join(self.training.fan_names)})" if self.training.fan_names else ""
+        low, high = (speed / rpm for speed in self.speed_range_rad_s)
+        return "\n".join(
+            (
+                f"{self.name}: {self.kind} twin of {fans}, {self.rate_hz:.3g} Hz",
+                f"trained on {sum(each.samples for each in self.training.data)} samples, {self.created}",
+                f"command {self.command_range[0]:.4g} to {self.command_range[1]:.4g} {self.command_unit}".rstrip()
+                + f", speed_rpm {low:.4g} to {high:.4g}",
+                f"{of.source} free run: " + ", ".join(f"{name} {value:.4g}" for name, value in shown.items()),
+            )
+        )
 
     @property
     def fan_numbers(self) -> tuple[int, ...]:

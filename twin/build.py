@@ -54,6 +54,7 @@ def train_twin(
     each_network: ForEachNetwork = one_after_another,
     command_unit: str = "",
     fan_numbers: Sequence[int] | None = None,
+    fan_names: Sequence[str] = (),
     data: Sequence[DataCard] = (),
     validation_data: Sequence[DataCard] = (),
     created: datetime | None = None,
@@ -65,7 +66,7 @@ def train_twin(
     figures. If empty, the training runs are used instead, and the card says so. networks: how many are trained and
     averaged, 1 to MOST_NETWORKS. trainer "adam" trains one, keeps the physics as identified, and keeps the weights with
     the smallest training error. each_network: runs their trainings.
-    fan_numbers (what the recordings call the runs' fans; default: counted from 0), command_unit, data and
+    fan_numbers and fan_names (what the recordings call the runs' fans; default: counted from 0), command_unit, data and
     validation_data (the files that the runs are from) and created (default: now) go into the card. The same seed and
     runs give the same model.
     Raises TwinError when the runs do not determine the parameters, are not measured alike, or the result cannot serve
@@ -121,7 +122,15 @@ def train_twin(
         uncertainty = model_uncertainty(model, of_physics, commanded, acting, friction, identification)
     physics = "refined" if fitted.is_refined else "fixed"
     training = TrainingCard(
-        trainer, physics, seed, fitted.iterations, round(duration_s, 3), tuple(data), numbers, networks
+        trainer=trainer,
+        physics=physics,
+        seed=seed,
+        iterations=fitted.iterations,
+        duration_s=round(duration_s, 3),
+        data=tuple(data),
+        fans=numbers,
+        networks=networks,
+        fan_names=tuple(fan_names) if any(fan_names) else (),
     )
     return finish_twin(
         model,

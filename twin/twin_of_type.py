@@ -29,6 +29,7 @@ def place_twin(
     *,
     name: str,
     fan_numbers: Sequence[int] | None = None,
+    fan_names: Sequence[str] = (),
     data: Sequence[DataCard] = (),
     validation_data: Sequence[DataCard] = (),
     created: datetime | None = None,
@@ -76,6 +77,7 @@ def place_twin(
         numbers,
         card.training.networks,
         of_type=card.name,
+        fan_names=tuple(fan_names) if any(fan_names) else (),
     )
     return finish_twin(
         model,

@@ -61,27 +61,32 @@ def fit_twin(
         TwinError: the data do not suffice.
     """
     from fantwin.twin.build import train_twin  # noqa: PLC0415  the command line loads twin only when it is needed
+    from fantwin.twin.errors import TwinError  # noqa: PLC0415
     from fantwin.twin.kinds import find_kind  # noqa: PLC0415
     from fantwin.twin.network_training import one_after_another  # noqa: PLC0415
     from fantwin.twin.progress import unreported  # noqa: PLC0415
 
     can_average = find_kind(settings.model).has_ode_network and settings.trainer == DEFAULT_SETTINGS.trainer
-    return train_twin(
-        training_data.runs,
-        held_out.runs if held_out else [],
-        settings.model,
-        name=name,
-        seed=settings.seed,
-        max_iterations=settings.iterations,
-        trainer=settings.trainer,
-        networks=settings.networks if settings.networks is not None else NETWORKS if can_average else 1,
-        each_network=each_network or one_after_another,
-        command_unit=settings.command_unit,
-        fan_numbers=training_data.fans,
-        data=data_cards(training_data),
-        validation_data=data_cards(held_out) if held_out else (),
-        progress=progress or unreported,
-    )
+    try:
+        return train_twin(
+            training_data.runs,
+            held_out.runs if held_out else [],
+            settings.model,
+            name=name,
+            seed=settings.seed,
+            max_iterations=settings.iterations,
+            trainer=settings.trainer,
+            networks=settings.networks if settings.networks is not None else NETWORKS if can_average else 1,
+            each_network=each_network or one_after_another,
+            command_unit=settings.command_unit,
+            fan_numbers=training_data.fans,
+            fan_names=[training_data.names.name(fan) for fan in training_data.fans],
+            data=data_cards(training_data),
+            validation_data=data_cards(held_out) if held_out else (),
+            progress=progress or unreported,
+        )
+    except TwinError as error:
+        raise TwinError(training_data.in_its_words(str(error))) from error
 
 
 MOST_KEPT_BYTES = 1 << 30

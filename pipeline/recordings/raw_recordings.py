@@ -10,12 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from fantwin.pipeline.recordings.reading import TACHO_KEY
+from fantwin.pipeline.recordings.reading import NAMES_KEY, TACHO_KEY
 from fantwin.pipeline.recordings.writing import RecordingWriter
 from fantwin.pipeline.sources.simulated.device import Device, PlaybackCounts
 from fantwin.pipeline.sources.tables.measured_table import Table
 from fantwin.schemas.blocks import cut
 from fantwin.schemas.device_sample import DeviceSample
+from fantwin.schemas.fan_names import NO_NAMES, FanNames
 from fantwin.schemas.header import Header
 from fantwin.schemas.messages import Raw
 from fantwin.schemas.tacho import INSTANTANEOUS, Tacho, tachos_to_json
@@ -78,6 +79,7 @@ def write_raw(
     tray: str,
     speed_unit: str,
     tachos: Sequence[Tacho],
+    names: FanNames = NO_NAMES,
 ) -> None:
     """Write the samples of a tray to a recording. They get their headers here; a message is received with its last
     sample. An existing recording is replaced.
@@ -88,13 +90,17 @@ def write_raw(
     metadata = {"source": source, "site": site, "trays": tray, "speed_unit": speed_unit}
     if tuple(tachos) != INSTANTANEOUS:
         metadata[f"{TACHO_KEY}.{tray}"] = tachos_to_json(tachos)
+    if any(names.names):
+        metadata[f"{NAMES_KEY}.{tray}"] = names.as_json()
     with RecordingWriter(path, metadata, t_ns=first_t_ns, overwrite=True) as writer:
         for sequence, raw in enumerate(raws):
             numbered = replace(raw, header=Header(producer, sequence, tray))
             writer.add_message(tray_key(site, tray, "raw"), numbered, int(raw.host_receive_t_ns[-1]))
 
 
-def write_table(table: Table, output: Path, tray: str, tachos: tuple[Tacho, ...] = INSTANTANEOUS) -> None:
+def write_table(
+    table: Table, output: Path, tray: str, tachos: tuple[Tacho, ...] = INSTANTANEOUS, names: FanNames = NO_NAMES
+) -> None:
     """Write the samples of a table as raw messages; the time of receipt is the time in the table.
 
     Raises:
@@ -112,7 +118,7 @@ def write_table(table: Table, output: Path, tray: str, tachos: tuple[Tacho, ...]
     starts = [0, *range(1, len(table.t_ns), SAMPLES_PER_MESSAGE), len(table.t_ns)]
     raws = (cut(whole, first, end) for first, end in pairwise(starts))
     about = {"source": table.path.name, "site": IMPORTED, "tray": tray, "speed_unit": table.speed_unit}
-    write_raw(output, raws, int(table.t_ns[0]), "import", **about, tachos=tachos)
+    write_raw(output, raws, int(table.t_ns[0]), "import", **about, tachos=tachos, names=names)
 
 
 def _blocks(device: Device, played: PlaybackCounts) -> Iterator[list[DeviceSample]]:

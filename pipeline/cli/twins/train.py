@@ -205,6 +205,7 @@ def _place(
         held_out.runs if held_out else [],
         name=name,
         fan_numbers=training_data.fans,
+        fan_names=[training_data.names.name(fan) for fan in training_data.fans],
         data=data_cards(training_data),
         validation_data=data_cards(held_out) if held_out else (),
         progress=progress,
