@@ -14,6 +14,7 @@ read recordings (`fantwin.pipeline.recordings`). The folders of the repository a
 from __future__ import annotations
 
 from importlib import import_module
+from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -56,6 +57,8 @@ def __getattr__(name: str) -> Any:
     Raises:
         AttributeError: there is no such name.
     """
+    if name == "__version__":
+        return version("fantwin")
     if name not in __all__:
         raise AttributeError(f"module 'fantwin' has no attribute {name!r}")
     return getattr(import_module(f"fantwin.{_MODULES.get(name, 'pipeline.recordings')}"), name)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
@@ -11,30 +12,51 @@ import numpy as np
 
 from fantwin.interface.columns import Fan
 from fantwin.interface.decisions import DecidedTray, decided
-from fantwin.interface.suspicions import refuse_speeds
+from fantwin.interface.suspicions import suspect_levels
 from fantwin.interface.tables import Array, FanTable, Form, data_frame
+from fantwin.interface.words import warn
+from fantwin.pipeline.errors import FantwinError
 from fantwin.pipeline.extras import is_installed
+from fantwin.pipeline.prediction.tray_twin import load_tray_twin
 from fantwin.pipeline.recordings.dates import has_date
 from fantwin.pipeline.recordings.raw_recordings import write_table
-from fantwin.schemas.tacho import Tacho
+from fantwin.pipeline.sources.tables.measured_table import Table
 
 Answer: TypeAlias = Literal["prediction", "scores", "alarms"]
+MOST_KEPT = 2_000_000
+"""samples of fans of a table whose scores are kept, some 300 MB"""
 
 
-def of_table(given: FanTable, tachos: tuple[Tacho, ...], twin: Path, overrides: Sequence[str], answer: Answer) -> Any:
-    """The answer to a table, which becomes a recording beside the file of the twin."""
-    recording = twin.with_name("table.mcap")
-    write_table(given.samples, recording, "table", tachos)
-    (tray,) = decided(recording, twin, overrides)
-    refuse_speeds(tray.scores, given.form.unit)
+def of_table(
+    given: FanTable, twin: Path, overrides: Sequence[str], answer: Answer, latest: dict[str, DecidedTray]
+) -> Any:
+    """The answer to a table, which becomes a recording beside the file of the twin.
+
+    latest: the scores of the newest table by its samples: `score` and `alarms` of one table take the time of one.
+    """
+    loaded, key = load_tray_twin(twin, len(given.fans)), _digest(given.samples, overrides)
+    tray = latest.get(key) if answer != "prediction" else None
+    if tray is None:
+        recording = twin.with_name("table.mcap")
+        write_table(given.samples, recording, "table", loaded.card.tacho)
+        (tray,) = decided(recording, twin, overrides, scores=answer != "prediction")
+        if answer != "prediction":
+            latest.clear()
+            if given.samples.command.size <= MOST_KEPT:
+                latest[key] = tray
+    suspect_levels(given, loaded, tray.scores)
+    warn(tray.left_out)
     return given.form.make(_columns(tray, given.fans, given.form, answer), given.form.zone)
 
 
 def of_recording(recording: Path, twin: Path, overrides: Sequence[str], answer: Answer) -> Any:
     """The answer to a recording: its trays one after another, with a column `tray`."""
-    trays = decided(recording, twin, overrides)
+    trays = decided(recording, twin, overrides, scores=answer != "prediction")
+    for tray in trays:
+        _require_order(tray, load_tray_twin(twin).card.training.fan_names)
+        warn(tray.left_out)
     is_dated = any(has_date(int(tray.scores[0].t_ns[0])) for tray in trays if tray.scores)
-    form = Form(_frame_or_dict, is_dated, unit=trays[0].speed_unit)
+    form = Form(_frame_or_dict, "dates" if is_dated else "seconds", unit=trays[0].speed_unit)
     parts = [_columns(tray, range(tray.fans), form, answer) for tray in trays]
     names = np.repeat(np.array([tray.name for tray in trays], np.object_), [len(part["fan"]) for part in parts])
     return form.make(
@@ -46,6 +68,28 @@ def _columns(tray: DecidedTray, fans: Sequence[Fan], form: Form, answer: Answer)
     if answer == "alarms":
         return tray.columns_of_alarms(fans, form)
     return tray.columns_of_samples(fans, form, decisions=answer == "scores")
+
+
+def _digest(samples: Table, overrides: Sequence[str]) -> str:
+    found = hashlib.sha256(repr(overrides).encode())
+    for name, values in {
+        "t": samples.t_ns,
+        "c": samples.command,
+        "s": samples.speed_rad_s,
+        **samples.auxiliary,
+    }.items():
+        found.update(name.encode() + np.ascontiguousarray(values).tobytes())
+    return found.hexdigest()
+
+
+def _require_order(tray: DecidedTray, names: Sequence[str]) -> None:
+    """Refuse a recording that has the fans of the twin in another order: its fans are matched by number."""
+    own = tray.fan_names[: tray.fans]
+    if len(names) > 1 and sorted(own) == sorted(names) and own != tuple(names):
+        raise FantwinError(
+            f"tray {tray.name} has the fans {', '.join(own)} in this order, and the twin {', '.join(names)}: use the "
+            "twin of this tray"
+        )
 
 
 def _frame_or_dict(columns: dict[str, Array], zone: Any) -> Any:

@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from fantwin.interface.columns import Fan
 from fantwin.interface.tables import Array, Form
 from fantwin.interface.words import warn
+from fantwin.pipeline.config.settings import TrayConfig
+from fantwin.pipeline.prediction.tray_twin import load_tray_twin
 from fantwin.pipeline.replay.offline.alarm_episodes import episodes
-from fantwin.pipeline.replay.offline.replay_input import open_replay_input
+from fantwin.pipeline.replay.offline.replay_input import ReplayInput, open_replay_input
 from fantwin.pipeline.replay.offline.rescoring import RescoredTray, rescore
 from fantwin.schemas.blocks import cut
 from fantwin.schemas.enums import FanState, InvalidReason
-from fantwin.schemas.messages import Alarm, Message, Score
-from fantwin.scoring.score_message import BAND_SIGMAS
+from fantwin.schemas.messages import Alarm, Message, Prediction, Score
+from fantwin.scoring.samples import NOT_ARRIVED, among, reading_missing_of
+from fantwin.scoring.score_message import BAND_SIGMAS, ScoreColumns, score_of
 
 LIMIT = 1.0
 """score at which an alarm is raised: scores are relative to their limit"""
@@ -26,13 +31,21 @@ _NEVER_NS = np.iinfo(np.int64).min
 
 @dataclass(frozen=True)
 class DecidedTray:
-    """The scores and alarms of a tray. speed_unit: of the recording."""
+    """The scores and alarms of a tray.
+
+    why: (samples, fans) of InvalidReason, why a measured speed cannot be compared with its prediction. A fan may have a
+    score nevertheless: by its torque balance, or because it stands. speed_unit, fan_names: of the recording.
+    left_out: what could not be used, for people.
+    """
 
     name: str
     fans: int
     scores: tuple[Score, ...]
+    why: Array
     alarms: tuple[Alarm, ...]
     speed_unit: str
+    fan_names: tuple[str, ...]
+    left_out: tuple[str, ...]
 
     def columns_of_samples(self, fans: Sequence[Fan], form: Form, *, decisions: bool) -> dict[str, Array]:
         """A row for each sample of a fan, (samples * fans,) each: all fans of a time, then the next time.
@@ -45,6 +58,7 @@ class DecidedTray:
 
         t_ns = of(lambda score: score.t_ns).astype(np.int64).reshape(-1)
         predicted, band = of(lambda score: score.predicted_speed_rad_s), np.sqrt(of(lambda score: score.band_variance))
+        is_missing = self.why == InvalidReason.NO_SPEED  # between two readings, the grid has one in the middle
         speeds = {
             "speed": of(lambda score: score.measured_speed_rad_s),
             "predicted": predicted,
@@ -52,15 +66,17 @@ class DecidedTray:
             "lower": predicted - band,
             "upper": predicted + band,
             "residual": of(lambda score: score.residual_rad_s),
-            "deviation": of(lambda score: score.deviation_rad_s),
-        }
-        reason = of(lambda score: score.invalid_reason)
+        } | ({"deviation": of(lambda score: score.deviation_rad_s)} if decisions else {})
+        for name in speeds.keys() & {"speed", "residual", "deviation"}:
+            speeds[name] = np.where(is_missing, np.nan, speeds[name])
+        is_known = np.isfinite(speeds["residual"])
+        reason = np.where((self.why == InvalidReason.NONE) & ~is_known, InvalidReason.WARMING_UP, self.why)
         columns = {
             "time": np.repeat(form.times(t_ns), len(fans)),
             "fan": np.tile(labels(fans), len(t_ns)),
             "command": of(lambda score: score.command).astype(np.float64),
             **{form.speed_column(name): form.in_unit(speed) for name, speed in speeds.items()},
-            "valid": of(lambda score: score.valid).astype(np.bool_),
+            "valid": reason == InvalidReason.NONE,
             "reason": _words(reason, InvalidReason, {InvalidReason.NONE: ""}),
         }
         if decisions:
@@ -91,7 +107,9 @@ class DecidedTray:
         found = episodes(self.alarms)
         cleared_ns = [_NEVER_NS if each.cleared_ns is None else each.cleared_ns for each in found]
         causes = np.empty(len(found), np.object_)
-        causes[:] = [{cause.cause: cause.probability for cause in each.causes} for each in found]
+        causes[:] = [
+            [{"cause": cause.cause, "probability": cause.probability} for cause in each.causes] for each in found
+        ]
         return {
             "fan": labels([fans[each.fan] for each in found]) if found else labels(fans)[:0],
             "raised": form.times(np.array([each.raised_ns for each in found], np.int64)),
@@ -115,35 +133,87 @@ def _words(values: Array, enum: type[InvalidReason] | type[FanState], others: Ma
     return known[values.astype(np.int64)]
 
 
-def decided(recording: Path, twin: Path, overrides: Sequence[str] = ()) -> list[DecidedTray]:
-    """The decisions on a recording with this twin; warns of what could not be used.
+class _Newest:
+    """The blocks of a tray, without the samples that a restarted stage repeats."""
+
+    def __init__(self) -> None:
+        self._t_ns = _NEVER_NS
+        self.blocks: list[Any] = []
+
+    def add(self, block: Prediction | Score) -> None:
+        new = block.t_ns > self._t_ns
+        if new.any():
+            self.blocks.append(block if new.all() else cut(block, int(np.argmax(new)), len(new)))
+            self._t_ns = max(int(block.t_ns[-1]), self._t_ns)
+
+
+def decided(recording: Path, twin: Path, overrides: Sequence[str], *, scores: bool) -> list[DecidedTray]:
+    """The decisions on a recording with this twin. scores: not only its prediction, which takes a tenth of the time.
 
     Raises:
         FantwinError: the recording or the twin cannot be used.
+
+    Warns:
+        FantwinWarning: a file is damaged.
     """
-    scores: dict[str, list[Score]] = {}
-    newest_ns: dict[str, int] = {}
+    found: dict[tuple[str, type[Message]], _Newest] = defaultdict(_Newest)
 
     def observe(tray: str, message: Message) -> None:
-        if isinstance(message, Score) and len(message.t_ns):
-            new = message.t_ns > newest_ns.get(tray, _NEVER_NS)
-            if new.all():
-                scores.setdefault(tray, []).append(message)
-            elif new.any():
-                first = int(np.argmax(new))
-                scores.setdefault(tray, []).append(cut(message, first, len(new)))
-            newest_ns[tray] = max(int(message.t_ns[-1]), newest_ns.get(tray, _NEVER_NS))
+        if isinstance(message, Score | Prediction) and len(message.t_ns):
+            found[tray, type(message)].add(message)
 
     with open_replay_input([recording], None, tuple(overrides), twin) as replay_input:
-        trays = rescore(replay_input, None, verify=False, observe=observe)
+        if scores:
+            trays = rescore(replay_input, None, verify=False, observe=observe)
+        else:
+            trays = [_predicted(replay_input, tray, twin, observe) for tray in replay_input.trays]
         fans = {tray.name: tray.fans for tray in replay_input.trays}
-        units = {tray.tray: replay_input.metadata.speed_unit(tray.tray) for tray in trays}
+        metadata = replay_input.metadata
         warn(replay_input.damage.values())
-    warn(line for tray in trays for line in _left_out(tray))
     return [
-        DecidedTray(each.tray, fans[each.tray], tuple(scores.get(each.tray, ())), tuple(each.alarms), units[each.tray])
+        DecidedTray(
+            name=each.tray,
+            fans=fans[each.tray],
+            scores=tuple(blocks := found[each.tray, Score].blocks),
+            why=_why(found[each.tray, Prediction].blocks, blocks, fans[each.tray]),
+            alarms=tuple(each.alarms),
+            speed_unit=metadata.speed_unit(each.tray),
+            fan_names=metadata.names(each.tray).names,
+            left_out=tuple(_left_out(each)),
+        )
         for each in trays
     ]
+
+
+def _predicted(
+    replay_input: ReplayInput, tray: TrayConfig, path: Path, observe: Callable[[str, Message], None]
+) -> RescoredTray:
+    """What a scorer would receive, as its message without evidence. path: of the twin."""
+    twin, plan = load_tray_twin(path, tray.fans), replay_input.read_plan(tray.name).plan
+    found = RescoredTray(tray.name, plan)
+    pipeline = replay_input.pipeline(tray.name, plan)
+    reads_balance, unseen_error = np.zeros(tray.fans, np.bool_), twin.unseen_error
+    for item in pipeline.predictions():
+        unseen_rad_s = np.nan_to_num(unseen_error.of(item)[0]) if unseen_error else 0.0
+        score = score_of(item, ScoreColumns.empty(*item.valid.shape), reads_balance, unseen_rad_s)
+        found.add(score, pipeline.longest_repeat)
+        observe(tray.name, item)
+        observe(tray.name, score)
+    found.counts, found.raw_missing = pipeline.counts, pipeline.raw_missing
+    return found
+
+
+def _why(predictions: Sequence[Prediction], scores: Sequence[Score], fans: int) -> Array:
+    """(samples, fans) why samples cannot be compared with their prediction, by it, at the times of the scores."""
+    if not scores:
+        return np.zeros((0, fans), np.uint8)
+    t_ns, reason, missing = (
+        np.concatenate([value(item) for item in predictions])
+        for value in (lambda item: item.t_ns, lambda item: item.invalid_reason, reading_missing_of)
+    )
+    rows = np.searchsorted(t_ns, np.concatenate([score.t_ns for score in scores]))
+    silent = among(reason, *NOT_ARRIVED)
+    return np.where(missing & ~silent, np.uint8(InvalidReason.NO_SPEED), reason)[rows]
 
 
 def _left_out(tray: RescoredTray) -> list[str]:

@@ -11,6 +11,7 @@ from fantwin.interface.decisions import labels
 from fantwin.interface.tables import NAME, Array, FanTable
 from fantwin.pipeline.errors import FantwinError
 from fantwin.pipeline.prediction.free_run import FreeRun
+from fantwin.pipeline.prediction.tray_integrator import HIGHEST_SPEED
 from fantwin.pipeline.prediction.twin_file import TwinFile
 from fantwin.pipeline.replay.resolve_config import rounded_rate_hz
 from fantwin.schemas.enums import InvalidReason
@@ -32,6 +33,10 @@ def free_run_columns(content: bytes, table: FanTable, initial_speed_rpm: Any) ->
     initial_rad_s = _of_each_fan(initial_speed_rpm, fans) * RAD_S_PER_UNIT["rpm"]
     twin = TwinFile.of_content(Path("the twin"), content, fans)
     card = twin.card
+    low, high = min(0.0, HIGHEST_SPEED * card.speed_range_rad_s[0]), HIGHEST_SPEED * card.top_speed_rad_s
+    if not ((initial_rad_s >= low) & (initial_rad_s <= high)).all():
+        low, high = (round(each / RAD_S_PER_UNIT["rpm"]) for each in (low, high))
+        raise FantwinError(f"initial_speed_rpm = {initial_speed_rpm!r}: the twin knows {low} to {high} rpm")
     if card.conditions:
         raise FantwinError(
             f"the twin needs {' and '.join(card.conditions.needed)}: predict a table with measured speeds"
@@ -68,7 +73,10 @@ def free_run_columns(content: bytes, table: FanTable, initial_speed_rpm: Any) ->
 
 
 def _of_each_fan(values: Any, fans: int) -> Array:
-    given = np.asarray(values, np.float64)
+    try:
+        given = np.asarray(values, np.float64)
+    except (TypeError, ValueError):
+        given = np.array(np.nan)
     if given.shape not in ((), (fans,)) or not np.isfinite(given).all():
         raise FantwinError(f"initial_speed_rpm must be a speed, or {fans} speeds, not {values!r}")
     return np.broadcast_to(given, (fans,))

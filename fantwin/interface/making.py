@@ -2,31 +2,42 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from itertools import count
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from fantwin.interface.columns import Columns
+from pydantic import InstanceOf
+
+from fantwin.interface.arguments import Count, Rate, Seed, check
+from fantwin.interface.columns import Columns, Fan
+from fantwin.interface.fan_matching import matched
 from fantwin.interface.tables import fan_table
 from fantwin.interface.twin import USUAL, Twin
-from fantwin.interface.words import in_python, warn
+from fantwin.interface.words import TEMPORARY, in_python, warn
 from fantwin.pipeline.cli.progress import training_progress
+from fantwin.pipeline.errors import FantwinError
 from fantwin.pipeline.learning.fitting import TrainingSettings, calibrated_on, fit_twin, with_calibration
 from fantwin.pipeline.learning.healthy_evidence import marked_running, outlier_warnings
 from fantwin.pipeline.learning.training_data import Part, read_held_out, read_training_data
 from fantwin.pipeline.recordings.raw_recordings import write_table
+from fantwin.pipeline.replay.offline.calibration_of_twin import require_enough
 from fantwin.pipeline.replay.offline.healthy_runs import HealthyPart, in_this_process
 from fantwin.pipeline.sources.tables.tachos import parse_tachos
+from fantwin.schemas.fan_names import FanNames
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
+    from pyarrow import Table
 
 
 def train(
-    tables: Any,
+    tables: DataFrame | Table | Mapping[str, Any] | Path | str | Sequence[Any],
     columns: Columns = USUAL,
     *,
-    validate: Any = None,
+    validate: DataFrame | Table | Mapping[str, Any] | Path | str | Sequence[Any] | None = None,
     tacho: str | Sequence[str] = (),
     name: str = "fan",
     model: str = "hybrid",
@@ -58,6 +69,10 @@ def train(
     Warns:
         FantwinWarning: of what the data do not show, of outliers, and of what was repaired in a table.
     """
+    for argument, value, kind in (("seed", seed, Seed), ("name", name, str), ("command_unit", command_unit, str)):
+        check(argument, value, kind)
+    for argument, value in (("iterations", iterations), ("networks", networks)):
+        check(argument, value, Count | None)
     settings = TrainingSettings(model, seed, "levenberg-marquardt", iterations, networks, command_unit)
     with _recordings(columns) as recording:
         healthy = [recording(table, tacho) for table in _each(tables)]
@@ -72,7 +87,12 @@ def train(
 
 
 def calibrate(
-    twin: Twin, tables: Any, columns: Columns = USUAL, *, false_alarms_per_day: float, extrapolate: bool = False
+    twin: Twin,
+    tables: DataFrame | Table | Mapping[str, Any] | Path | str | Sequence[Any],
+    columns: Columns = USUAL,
+    *,
+    false_alarms_per_day: float,
+    extrapolate: bool = False,
 ) -> Twin:
     """The same twin with the spread of its fans, and a declared rate of false alarms, in its card; as by
     `fantwin calibrate`.
@@ -91,8 +111,12 @@ def calibrate(
     Warns:
         FantwinWarning: of fans that were perhaps not healthy, and of what was repaired in a table.
     """
+    check("twin", twin, InstanceOf[Twin])
+    check("false_alarms_per_day", false_alarms_per_day, Rate)
     with _recordings(columns) as recording, twin.file() as file:
         healthy = [recording(table, twin) for table in _each(tables)]
+        if not extrapolate:
+            require_enough(healthy, false_alarms_per_day)
         marked = marked_running(healthy, [], None, in_this_process)
         warn(marked.lines)
         part = HealthyPart(file, left_out=marked.left_out)
@@ -105,8 +129,9 @@ def calibrate(
 def _recordings(columns: Columns) -> Iterator[Callable[[Any, Twin | str | Sequence[str]], Path]]:
     """Yields what makes a temporary recording of a table, and leaves a recording as it is. Its second argument: how the
     speeds of the table were measured, or the twin that the table must fit."""
-    with TemporaryDirectory(prefix="fantwin-") as folder, in_python(Path(folder)):
+    with TemporaryDirectory(prefix=TEMPORARY) as folder, in_python():
         numbers = count(1)
+        first: dict[str, tuple[Fan, ...]] = {}
 
         def recording(table: Any, measured: Twin | str | Sequence[str]) -> Path:
             if isinstance(table, Path | str):
@@ -115,13 +140,18 @@ def _recordings(columns: Columns) -> Iterator[Callable[[Any, Twin | str | Sequen
             if isinstance(measured, Twin):
                 given, tachos = measured.checked(given), measured.card.tacho
             else:
+                given = matched(given, first.setdefault("fans", given.fans), "the first table")
                 tachos = parse_tachos([measured] if isinstance(measured, str) else measured, len(given.fans))
             path = Path(folder) / f"table-{next(numbers)}.mcap"
-            write_table(given.samples, path, "table", tachos)
+            names = FanNames(tuple(fan if isinstance(fan, str) else "" for fan in given.fans))
+            write_table(given.samples, path, "table", tachos, names)
             return path
 
         yield recording
 
 
 def _each(tables: Any) -> Sequence[Any]:
-    return tables if isinstance(tables, Sequence) and not isinstance(tables, str) else [tables]
+    each = tables if isinstance(tables, Sequence) and not isinstance(tables, str) else [tables]
+    if not each:
+        raise FantwinError("no table was given: the list of tables is empty")
+    return each

@@ -10,7 +10,7 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,7 @@ from fantwin.schemas.messages import FURTHEST_T_NS
 from fantwin.schemas.units import NS_PER_S
 
 Array: TypeAlias = NDArray[Any]
+TimesAre: TypeAlias = Literal["seconds", "dates", "durations"]
 NAME = Path("the table")
 """name of a table in errors, where other data have a file"""
 _LEAST_SHARED = 0.5
@@ -38,22 +39,23 @@ class Form:
 
     Attributes:
         make: makes a table of columns by name, and of the time zone of dates, which come in UTC.
-        is_dated: times are dates, otherwise seconds.
+        times_are: seconds, dates or durations.
         zone: of dates; None: none was given.
         unit: of speeds.
     """
 
     make: Callable[[dict[str, Array], Any], Any]
-    is_dated: bool = False
+    times_are: TimesAre = "seconds"
     zone: Any = None
     unit: str = "rpm"
 
     def times(self, t_ns: Array) -> Array:
         """(n,) times in ns as those of the table; unknown where they are below the first possible one."""
         known = t_ns > -FURTHEST_T_NS
-        if self.is_dated:
-            return np.where(known, t_ns, _NOT_A_TIME).view("datetime64[ns]")
-        return np.where(known, t_ns / NS_PER_S, np.nan)
+        if self.times_are == "seconds":
+            return np.where(known, t_ns / NS_PER_S, np.nan)
+        kind = "datetime64[ns]" if self.times_are == "dates" else "timedelta64[ns]"
+        return np.where(known, t_ns, _NOT_A_TIME).view(kind)
 
     def speed_column(self, name: str) -> str:
         """The name of a column of speeds, with their unit at its end."""
@@ -96,9 +98,11 @@ def fan_table(table: Any, wanted: Columns, *, needs_speed: bool = True) -> FanTa
     Raises:
         FantwinError: it is no table, or a column is missing or cannot be used.
     """
+    if not isinstance(wanted, Columns):
+        raise FantwinError(f'columns must be fantwin.Columns, such as fantwin.Columns(command="NAME"), not {wanted!r}')
     columns, make = _columns_and_maker(table)
     found = find_columns(list(columns), wanted, needs_speed=needs_speed)
-    t_ns, known, is_dated, zone = _times(found.time, columns[found.time], found.ns_per_unit)
+    t_ns, known, times_are, zone = _times(found.time, columns[found.time], found.ns_per_unit)
     if not len(t_ns):
         raise FantwinError(f"{NAME} has no rows")
     of = (_long if found.fan else _wide)(found, columns, t_ns, known)
@@ -117,8 +121,11 @@ def fan_table(table: Any, wanted: Columns, *, needs_speed: bool = True) -> FanTa
     samples = table_of(NAME, chosen, named, of.t_ns, of.known, RAD_S_PER_TABLE_UNIT[unit], unit)
     if not found.speed:
         samples = replace(samples, repairs=replace(samples.repairs, speeds_missing=0))
-    warn(f"{NAME}: {note}" for note in samples.notes)
-    return FanTable(samples, of.fans, Form(make, is_dated, zone, unit))
+    lines = [f"{NAME}: {note}" for note in samples.notes]
+    if not found.fan and 2 * samples.repairs.repeated > samples.repairs.rows:
+        lines[-1] = f'{NAME}: most times repeat; of several fans name their column: fantwin.Columns(fan="NAME")'
+    warn(lines)
+    return FanTable(samples, of.fans, Form(make, times_are, zone, unit))
 
 
 def _wide(found: FoundColumns, columns: Mapping[str, Any], t_ns: Array, known: Array) -> _Samples:
@@ -126,18 +133,23 @@ def _wide(found: FoundColumns, columns: Mapping[str, Any], t_ns: Array, known: A
     values = {
         (what, fan): _numbers(name, columns[name]) for what, of in by_fan.items() for fan, name in of.items() if name
     }
-    return _Samples(t_ns, known, tuple(found.speed or found.command), values)
+    return _Samples(t_ns, known, _in_order(tuple(found.speed or found.command)), values)
+
+
+def _in_order(fans: tuple[Fan, ...]) -> tuple[Fan, ...]:
+    """Numbers rise, whatever the order of their columns or rows; names stay as they are."""
+    return tuple(sorted(fans)) if all(isinstance(fan, int) for fan in fans) else fans
 
 
 def _long(found: FoundColumns, columns: Mapping[str, Any], t_ns: Array, known: Array) -> _Samples:
     of_rows = _labels(found.fan, columns[found.fan])
-    fans = tuple(dict.fromkeys(of_rows.tolist()))
-    if all(isinstance(fan, int) for fan in fans):
-        fans = tuple(sorted(fans))
+    fans = _in_order(tuple(dict.fromkeys(of_rows.tolist())))
     rows = [np.flatnonzero(of_rows == fan) for fan in fans]
     shared, is_known = t_ns[rows[0]], known[rows[0]]
     places: list[Any] = [slice(None)] * len(fans)
     if not all(np.array_equal(t_ns[each], shared) for each in rows):
+        if not known.all():
+            warn([f"{NAME}: {np.count_nonzero(~known)} rows dropped: their time cannot be read"])
         shared = np.unique(t_ns[known])
         is_known = np.ones(len(shared), np.bool_)
         rows = [each[known[each]] for each in rows]
@@ -202,7 +214,7 @@ def _columns_and_maker(table: Any) -> tuple[dict[str, Any], Callable[[dict[str, 
 def data_frame(columns: dict[str, Array], zone: Any) -> Any:
     """A DataFrame. zone: of its dates, which come in UTC."""
     pandas = sys.modules["pandas"]
-    frame = pandas.DataFrame(columns)
+    frame = pandas.DataFrame({name: _typed(values) for name, values in columns.items()})
     for name in columns if zone is not None else ():
         if columns[name].dtype.kind == "M":
             frame[name] = frame[name].dt.tz_localize("UTC").dt.tz_convert(zone)
@@ -215,20 +227,22 @@ def _arrow_table(columns: dict[str, Array], zone: Any) -> Any:
     def column(values: Array) -> Any:
         if values.dtype.kind == "M":
             return pyarrow.array(values, pyarrow.timestamp("ns", tz=zone))
-        if values.dtype == np.object_ and any(isinstance(each, dict) for each in values):
-            shares = [list(each.items()) for each in values]
-            return pyarrow.array(shares, pyarrow.map_(pyarrow.string(), pyarrow.float64()))
-        return pyarrow.array(values)
+        return pyarrow.array(_typed(values))
 
     return pyarrow.table({name: column(values) for name, values in columns.items()})
 
 
-def _times(name: str, column: Any, ns_per_unit: int) -> tuple[Array, Array, bool, Any]:
-    """(n,) times in ns, whether they are known, whether they are dates, and of which time zone."""
+def _typed(values: Array) -> Array:
+    """A column of no values that would be of text."""
+    return values.astype(np.str_) if values.dtype == np.object_ and not len(values) else values
+
+
+def _times(name: str, column: Any, ns_per_unit: int) -> tuple[Array, Array, TimesAre, Any]:
+    """(n,) times in ns, whether they are known, what they are, and of which time zone."""
     values = _array(column)
-    if values.dtype.kind == "M":
-        t_ns = values.astype("datetime64[ns]").astype(np.int64)
-        return t_ns, ~np.isnat(values), True, _zone(column)
+    if values.dtype.kind in "Mm":
+        t_ns = values.astype(f"{values.dtype.kind}8[ns]").astype(np.int64)
+        return t_ns, ~np.isnat(values), "dates" if values.dtype.kind == "M" else "durations", _zone(column)
     if values.dtype.kind in "iu":
         known = np.ones(len(values), np.bool_)
         is_far = np.abs(values.astype(np.float64)) * ns_per_unit >= FURTHEST_T_NS
@@ -243,7 +257,7 @@ def _times(name: str, column: Any, ns_per_unit: int) -> tuple[Array, Array, bool
             f'{NAME}: {values[is_far][0]} in {name!r} is beyond the year 2116: give its unit, fantwin.Columns(time="'
             f'{name}:ms"), us or ns'
         )
-    return t_ns, known, False, None
+    return t_ns, known, "seconds", None
 
 
 def _zone(column: Any) -> Any:
@@ -272,12 +286,20 @@ def _numbers(name: str, column: Any) -> Array:
             raise ValueError
         numbers = values.astype(np.float64)
     except (TypeError, ValueError) as error:
-        example = next((each for each in values.tolist() if not isinstance(each, int | float)), values.dtype)
+        example = next(filter(_is_no_number, values.tolist()), values.dtype)
         raise FantwinError(
             f"{NAME}: column {name!r} must hold numbers, not such as {str(example)!r}; text of dates becomes dates by "
             "pandas.to_datetime"
         ) from error
     return np.where(np.isfinite(numbers), numbers, np.nan)
+
+
+def _is_no_number(cell: Any) -> bool:
+    try:
+        float(cell)
+    except (TypeError, ValueError):
+        return True
+    return False
 
 
 def _array(column: Any) -> Array:

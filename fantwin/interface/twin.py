@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -10,25 +10,30 @@ from typing import TYPE_CHECKING, Any, TypeVar, overload
 
 import numpy as np
 
-from fantwin.interface.columns import Columns
-from fantwin.interface.suspicions import refuse_commands, refuse_high_speeds, refuse_times
+from fantwin.interface.arguments import Rate, check
+from fantwin.interface.columns import Columns, Fan
+from fantwin.interface.fan_matching import matched
+from fantwin.interface.suspicions import refuse_commands, refuse_high_speeds, suspect_times
 from fantwin.interface.tables import NAME, FanTable, fan_table
-from fantwin.interface.words import in_python, warn
+from fantwin.interface.words import TEMPORARY, in_python, warn
 from fantwin.pipeline.errors import FantwinError
 from fantwin.pipeline.extras import require_torch
 from fantwin.pipeline.files import write_whole
 from fantwin.pipeline.prediction.tray_twin import read_file, tray_twin
 from fantwin.schemas.twin_card import TwinCard
+from fantwin.scoring.calibration.calibration import Calibration
 
 if TYPE_CHECKING:
+    from pandas import DataFrame
+    from pyarrow import Table
+
     from fantwin.interface.answers import Answer
+    from fantwin.interface.decisions import DecidedTray
     from fantwin.twin.fitting.torch_twin import TorchTwin
 
 AnyTable = TypeVar("AnyTable")
 USUAL = Columns()
 DEMO = Path(__file__).parents[1] / "pipeline" / "demo" / "twin.onnx"
-HIGHEST_RATE = 8640
-"""false alarms of a fan a day: one each ten seconds"""
 POPULATION = "the priors of a population of fans, 0.03 false alarms per fan and day"
 
 
@@ -52,10 +57,12 @@ class Twin:
         """Use `fantwin.load`. content: of an ONNX file."""
         self.content = content
         self._known = tray_twin(Path("the twin"), content, None)
+        self._latest: dict[str, DecidedTray] = {}
 
     @property
     def card(self) -> TwinCard:
-        """All that is known of the twin: data, figures, parameters, ranges, band; speeds in rad/s."""
+        """All that is known of the twin: data, figures, parameters, ranges, band; speeds in rad/s. `print` shows the
+        most important."""
         return self._known.card
 
     @property
@@ -65,6 +72,8 @@ class Twin:
 
     def __repr__(self) -> str:
         calibrated = "calibrated" if self.card.calibration else "not calibrated"
+        if self.card.calibration and Calibration.model_validate(self.card.calibration).is_target:
+            calibrated += ", its rate of false alarms is only a target"
         fans = f"{self.fans} fan{'s' * (self.fans != 1)}"
         return f"Twin({self.card.name!r}, {self.card.kind}, {fans}, {self.card.rate_hz:.3g} Hz, {calibrated})"
 
@@ -82,17 +91,23 @@ class Twin:
     @overload
     def predict(self, table: AnyTable, columns: Columns = ..., *, initial_speed_rpm: Any = ...) -> AnyTable: ...
 
-    def predict(self, table: Any, columns: Columns = USUAL, *, initial_speed_rpm: Any = None) -> Any:
+    def predict(
+        self,
+        table: DataFrame | Table | Mapping[str, Any] | Path | str,
+        columns: Columns = USUAL,
+        *,
+        initial_speed_rpm: Any = None,
+    ) -> Any:
         """The speeds that healthy fans would have by these commands, and the band in which they are expected.
 
         Columns of the result: `time`, `fan`, `command`, and, with the unit at their ends, `speed` (measured),
         `predicted`, `sigma`, `lower` and `upper` (the band of two sigma, wider by what a tacho cannot resolve),
-        `residual` (measured minus predicted), `deviation` (what it has more than is usual for this fan); then `valid`
-        and `reason` (why not; empty if valid). The free run starts from the first measured speeds, and is never
-        corrected by others. What is not known is NaN.
+        `residual` (measured minus predicted); then `valid` (the residual is known, and says something) and `reason`
+        (why not; empty if valid). The free run starts from the first measured speeds, and is never corrected by others.
+        What is not known is NaN. `score` takes ten times as long, and has these columns, too.
 
         initial_speed_rpm: in place of measured speeds, for a table of commands alone: one for all fans or one for each,
-        at its first time. The result is in rpm, without measured speed, residual and deviation.
+        at its first time. The result is in rpm, without measured speed and residual.
 
         Raises:
             FantwinError: the table does not fit the twin.
@@ -108,12 +123,12 @@ class Twin:
             at 0.03 s: 3059 rpm
         """
         if initial_speed_rpm is None:
-            return self._answer(table, columns, "prediction", ())
+            return self._answer(table, columns, "prediction")
         from fantwin.interface.free_run import free_run_columns  # noqa: PLC0415  `load` needs none of the pipeline
 
         with in_python():
             given = fan_table(table, columns, needs_speed=False)
-            given = self.checked(given if len(given.fans) > 1 else given.of_each(self.card.fan_numbers))
+            given = self.checked(given if len(given.fans) > 1 else given.of_each(self._fan_labels))
             return given.form.make(free_run_columns(self.content, given, initial_speed_rpm), given.form.zone)
 
     @overload
@@ -123,12 +138,22 @@ class Twin:
         self, table: AnyTable, columns: Columns = ..., *, false_alarms_per_day: float | None = ...
     ) -> AnyTable: ...
 
-    def score(self, table: Any, columns: Columns = USUAL, *, false_alarms_per_day: float | None = None) -> Any:
+    def score(
+        self,
+        table: DataFrame | Table | Mapping[str, Any] | Path | str,
+        columns: Columns = USUAL,
+        *,
+        false_alarms_per_day: float | None = None,
+    ) -> Any:
         """What a scorer decides on each sample: the columns of `predict`, and
 
-        `score` (evidence for a fault, relative to its limit: an alarm is raised at 1), `limit` (1), `state` (normal,
-        suspect, alarm, returning, stopped, starting, unknown), `alarm` (whether the fan has one), `severity` (warning,
-        alarm; empty without), `cause` (the most probable one, as in docs/explanation/diagnosis.md) and `probability`.
+        `deviation` (of the residual, what is unusual for this fan), `score` (evidence for a fault, relative to its
+        limit: an alarm is raised at 1), `limit` (1), `state` (normal, suspect, alarm, returning, stopped, starting,
+        unknown), `alarm` (whether the fan has one), `severity` (warning, alarm; empty without), `cause` (the most
+        probable one, as in docs/explanation/diagnosis.md) and `probability`.
+
+        A scorer learns at the beginning of a table what is usual for each fan: a difference within the twin's declared
+        error (`sigma` of its card) is taken for it. A fault that is already there and no larger is not found.
 
         false_alarms_per_day: of each fan, in place of the calibrated rate.
 
@@ -138,7 +163,7 @@ class Twin:
         Warns:
             FantwinWarning: as of `predict`, and of a twin that is not calibrated.
         """
-        return self._answer(table, columns, "scores", _overrides(false_alarms_per_day))
+        return self._answer(table, columns, "scores", false_alarms_per_day)
 
     @overload
     def alarms(self, table: Path | str, columns: Columns = ..., *, false_alarms_per_day: float | None = ...) -> Any: ...
@@ -147,14 +172,21 @@ class Twin:
         self, table: AnyTable, columns: Columns = ..., *, false_alarms_per_day: float | None = ...
     ) -> AnyTable: ...
 
-    def alarms(self, table: Any, columns: Columns = USUAL, *, false_alarms_per_day: float | None = None) -> Any:
+    def alarms(
+        self,
+        table: DataFrame | Table | Mapping[str, Any] | Path | str,
+        columns: Columns = USUAL,
+        *,
+        false_alarms_per_day: float | None = None,
+    ) -> Any:
         """The alarms that `score` finds, a row for each.
 
         Columns: `fan`, `raised`, `cleared` (unknown if it lasts to the end), `onset` (when the fault probably began),
-        `severity` (the highest), `cause` and `probability` of the last diagnosis, `causes` (all of it: the probability
-        by cause). Arguments, errors and warnings are those of `score`.
+        `severity` (the highest), `cause` and `probability` of the last diagnosis, `causes` (all of it: a list of
+        records with `cause` and `probability`). Arguments, errors and warnings are those of `score`, and so is what the
+        beginning of a table means. After `score` of the same table it takes no time.
         """
-        return self._answer(table, columns, "alarms", _overrides(false_alarms_per_day))
+        return self._answer(table, columns, "alarms", false_alarms_per_day)
 
     def as_torch(self) -> TorchTwin:
         """The twin as a differentiable module of PyTorch, for control and for fits of one's own.
@@ -168,34 +200,38 @@ class Twin:
         with in_python():
             return torch_twin(self.content, self.card)
 
-    def _answer(self, table: Any, columns: Columns, answer: Answer, overrides: Sequence[str]) -> Any:
+    def _answer(self, table: Any, columns: Columns, answer: Answer, rate: float | None = None) -> Any:
+        check("false_alarms_per_day", rate, Rate | None)
+        overrides = () if rate is None else (f"scorer.false_alarms_per_day={rate}",)
         if not self.card.calibration and answer != "prediction":
             warn([f"{self.card.name!r} is not calibrated: its alarms are by {POPULATION}; see fantwin.calibrate"])
         from fantwin.interface import answers  # noqa: PLC0415  `load` needs none of the pipeline
 
-        with self.file() as file, in_python(file.parent):
+        with self.file() as file, in_python():
             if isinstance(table, Path | str):
                 return answers.of_recording(Path(table), file, overrides, answer)
             given = self.checked(fan_table(table, columns))
-            return answers.of_table(given, self.card.tacho, file, overrides, answer)
+            return answers.of_table(given, file, overrides, answer, self._latest)
 
     @contextmanager
     def file(self) -> Iterator[Path]:
         """A temporary file of the twin, in a folder of its own."""
-        with TemporaryDirectory(prefix="fantwin-") as folder:
+        with TemporaryDirectory(prefix=TEMPORARY) as folder:
             path = Path(folder) / "twin.onnx"
             path.write_bytes(self.content)
             yield path
 
     def checked(self, given: FanTable) -> FanTable:
-        """The same samples. Raises FantwinError where they cannot be of the fans of this twin."""
+        """The same samples, in the order of the fans of this twin. Raises FantwinError where they cannot be of them."""
         if self.fans > 1 and len(given.fans) != self.fans:
             raise FantwinError(
                 f"{NAME} has {len(given.fans)} fan(s), and the twin is of {self.fans}: give a "
                 "table of all of them, or use a twin of one fan"
             )
+        if self.fans > 1:
+            given = matched(given, self._fan_labels, "the twin")
         if np.isfinite(given.samples.speed_rad_s).any():  # commands alone may be as rare as they like
-            refuse_times(given.samples, self.card)
+            suspect_times(given.samples, self._known)
         refuse_commands(given.samples, self.card)
         refuse_high_speeds(given.samples, self.card)
         needed = self.card.conditions.needed if self.card.conditions else ()
@@ -203,11 +239,11 @@ class Twin:
             raise FantwinError(f"{NAME} has no column {lacking[0]!r}, which the twin needs")
         return given
 
-
-def _overrides(false_alarms_per_day: float | None) -> tuple[str, ...]:
-    if false_alarms_per_day is not None and not 0.0 < false_alarms_per_day <= HIGHEST_RATE:
-        raise FantwinError(f"false_alarms_per_day = {false_alarms_per_day}: give a rate above 0, up to {HIGHEST_RATE}")
-    return () if false_alarms_per_day is None else (f"scorer.false_alarms_per_day={false_alarms_per_day}",)
+    @property
+    def _fan_labels(self) -> tuple[Fan, ...]:
+        """Names of the fans where all have one of their own, else their numbers."""
+        names = self.card.training.fan_names
+        return names if len({*names} - {""}) == self.fans else self.card.fan_numbers
 
 
 def load(path: Path | str | None = None) -> Twin:

@@ -112,7 +112,8 @@ def test_what_is_repaired_or_left_out_is_said_at_the_line_of_the_caller(twin, wi
     (line,) = said
     assert line.category is fantwin.FantwinWarning and words in str(line.message) and line.filename == __file__
     assert list(answer["valid"] == (answer["reason"] == "")) == [True] * len(answer)
-    assert answer["score"].notna().equals(answer["valid"])
+    known = answer[["speed_rpm", "predicted_rpm", "residual_rpm", "score"]].notna().all(axis=1)
+    assert known[answer["valid"]].all()
 
 
 def test_missing_values_of_each_library_are_missing_speeds(twin, wide):
@@ -137,7 +138,22 @@ def test_files_and_arguments_that_cannot_be_used_are_refused(twin, wide, tmp_pat
         "not an ONNX file": lambda: fantwin.load(tmp_path / "text.onnx"),
         "not a recording (MCAP)": lambda: twin.score(tmp_path / "text.onnx"),
         "cannot be written": lambda: twin.save("/dev/null/fan.onnx"),
-        "give a rate above 0": lambda: twin.score(wide, false_alarms_per_day=0.0),
+        "false_alarms_per_day = 0.0 cannot be used: input should be greater than 0": lambda: twin.score(
+            wide, false_alarms_per_day=0.0
+        ),
+        "false_alarms_per_day = '1' cannot be used: input should be a valid number": lambda: twin.alarms(
+            wide, false_alarms_per_day="1"
+        ),
+        "false_alarms_per_day = -1 cannot be used": lambda: fantwin.calibrate(twin, wide, false_alarms_per_day=-1),
+        "networks = 0 cannot be used: input should be greater": lambda: fantwin.train(wide, networks=0),
+        "the list of tables is empty": lambda: fantwin.train([]),
+        "columns must be fantwin.Columns": lambda: twin.predict(wide, {"command": "pwm"}),
+        "must be a speed, or 8 speeds, not 'fast'": lambda: twin.predict(
+            {"t": [0, 1], "command": [1, 1]}, initial_speed_rpm="fast"
+        ),
+        "initial_speed_rpm = 1000000.0: the twin knows 0 to": lambda: twin.predict(
+            {"t": [0, 1], "command": [1, 1]}, initial_speed_rpm=1e6
+        ),
         "leave out initial_speed_rpm": lambda: twin.predict(wide, initial_speed_rpm=1.0),
         "initial_speed_rpm must be a speed, or 8": lambda: twin.predict(
             {"t": [0, 1], "command": [1, 1]}, initial_speed_rpm=[1]

@@ -76,6 +76,7 @@ def test_each_extra_has_the_packages_of_its_modules_and_all_has_every_extra():
 def test_every_package_that_is_imported_is_required_and_every_required_one_is_imported():
     found = imported()
     assert found.pop("torch") == {"twin/fitting/torch_reference.py", "twin/fitting/torch_twin.py"}
+    assert found.pop("pandas") == {"fantwin/interface/making.py", "fantwin/interface/twin.py"}, "for types alone"
     required = {module for module in found if PARTS.get(module, module) not in OPTIONAL}
     assert packages_of(required) == names(PROJECT["dependencies"])
 

@@ -9,13 +9,15 @@ import numpy as np
 import torch
 
 from fantwin.schemas.twin_card import TwinCard
+from fantwin.twin.errors import TwinError
 from fantwin.twin.export.onnx_twin import stored_ode
 from fantwin.twin.fitting.torch_reference import torch_acceleration, torch_free_run
 from fantwin.twin.models.drive import SMALLEST_STEP_S, Drive, drive_settings
 from fantwin.twin.models.fan_ode import FanOde
 from fantwin.twin.models.physics import LAG
-from fantwin.twin.runs import Array
 
+FASTEST = 1.5
+"""highest initial speed, relative to that of the training data"""
 MOST_STEPS = 1000
 """largest number of steps in a period, as in a running site (pipeline.prediction.free_run)"""
 
@@ -35,10 +37,11 @@ class TorchTwin(torch.nn.Module):
     weights: torch.nn.Parameter | None
     _trained: torch.Tensor
 
-    def __init__(self, model: FanOde, parameters: Array, rate_hz: float) -> None:
-        """Use `Twin.as_torch`. parameters: (fans, 4), behind a drive (fans, 7). rate_hz: of the training data."""
+    def __init__(self, model: FanOde, card: TwinCard) -> None:
+        """Use `Twin.as_torch`. card: of the twin; its parameters are (fans, 4), behind a drive (fans, 7)."""
         super().__init__()
-        self._model, self._rate_hz = model, rate_hz
+        parameters = np.array(card.parameters, np.float64)
+        self._model, self._rate_hz, self._top_speed_rad_s = model, card.rate_hz, card.top_speed_rad_s
         self._lag_s, self._settings = parameters[:, LAG], drive_settings(parameters)
         trained = torch.from_numpy(parameters[:, :LAG].copy())
         self.register_buffer("_trained", trained)
@@ -58,7 +61,11 @@ class TorchTwin(torch.nn.Module):
         initial_speed: (fans,), rad/s, of fans that have run for long at the first command. commands: (n, fans), each
         held for period_s. Of a twin of one fan there may be any number of fans. One step of Runge-Kutta takes as long
         as in training, or the period if that is shorter.
+
+        Raises:
+            TwinError: a shape, or the initial speed, cannot be right.
         """
+        self._require_possible(initial_speed, commands, period_s)
         steps = max(1, round(min(period_s * self._rate_hz, MOST_STEPS)))
         step_s = period_s / steps
         held = commands.repeat_interleave(steps, dim=0)
@@ -66,6 +73,22 @@ class TorchTwin(torch.nn.Module):
         each_s = torch.full((len(held),), step_s, dtype=commands.dtype)
         speeds = torch_free_run(self._model, self._theta, self._of_fans, initial_speed, acting, each_s)
         return speeds[::steps]
+
+    def _require_possible(self, initial_speed: torch.Tensor, commands: torch.Tensor, period_s: float) -> None:
+        fans, known = commands.shape[-1] if commands.ndim else 0, len(self._trained)
+        number = known if known > 1 else fans
+        if commands.ndim != 2 or fans != number or not len(commands):
+            raise TwinError(f"commands must be (n, {known if known > 1 else 'fans'}), not {tuple(commands.shape)}")
+        if not isinstance(initial_speed, torch.Tensor) or initial_speed.shape != (fans,):
+            shape = tuple(initial_speed.shape) if isinstance(initial_speed, torch.Tensor) else f"{initial_speed!r}"
+            raise TwinError(f"initial_speed must be a tensor ({fans},), a speed for each fan, not {shape}")
+        if not (initial_speed.abs() <= FASTEST * self._top_speed_rad_s).all():
+            raise TwinError(
+                f"initial_speed is {initial_speed.detach().abs().max():.4g}, and the twin knows speeds up to "
+                f"{self._top_speed_rad_s:.4g} rad/s: convert it to rad/s"
+            )
+        if not (commands.isfinite().all() and 0.0 < period_s < np.inf):
+            raise TwinError(f"commands must be finite, and period_s a time in s, not {period_s!r}")
 
     @property
     def _theta(self) -> torch.Tensor:
@@ -112,4 +135,4 @@ def torch_twin(content: bytes, card: TwinCard) -> TorchTwin:
         TwinError: the twin is not continuous in time.
     """
     model = stored_ode(Path("the twin"), content, card)
-    return TorchTwin(model, np.array(card.parameters, np.float64), card.rate_hz)
+    return TorchTwin(model, card)

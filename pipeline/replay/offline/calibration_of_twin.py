@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +11,11 @@ from pydantic import ValidationError
 
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.prediction.tray_twin import TrayTwin
+from fantwin.pipeline.recordings.contents import contents_of
+from fantwin.pipeline.recordings.reading import read_metadata
 from fantwin.pipeline.replay.offline.healthy_runs import DecidedRun, HealthyRuns, LearnedRun, Limit
+from fantwin.pipeline.replay.resolve_config import first_raw
+from fantwin.schemas.units import NS_PER_S
 from fantwin.scoring.calibration.calibration import (
     HOURS_PER_DAY,
     Calibration,
@@ -87,6 +92,20 @@ def calibrated(
         interval_95=daily_interval(found, fan_hours),
     )
     return CalibratedTwin(calibration, learned, by_theory)
+
+
+def require_enough(recordings: Sequence[Path], per_day: float) -> None:
+    """Raise UserError, before the work, for recordings that cannot show a rate even if all of them counts."""
+    fan_hours = math.fsum(map(_longest_fan_hours, recordings))
+    if not supports(fan_hours, per_day):
+        raise UserError(too_little(fan_hours, per_day))
+
+
+def _longest_fan_hours(recording: Path) -> float:
+    found, first = contents_of(recording), first_raw([recording], read_metadata(recording))
+    return (
+        sum(raws[0].fans for raws in first.values()) * ((found.last_ns or 0) - (found.first_ns or 0)) / NS_PER_S / 3600
+    )
 
 
 def _raised(runs: HealthyRuns, limit: Limit, most: int) -> tuple[Limit, list[DecidedRun]]:
