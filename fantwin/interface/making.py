@@ -17,7 +17,7 @@ from fantwin.interface.fan_matching import matched
 from fantwin.interface.tables import fan_table
 from fantwin.interface.twin import USUAL, Twin
 from fantwin.interface.words import TEMPORARY, in_python, warn
-from fantwin.pipeline.cli.progress import training_progress
+from fantwin.pipeline.cli.progress import Reporter, training_progress
 from fantwin.pipeline.errors import FantwinError
 from fantwin.pipeline.learning.fitting import TrainingSettings, calibrated_on, fit_twin, with_calibration
 from fantwin.pipeline.learning.healthy_evidence import marked_running, outlier_warnings
@@ -95,7 +95,7 @@ def calibrate(
     extrapolate: bool = False,
 ) -> Twin:
     """The same twin with the spread of its fans, and a declared rate of false alarms, in its card; as by
-    `fantwin calibrate`.
+    `fantwin calibrate`. A terminal or a notebook with ipywidgets shows a bar meanwhile.
 
     Args:
         twin: not changed.
@@ -120,7 +120,10 @@ def calibrate(
         marked = marked_running(healthy, [], None, in_this_process)
         warn(marked.lines)
         part = HealthyPart(file, left_out=marked.left_out)
-        found = calibrated_on(healthy, part, false_alarms_per_day, in_this_process, extrapolate=extrapolate)
+        with Reporter(only_bar=True) as reporter:
+            reporter.show("calibrating")
+            how = {"extrapolate": extrapolate, "progress": reporter.show}
+            found = calibrated_on(healthy, part, false_alarms_per_day, in_this_process, **how)
         warn(outlier_warnings(found))
         return Twin(with_calibration(file, found.calibration))
 

@@ -15,6 +15,7 @@ TEMPORARY = "fantwin-python-"
 """beginning of the names of temporary folders, which no message shows"""
 _HERE = str(Path(__file__).parent)
 _OPTION = re.compile(r"--([a-z][a-z-]*)")
+_COMMAND = re.compile(r"\bfantwin (train|calibrate)\b")
 _TEMPORARY = re.compile(rf"\S*{TEMPORARY}[^/\s]+/(?:table-(\d+)\.mcap)?")
 _TACHO = re.compile(r'`tacho = \{ kind = "(\w+)"(?:, )?(.*?) \}` in \[\[tray\]\]')
 
@@ -50,4 +51,5 @@ def _of_python(line: str) -> str:
     """A line of the pipeline without options of commands, keys of a configuration and temporary files."""
     line = _TEMPORARY.sub(lambda found: f"table {found[1]}" if found[1] else "", line)
     line = _TACHO.sub(lambda found: f'`tacho="{found[1]}:{found[2].replace(" ", "")}"`', line)
+    line = _COMMAND.sub(r"fantwin.\1", line.replace("; correct [[tray]] twin", ""))
     return _OPTION.sub(lambda found: f"`{found[1].replace('-', '_')}`", line)

@@ -21,6 +21,7 @@ from fantwin.pipeline.recordings.reading import RecordingError, RecordingMetadat
 from fantwin.pipeline.timebase.grid_timing import GAP_PERIODS
 from fantwin.schemas.codec import CodecError
 from fantwin.schemas.envelope import Envelope
+from fantwin.schemas.fan_names import is_fan_name
 from fantwin.schemas.messages import Raw
 from fantwin.schemas.tacho import INSTANTANEOUS, Tacho
 from fantwin.schemas.units import NS_PER_S
@@ -79,7 +80,10 @@ def default_config(
     )
     for tray, messages in first.items():
         unit = metadata.speed_unit(tray) if metadata.speed_unit(tray) in ("rad/s", "rpm") else "rad/s"
-        text += f'\n[[tray]]\nname = {json.dumps(tray)}\nfans = {messages[0].fans}\nspeed_unit = "{unit}"\n'
+        names = metadata.names(tray).names
+        is_named = len({*names}) == messages[0].fans and all(map(is_fan_name, names))
+        fans = json.dumps(names, ensure_ascii=False) if is_named else messages[0].fans
+        text += f'\n[[tray]]\nname = {json.dumps(tray)}\nfans = {fans}\nspeed_unit = "{unit}"\n'
         if (tacho := metadata.tacho(tray, messages[0].tachos)) != INSTANTANEOUS:
             text += f"tacho = [{', '.join(_toml_table(its) for its in tacho)}]\n"
     return parse_config(text, path, overrides, stages)

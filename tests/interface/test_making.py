@@ -90,9 +90,10 @@ def test_what_data_do_not_show_is_said_and_what_is_too_little_is_refused(twin):
         fantwin.train(table_of(1, 20.0), tacho="counts")
 
 
-def test_training_shows_a_bar_on_a_terminal_and_nothing_in_a_pipe(monkeypatch, capsys):
+def test_training_and_calibration_show_a_bar_on_a_terminal_and_nothing_in_a_pipe(twin, monkeypatch, capsys):
     def shown() -> str:
         fantwin.train(table_of(1, 4.0), model="physical")
+        fantwin.calibrate(twin, table_of(4, 10.0), false_alarms_per_day=8, extrapolate=True)
         return capsys.readouterr().err
 
     with warnings.catch_warnings():
@@ -100,4 +101,4 @@ def test_training_shows_a_bar_on_a_terminal_and_nothing_in_a_pipe(monkeypatch, c
         assert shown() == ""
         monkeypatch.setenv("FORCE_COLOR", "1")  # what rich takes for a terminal
         monkeypatch.setenv("TERM", "xterm")
-        assert "identification" in shown()
+        assert "identification" in (bars := shown()) and "calibrating" in bars

@@ -135,7 +135,7 @@ def test_files_and_arguments_that_cannot_be_used_are_refused(twin, wide, tmp_pat
     (tmp_path / "text.onnx").write_text("no twin")
     attempts = {
         "there is no such file": lambda: fantwin.load(tmp_path / "none.onnx"),
-        "not an ONNX file": lambda: fantwin.load(tmp_path / "text.onnx"),
+        "not an ONNX file; make a twin: fantwin.train": lambda: fantwin.load(tmp_path / "text.onnx"),
         "not a recording (MCAP)": lambda: twin.score(tmp_path / "text.onnx"),
         "cannot be written": lambda: twin.save("/dev/null/fan.onnx"),
         "false_alarms_per_day = 0.0 cannot be used: input should be greater than 0": lambda: twin.score(

@@ -213,7 +213,10 @@ def test_too_short_tables_are_refused_before_the_work_and_a_target_is_called_one
     with pytest.raises(fantwin.FantwinError, match="0.099 fan-hours of healthy running cannot show 1 false alarm"):
         fantwin.calibrate(twin, table, COLUMNS, false_alarms_per_day=1)
     monkeypatch.undo()
-    target = quiet(lambda: fantwin.calibrate(twin, table, COLUMNS, false_alarms_per_day=8, extrapolate=True))[0]
+    slow = table.assign(rpm=table["rpm"].where(table["fan"] != "rear", table["rpm"] * 0.9))
+    both = partial(fantwin.calibrate, twin, [table, slow], COLUMNS, false_alarms_per_day=8, extrapolate=True)
+    target, said = quiet(both)
+    assert any(line.startswith("table 2: table rear (fan 2) is 10 % slower than its twin") for line in said), said
     assert repr(target).endswith("1 Hz, calibrated, its rate of false alarms is only a target)")
 
 
