@@ -86,7 +86,7 @@ def fit_twin(
             progress=progress or unreported,
         )
     except TwinError as error:
-        raise TwinError(training_data.in_its_words(str(error))) from error
+        raise TwinError(training_data.with_fan_numbers([str(error)])[-1]) from error
 
 
 MOST_KEPT_BYTES = 1 << 30

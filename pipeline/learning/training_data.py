@@ -70,17 +70,13 @@ class TrainingData:
         return [self.names.label(fan) for fan in self.fans]
 
     def with_fan_numbers(self, warnings: Sequence[str]) -> list[str]:
-        """The outlier warnings, then those of the model maker in the words of the recordings."""
-        return [*self.outliers, *map(self.in_its_words, warnings)]
-
-    def in_its_words(self, line: str) -> str:
-        """A line of the model maker with its column number replaced by the fan of the recordings, and with its speeds
-        in their unit, too."""
+        """The outlier warnings, then those of the model maker with its column numbers replaced by the fans of the
+        recordings, and with its speeds in their unit, too."""
 
         def fan_of(found: re.Match[str]) -> str:
             return f"{self.names.label(self.fans[int(found[1])])}:"
 
-        return self._with_unit(re.sub(r"^fan (\d+):", fan_of, line))
+        return [*self.outliers, *(self._with_unit(re.sub(r"^fan (\d+):", fan_of, line)) for line in warnings)]
 
     def _with_unit(self, line: str) -> str:
         if self.speed_unit == "rad/s":
