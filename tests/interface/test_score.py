@@ -6,6 +6,7 @@ import json
 import subprocess
 import sys
 import warnings
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -179,6 +180,8 @@ def test_a_prediction_without_measured_speeds_is_the_free_run_of_the_twin(twin, 
 def test_a_twin_loads_and_saves_without_the_pipeline_or_a_runtime(twin, tmp_path):
     assert fantwin.load(twin.save(tmp_path / "copy.onnx")).content == DEMO.read_bytes()
     assert repr(twin) == "Twin('demo tray', hybrid, 8 fans, 100 Hz, calibrated)"
+    assert str(twin.card).startswith("demo tray: hybrid twin of 8 fans, 100 Hz\n") and "rmse_rpm" in str(twin.card)
+    assert fantwin.__version__ == version("fantwin")
     code = (
         "import sys, fantwin; fantwin.load(); "
         "print({'zenoh', 'scipy', 'onnxruntime', 'pandas', 'torch'} & {*sys.modules})"
