@@ -78,12 +78,23 @@ class NetworkCard:
 
 @dataclass(frozen=True, config=_CONFIG)
 class DataCard:
-    """One file of training data."""
+    """One file of data. first_s, last_s: the part that was used, since its first sample; None: perhaps all of it."""
 
     name: str
     sha256: str
     fans: int
     samples: int
+    first_s: float | None = None
+    last_s: float | None = None
+
+    def overlaps(self, other: DataCard) -> bool:
+        """Whether both have samples in common."""
+        if self.sha256 != other.sha256:
+            return False
+        return all(
+            one.first_s is None or two.last_s is None or one.first_s <= two.last_s
+            for one, two in ((self, other), (other, self))
+        )
 
 
 @dataclass(frozen=True, config=_CONFIG)

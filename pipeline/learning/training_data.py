@@ -235,12 +235,19 @@ def data_cards(data: TrainingData) -> list[DataCard]:
     """One card entry for each file of the training data."""
     from fantwin.schemas.twin_card import DataCard  # noqa: PLC0415
 
-    samples: dict[Path, int] = {}
+    runs: dict[Path, list[Source]] = {}
     for source in data.sources:
-        samples[source.path] = samples.get(source.path, 0) + source.samples
+        runs.setdefault(source.path, []).append(source)
     return [
-        DataCard(name=path.name, sha256=data.sha256.get(path) or sha256_of(path), fans=len(data.fans), samples=count)
-        for path, count in samples.items()
+        DataCard(
+            name=path.name,
+            sha256=data.sha256.get(path) or sha256_of(path),
+            fans=len(data.fans),
+            samples=sum(source.samples for source in sources),
+            first_s=min(source.first_s for source in sources),
+            last_s=max(source.last_s for source in sources),
+        )
+        for path, sources in runs.items()
     ]
 
 

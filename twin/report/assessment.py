@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 
 from fantwin.schemas.model_uncertainty import ModelUncertainty
-from fantwin.schemas.twin_card import DriveCard
+from fantwin.schemas.twin_card import DataCard, DriveCard
 from fantwin.twin.report.content import FanSummary, Summary
 from fantwin.twin.report.steady_states import StaticCurve
 
@@ -53,7 +53,7 @@ def least_known(known: ModelUncertainty, curve: StaticCurve, drive: DriveCard | 
     return LeastKnown(float(speeds_rad_s[start]), float(commands[end]), float(of_steps[start, end]), held=False)
 
 
-Level = Literal["as declared", "looser than declared", "not followed"]
+Level = Literal["as declared", "looser than declared", "not followed", "not tested"]
 
 AS_DECLARED = 1.1
 LOOSER = 1.5
@@ -88,17 +88,21 @@ class Assessment:
 def assess(content: Summary) -> Assessment:
     """The assessment by the worst fan."""
     for level, sentence in WORSE.items():
-        if worse := [fan for fan in content.fans if level_of(fan) == level]:
+        if worse := [fan for fan in content.fans if level_of(fan, content) == level]:
             what = sentence.format(_these(worse, content))
             return Assessment(level, f"The twin {what}: rmse {_worst(worse)}.", warnings(content))
+    if seen := [data.name for used in _made_from(content).values() for data in used]:
+        headline = f"Not tested: {', '.join(dict.fromkeys(seen))} made this twin; evaluate it on other recordings."
+        return Assessment("not tested", headline, warnings(content))
     who = "this fan" if len(content.fans) == 1 else f"all {len(content.fans)} fans"
     return Assessment("as declared", f"The twin follows {who} as closely as its card says.", warnings(content))
 
 
-def level_of(fan: FanSummary) -> Level:
-    """The level of one fan; `not followed` where the free run diverged or is undefined."""
+def level_of(fan: FanSummary, content: Summary) -> Level:
+    """The level of one fan; `not followed` where the free run diverged or is undefined, and `not tested` where it would
+    be as declared, but by recordings from which the twin was made."""
     if fan.rmse_in_sigma <= AS_DECLARED:
-        return "as declared"
+        return "not tested" if any(_made_from(content).values()) else "as declared"
     return "looser than declared" if fan.rmse_in_sigma <= LOOSER else "not followed"
 
 
@@ -109,15 +113,24 @@ def warnings(content: Summary) -> tuple[str, ...]:
     return (*_about_the_data(content), *of_fans)
 
 
+def _made_from(content: Summary) -> dict[str, list[DataCard]]:
+    """The recordings with samples from which the twin was made, by what these were used for."""
+    card = content.card
+    used = {"in training": card.training.data, "to choose the model and its band": card.validation.data}
+    if not set(card.fan_numbers) & {fan.number for fan in content.fans}:
+        return {}
+    return {how: [own for own in content.recordings if any(map(own.overlaps, data))] for how, data in used.items()}
+
+
 def _about_the_data(content: Summary) -> Iterator[str]:
     card = content.card
     fastest_rad_s = float(np.nanmax([0.0, *(fan.fastest_rad_s for fan in content.fans)]))
     if fastest_rad_s > ANOTHER_UNIT * card.top_speed_rad_s > 0.0:
         fastest, known = (f"{value / content.unit.rad_s:,.0f}" for value in (fastest_rad_s, card.top_speed_rad_s))
         yield f"Speeds up to {fastest} {content.unit.name}, the twin knows {known}: is the recording's unit right?"
-    trained_on = {data.sha256 for data in card.training.data}
-    if seen := [data.name for data in content.recordings if data.sha256 in trained_on]:
-        yield f"{', '.join(seen)}: used in training, at least in part; there these figures are too optimistic."
+    for how, seen in _made_from(content).items():
+        if seen:
+            yield f"{', '.join(data.name for data in seen)}: used {how}, so these figures are too favourable."
     if card.validation.source == "training":
         yield "The band is the error over the training data, so it may be too narrow: train with --validate."
     if few := [n for n in card.healthy.independent_samples if n is not None and n < FEW_INDEPENDENT]:

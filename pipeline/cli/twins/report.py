@@ -132,7 +132,7 @@ def _write_page(
             "name": training_data.names.name(fan.number),
             **figures_in(fan.figures, training_data.rad_s_per_unit),
             "sigma": fan.sigma_rad_s / training_data.rad_s_per_unit,
-            "assessment": level_of(fan),
+            "assessment": level_of(fan, content),
         }
         for fan in content.fans
     ]

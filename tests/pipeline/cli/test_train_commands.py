@@ -157,6 +157,30 @@ def test_a_part_of_a_recording_and_some_of_its_fans_can_be_used(folder, twin, tm
     assert (result["evaluated_on"], result["samples"]) == ("held-out", 2000)
 
 
+def test_a_twin_is_not_judged_by_samples_that_made_it_and_others_of_the_same_recording_judge_it(folder, tmp_path):
+    twin, validated = tmp_path / "part.onnx", tmp_path / "validated.onnx"
+    words = ("train", folder / "healthy.mcap", "--to", 20, "--model", "physical", "-o")
+    assert fantwin(*words, twin).exit_code == 0
+    assert fantwin(*words, validated, "--validate", folder / "healthy.mcap").exit_code == 0
+    page, training = tmp_path / "page.html", "healthy.mcap: used in training"
+    choosing = "healthy.mcap: used to choose the model and its band"
+    for of, part, used in (
+        (twin, (), [training]),
+        (twin, ("--from", 20), []),
+        (validated, (), [training, choosing]),
+        (validated, ("--to", 20), [training]),
+        (validated, ("--from", 20), [choosing]),
+    ):
+        for name, more in (("evaluate", ()), ("report", ("-o", page))):
+            found = json.loads(fantwin(name, of, folder / "healthy.mcap", *part, *more, "--json").stdout)
+            said = [line.partition(",")[0] for line in found["warnings"] if "used " in line]
+            assert (found["assessment"], said) == ("not tested" if used else "as declared", used)
+            assert found["headline"].startswith("Not tested: healthy.mcap made this twin") == bool(used)
+        assert found["fans"][0]["assessment"] == found["assessment"]
+        assert found["headline"] in page.read_text()
+    assert evaluated(validated, folder / "held-out.mcap")["assessment"] == "as declared"
+
+
 def test_outliers_are_left_out_in_every_evaluation_of_a_twin(tmp_path):
     run = published_run(7)
     speed = run.speed_rad_s.copy()

@@ -172,7 +172,7 @@ def test_json_and_page_hold_the_figures_of_evaluate(reported, page, evaluated):
     for figure in ("rmse", "max_error", "r2", "coverage_2_sigma", "one_step_rmse", "samples"):
         assert reported[figure] == evaluated[figure]
         assert reported["fans"][0][figure] == evaluated["fans"][0][figure]
-    assert (reported["assessment"], reported["fans"][0]["fan"]) == ("as declared", 0)
+    assert (reported["assessment"], reported["fans"][0]["fan"]) == ("not tested", 0)
     assert Page(page).numbers["row-0"][0] == pytest.approx(evaluated["fans"][0]["rmse"], rel=1e-12)
 
 
@@ -204,7 +204,7 @@ def test_what_limits_the_figures_is_a_warning(twin):
     healthy = replace(twin.card.healthy, independent_samples=(8.0,))
     of_few: Any = SimpleNamespace(card=replace(twin.card, healthy=healthy), path=twin.path)
     for judged, words in (
-        (report_content(twin, [run], [trained_on], RAD_S), "too optimistic"),
+        (report_content(twin, [run], [trained_on], RAD_S), "used in training, so these figures are too favourable"),
         (content_of(twin, Run("beyond", run.t_s, run.command + 40.0, run.speed_rad_s)), "outside the trained range"),
         (content_of(twin, with_speed(run, seldom)), "speeds are missing"),
         (
