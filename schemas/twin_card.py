@@ -30,6 +30,12 @@ CARD_PROPERTY = "fantwin.card"
 GRAPH_INPUTS = ("state", "command", "step_s", "parameters")
 GRAPH_OUTPUTS = ("speed_rad_s", "state_out")
 
+NOT_CALIBRATED = (
+    "is not calibrated: its alarms are by the priors of a population of fans, 0.03 false alarms per fan and day"
+)
+AS_DECLARED, LOOSER = 1.1, 1.5
+"""limits of the free-run rmse in healthy sigma: a twin follows as declared up to the first, looser up to the second"""
+
 Array: TypeAlias = NDArray[np.float64]
 Positive: TypeAlias = Annotated[float, Field(gt=0)]
 NotNegative: TypeAlias = Annotated[float, Field(ge=0)]

@@ -12,7 +12,7 @@ import numpy as np
 
 from fantwin.interface.columns import Fan
 from fantwin.interface.tables import Array, Form
-from fantwin.interface.words import warn
+from fantwin.interface.words import Words
 from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.prediction.tray_twin import load_tray_twin
 from fantwin.pipeline.replay.offline.alarm_episodes import episodes
@@ -147,7 +147,7 @@ class _Newest:
             self._t_ns = max(int(block.t_ns[-1]), self._t_ns)
 
 
-def decided(recording: Path, twin: Path, overrides: Sequence[str], *, scores: bool) -> list[DecidedTray]:
+def decided(recording: Path, twin: Path, overrides: Sequence[str], words: Words, *, scores: bool) -> list[DecidedTray]:
     """The decisions on a recording with this twin. scores: not only its prediction, which takes a tenth of the time.
 
     Raises:
@@ -169,7 +169,7 @@ def decided(recording: Path, twin: Path, overrides: Sequence[str], *, scores: bo
             trays = [_predicted(replay_input, tray, twin, observe) for tray in replay_input.trays]
         fans = {tray.name: tray.fans for tray in replay_input.trays}
         metadata = replay_input.metadata
-        warn(replay_input.damage.values())
+        words.warn(replay_input.damage.values())
     return [
         DecidedTray(
             name=each.tray,
@@ -190,7 +190,7 @@ def _predicted(
 ) -> RescoredTray:
     """What a scorer would receive, as its message without evidence. path: of the twin."""
     twin, plan = load_tray_twin(path, tray.fans), replay_input.read_plan(tray.name).plan
-    found = RescoredTray(tray.name, plan)
+    found = RescoredTray(tray.name, plan, names=replay_input.metadata.names(tray.name))
     pipeline = replay_input.pipeline(tray.name, plan)
     reads_balance, unseen_error = np.zeros(tray.fans, np.bool_), twin.unseen_error
     for item in pipeline.predictions():
@@ -218,4 +218,4 @@ def _why(predictions: Sequence[Prediction], scores: Sequence[Score], fans: int) 
 
 def _left_out(tray: RescoredTray) -> list[str]:
     lost = [f"{tray.tray}: {tray.lost} messages or samples are lost"] if tray.lost else []
-    return [*lost, *([tray.problem] if tray.problem else [])]
+    return [*lost, *filter(None, (tray.problem, tray.misfit))]

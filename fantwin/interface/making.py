@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from itertools import count
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
@@ -16,11 +16,11 @@ from fantwin.interface.columns import Columns, Fan
 from fantwin.interface.fan_matching import matched
 from fantwin.interface.tables import fan_table
 from fantwin.interface.twin import USUAL, Twin
-from fantwin.interface.words import TEMPORARY, in_python, warn
+from fantwin.interface.words import Words, in_python
 from fantwin.pipeline.cli.progress import Reporter, training_progress
 from fantwin.pipeline.errors import FantwinError
 from fantwin.pipeline.learning.fitting import TrainingSettings, calibrated_on, fit_twin, with_calibration
-from fantwin.pipeline.learning.healthy_evidence import marked_running, outlier_warnings
+from fantwin.pipeline.learning.healthy_evidence import marked_running, outlier_warnings, training_warnings
 from fantwin.pipeline.learning.training_data import Part, read_held_out, read_training_data
 from fantwin.pipeline.recordings.raw_recordings import write_table
 from fantwin.pipeline.replay.offline.calibration_of_twin import require_enough
@@ -74,15 +74,16 @@ def train(
     for argument, value in (("iterations", iterations), ("networks", networks)):
         check(argument, value, Count | None)
     settings = TrainingSettings(model, seed, "levenberg-marquardt", iterations, networks, command_unit)
-    with _recordings(columns) as recording:
-        healthy = [recording(table, tacho) for table in _each(tables)]
-        others = [recording(table, tacho) for table in _each(validate)] if validate is not None else []
+    with _recordings(columns) as recordings:
+        both = recordings.of([*_each(tables), *(_each(validate) if validate is not None else ())], tacho)
+        healthy, others = both[: len(_each(tables))], both[len(_each(tables)) :]
+        words = recordings.words
         data = read_training_data(healthy, Part(), in_this_process)
         held_out = read_held_out(data, others, Part(), in_this_process) if others else None
-        warn(line for each in (data, held_out) if each for line in (*each.damage, *each.hints))
+        words.warn(line for each in (data, held_out) if each for line in (*each.damage, *each.hints))
         with training_progress(data, only_bar=True) as start:
             trained = fit_twin(data, held_out, name, settings, start(""))
-        warn(data.with_fan_numbers(trained.identification.warnings))
+        words.warn(data.with_fan_numbers(trained.identification.warnings))
         return Twin(trained.onnx())
 
 
@@ -109,48 +110,61 @@ def calibrate(
         FantwinError: a table cannot be used, or there is too little running to show the rate.
 
     Warns:
-        FantwinWarning: of fans that were perhaps not healthy, and of what was repaired in a table.
+        FantwinWarning: of fans that were perhaps not healthy, of tables that the twin was trained on, and of what was
+            repaired in a table.
     """
     check("twin", twin, InstanceOf[Twin])
     check("false_alarms_per_day", false_alarms_per_day, Rate)
-    with _recordings(columns) as recording, twin.file() as file:
-        healthy = [recording(table, twin) for table in _each(tables)]
+    with _recordings(columns) as recordings, twin.file() as file:
+        healthy, words = recordings.of(_each(tables), twin), recordings.words
         if not extrapolate:
             require_enough(healthy, false_alarms_per_day)
         marked = marked_running(healthy, [], None, in_this_process)
-        warn(marked.lines)
+        words.warn(marked.lines)
         part = HealthyPart(file, left_out=marked.left_out)
         with Reporter(only_bar=True) as reporter:
             reporter.show("calibrating")
             how = {"extrapolate": extrapolate, "progress": reporter.show}
             found = calibrated_on(healthy, part, false_alarms_per_day, in_this_process, **how)
-        warn(outlier_warnings(found))
+        words.warn([*training_warnings(twin.card, found.calibration), *outlier_warnings(found)])
         return Twin(with_calibration(file, found.calibration))
 
 
-@contextmanager
-def _recordings(columns: Columns) -> Iterator[Callable[[Any, Twin | str | Sequence[str]], Path]]:
-    """Yields what makes a temporary recording of a table, and leaves a recording as it is. Its second argument: how the
-    speeds of the table were measured, or the twin that the table must fit."""
-    with TemporaryDirectory(prefix=TEMPORARY) as folder, in_python():
-        numbers = count(1)
-        first: dict[str, tuple[Fan, ...]] = {}
+@dataclass(frozen=True)
+class _Recordings:
+    """Temporary recordings of tables. words: of what concerns them."""
 
-        def recording(table: Any, measured: Twin | str | Sequence[str]) -> Path:
+    folder: Path
+    columns: Columns
+    words: Words
+
+    def of(self, tables: Sequence[Any], measured: Twin | str | Sequence[str]) -> list[Path]:
+        """A recording of each table, and those that are recordings as they are. measured: how the speeds of the tables
+        were measured, or the twin that they must fit."""
+        paths = []
+        fans: Sequence[Fan] = ()
+        for number, table in enumerate(tables, 1):
             if isinstance(table, Path | str):
-                return Path(table)
-            given = fan_table(table, columns)
+                paths.append(Path(table))
+                continue
+            given = fan_table(table, self.columns)
             if isinstance(measured, Twin):
                 given, tachos = measured.checked(given), measured.card.tacho
             else:
-                given = matched(given, first.setdefault("fans", given.fans), "the first table")
+                given = matched(given, fans or given.fans, "the first table")
                 tachos = parse_tachos([measured] if isinstance(measured, str) else measured, len(given.fans))
-            path = Path(folder) / f"table-{next(numbers)}.mcap"
-            names = FanNames(tuple(fan if isinstance(fan, str) else "" for fan in given.fans))
-            write_table(given.samples, path, "table", tachos, names)
-            return path
+            paths.append(self.folder / f"table-{number}.mcap")
+            fans = given.fans
+            names = FanNames(tuple(fan if isinstance(fan, str) else "" for fan in fans))
+            write_table(given.samples, paths[-1], "table", tachos, names)
+        self.words.fans = fans  # from here on, lines are about the recordings
+        return paths
 
-        yield recording
+
+@contextmanager
+def _recordings(columns: Columns) -> Iterator[_Recordings]:
+    with TemporaryDirectory(prefix="fantwin-") as folder, in_python(Path(folder)) as words:
+        yield _Recordings(Path(folder), columns, words)
 
 
 def _each(tables: Any) -> Sequence[Any]:

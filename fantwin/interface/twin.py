@@ -15,12 +15,12 @@ from fantwin.interface.columns import Columns, Fan
 from fantwin.interface.fan_matching import matched
 from fantwin.interface.suspicions import refuse_commands, refuse_high_speeds, suspect_times
 from fantwin.interface.tables import NAME, FanTable, fan_table
-from fantwin.interface.words import TEMPORARY, in_python, warn
+from fantwin.interface.words import in_python, warn
 from fantwin.pipeline.errors import FantwinError
 from fantwin.pipeline.extras import require_torch
 from fantwin.pipeline.files import write_whole
 from fantwin.pipeline.prediction.tray_twin import read_file, tray_twin
-from fantwin.schemas.twin_card import TwinCard
+from fantwin.schemas.twin_card import NOT_CALIBRATED, TwinCard
 from fantwin.scoring.calibration.calibration import Calibration
 
 if TYPE_CHECKING:
@@ -34,7 +34,6 @@ if TYPE_CHECKING:
 AnyTable = TypeVar("AnyTable")
 USUAL = Columns()
 DEMO = Path(__file__).parents[1] / "pipeline" / "demo" / "twin.onnx"
-POPULATION = "the priors of a population of fans, 0.03 false alarms per fan and day"
 
 
 class Twin:
@@ -188,6 +187,30 @@ class Twin:
         """
         return self._answer(table, columns, "alarms", false_alarms_per_day)
 
+    def evaluate(
+        self, table: DataFrame | Table | Mapping[str, Any] | Path | str, columns: Columns = USUAL
+    ) -> dict[str, Any]:
+        """How well the twin follows healthy fans: the fields of `fantwin evaluate --json`, speeds in the table's unit.
+
+        Among them `rmse` of the free run, `coverage_2_sigma` (the share of samples in the band), `assessment` (as
+        declared, looser than declared, not followed, or not tested: on data that made the twin), its `headline`,
+        `warnings`, and `fans` with the figures of each. `fantwin report` draws them.
+
+        Raises:
+            FantwinError: the table does not fit the twin.
+
+        Warns:
+            FantwinWarning: of what was repaired.
+        """
+        from fantwin.interface import answers  # noqa: PLC0415  `load` needs none of the pipeline
+
+        with self.file() as file, in_python(file.parent) as words:
+            if isinstance(table, Path | str):
+                return answers.evaluation_of(Path(table), file, words)
+            given = self.checked(fan_table(table, columns))
+            words.fans = given.fans
+            return answers.evaluation_of(answers.recording_of(given, self.card.tacho, file), file, words)
+
     def as_torch(self) -> TorchTwin:
         """The twin as a differentiable module of PyTorch, for control and for fits of one's own.
 
@@ -204,19 +227,20 @@ class Twin:
         check("false_alarms_per_day", rate, Rate | None)
         overrides = () if rate is None else (f"scorer.false_alarms_per_day={rate}",)
         if not self.card.calibration and answer != "prediction":
-            warn([f"{self.card.name!r} is not calibrated: its alarms are by {POPULATION}; see fantwin.calibrate"])
+            warn([f"{self.card.name!r} {NOT_CALIBRATED}; see fantwin.calibrate"])
         from fantwin.interface import answers  # noqa: PLC0415  `load` needs none of the pipeline
 
-        with self.file() as file, in_python():
+        with self.file() as file, in_python(file.parent) as words:
             if isinstance(table, Path | str):
-                return answers.of_recording(Path(table), file, overrides, answer)
+                return answers.of_recording(Path(table), file, overrides, answer, words)
             given = self.checked(fan_table(table, columns))
-            return answers.of_table(given, file, overrides, answer, self._latest)
+            words.fans = given.fans
+            return answers.of_table(given, file, overrides, answer, self._latest, words)
 
     @contextmanager
     def file(self) -> Iterator[Path]:
         """A temporary file of the twin, in a folder of its own."""
-        with TemporaryDirectory(prefix=TEMPORARY) as folder:
+        with TemporaryDirectory(prefix="fantwin-") as folder:
             path = Path(folder) / "twin.onnx"
             path.write_bytes(self.content)
             yield path

@@ -32,6 +32,7 @@ from fantwin.pipeline.replay.offline.healthy_runs import DecidedRun, HealthyPart
 from fantwin.pipeline.replay.offline.rescoring import rescore
 from fantwin.schemas.enums import Feedback
 from fantwin.schemas.messages import Alarm
+from fantwin.schemas.twin_card import DataCard, TwinCard
 from fantwin.scoring.calibration.calibration import Calibration, daily_interval, expected_alarms, is_exceeded
 from fantwin.scoring.model.population import Priors
 
@@ -109,6 +110,23 @@ def outlier_warnings(found: CalibratedTwin) -> list[str]:
     if found.calibration.limit_factor > 1.0 or found.calibration.is_exceeded:
         warnings.append(_of_alarms(found.by_theory))
     return [warning for warning in warnings if warning]
+
+
+def training_warnings(card: TwinCard, calibration: Calibration) -> list[str]:
+    """A line where a calibration used running that the twin was trained on."""
+    used = [
+        DataCard(
+            data["name"], data["sha256"], 0, 0, data.get("from_s"), math.nextafter(data.get("to_s", math.inf), 0.0)
+        )
+        for data in calibration.data
+    ]
+    names = [each.name for each in used if any(map(each.overlaps, card.training.data))]
+    if not names:
+        return []
+    return [
+        f"{', '.join(names)}: the twin was trained on it, so its errors are too small there, and alarms may come more "
+        "often than declared: calibrate on other healthy recordings"
+    ]
 
 
 def _of_mean(runs: Sequence[LearnedRun]) -> str:

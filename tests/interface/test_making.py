@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import warnings
 from functools import partial
 from pathlib import Path
@@ -79,10 +80,49 @@ def test_calibration_by_tables_is_that_of_the_command(twin, tmp_path):
         assert not calibrated.score(table_of(6, 20.0))["alarm"].to_numpy().any()
 
 
+def test_evaluate_is_that_of_the_command_and_data_that_made_the_twin_do_not_test_it(twin, tmp_path):
+    table = table_of(7, 20.0)
+    found = twin.evaluate(table)
+    file, recording = twin.save(tmp_path / "own.onnx"), imported(table, tmp_path / "run.mcap")
+    done = as_typed("evaluate", file, recording, "--json")
+    assert found == json.loads(done.stdout) == twin.evaluate(recording)
+    assert (found["assessment"] != "not tested", found["speed_unit"], len(found["fans"])) == (True, "rpm", 1)
+    for made_it, used in (
+        (table_of(1), "the table: used in training"),
+        (table_of(2, 10.0), "the table: used to choose the model"),
+    ):
+        judged = twin.evaluate(made_it)
+        assert judged["assessment"] != "as declared" and used in judged["warnings"][0], judged["warnings"]
+    with pytest.warns(fantwin.FantwinWarning, match="table 1: the twin was trained on it, so its errors are too small"):
+        fantwin.calibrate(twin, table_of(1), false_alarms_per_day=8, extrapolate=True)
+    assert dir(fantwin) == sorted(fantwin.__all__)
+
+
+def test_warnings_and_errors_call_fans_as_the_table_does(twin):
+    run = table_of(3, 20.0)
+    slow = {f"rpm{fan}": run["speed_rpm"] * factor for fan, factor in ((1, 1.0), (2, 0.6))}
+    table = pd.DataFrame({"time": run["time"], "command": run["command"], **slow})
+    columns = fantwin.Columns(speed="rpm*:rpm")
+    with pytest.warns(
+        fantwin.FantwinWarning,
+        match=r"^table: the twin does not follow fan 2: rmse .* times its sigma: a fault, or not its twin",
+    ):
+        assert set(twin.alarms(table, columns)["fan"]) == {2}
+    found = twin.evaluate(table, columns)
+    assert [fan["fan"] for fan in found["fans"]] == [1, 2]
+    assert found["headline"].startswith("The twin does not follow fan 2: rmse")
+    named = fantwin.Columns(speed={"CPU": "rpm1:rpm", "rear": "rpm2:rpm"})
+    assert twin.evaluate(table, named)["headline"].startswith("The twin does not follow rear: rmse")
+    with pytest.raises(fantwin.FantwinError, match="^fan 1: fewer than ten measured speeds"):
+        fantwin.train(table.assign(rpm1=float("nan")), columns, model="physical")
+
+
 def test_what_data_do_not_show_is_said_and_what_is_too_little_is_refused(twin):
     with pytest.warns(fantwin.FantwinWarning, match="too short"):
         fantwin.train(table_of(1, 4.0), model="physical")
-    with pytest.raises(fantwin.FantwinError, match="cannot show 1 false alarm per fan and day: that takes 72"):
+    with pytest.raises(
+        fantwin.FantwinError, match=r"that takes 72; .*, or add `extrapolate=True`: then it is only a target"
+    ):
         fantwin.calibrate(twin, table_of(4, 20.0), false_alarms_per_day=1)
     with pytest.raises(fantwin.FantwinError, match="kind 'linear' is unknown; use one of physical"):
         fantwin.train(table_of(1, 20.0), model="linear")

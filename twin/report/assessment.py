@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 
 from fantwin.schemas.model_uncertainty import ModelUncertainty
-from fantwin.schemas.twin_card import DataCard, DriveCard
+from fantwin.schemas.twin_card import AS_DECLARED, LOOSER, DataCard, DriveCard
 from fantwin.twin.report.content import FanSummary, Summary
 from fantwin.twin.report.steady_states import StaticCurve
 
@@ -55,9 +55,6 @@ def least_known(known: ModelUncertainty, curve: StaticCurve, drive: DriveCard | 
 
 Level = Literal["as declared", "looser than declared", "not followed", "not tested"]
 
-AS_DECLARED = 1.1
-LOOSER = 1.5
-"""Limits of the free-run rmse in healthy sigma: as declared up to the first, looser up to the second."""
 WORSE: dict[Level, str] = {
     "not followed": "does not follow {}",
     "looser than declared": "follows {} less closely than its card says",

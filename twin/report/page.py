@@ -10,10 +10,11 @@ from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 
 from fantwin.schemas.model_uncertainty import ModelUncertainty
+from fantwin.schemas.twin_card import AS_DECLARED, LOOSER
 from fantwin.twin.evaluation.residual_analysis import SIGNIFICANCE
 from fantwin.twin.kinds import kind_title
 from fantwin.twin.report import figures
-from fantwin.twin.report.assessment import AS_DECLARED, LOOSER, Assessment, assess, least_known, level_of
+from fantwin.twin.report.assessment import Assessment, assess, least_known, level_of
 from fantwin.twin.report.content import Content, FanContent
 from fantwin.twin.report.steady_states import StaticCurve, static_curve
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
@@ -127,6 +128,10 @@ def print_result(result: dict[str, Any], output: Path | None) -> None:
         f"{alarms} alarm{'s' * (alarms != 1)} in {_duration(result['hours'])}, {result['samples']} samples, "
         f"{result['lost']} lost; {result['times_real_time']:.0f} times real time"
     )
+    if line := _not_judged(result):
+        console.print(line, markup=False)
+    for line in dict.fromkeys(result["warnings"]):
+        console.print(f"[bold yellow]warning:[/bold yellow] {escape(line)}")
     for problem in result["not_scored"]:
         console.print(f"[bold yellow]not scored:[/bold yellow] {escape(problem)}")
     if result["restarts"]:
@@ -145,6 +150,18 @@ def print_result(result: dict[str, Any], output: Path | None) -> None:
         _print_verified(result["verified"], console)
     if output:
         console.print(f"written to {output}", markup=False)
+
+
+def _not_judged(result: dict[str, Any]) -> str:
+    """The share of the samples of fans that could not be judged, and why; empty: all could."""
+    reasons = Counter[str]()
+    for one in result.get("recordings", [result]):
+        for of_tray in one["not_judged"].values():
+            reasons.update(of_tray)
+    if not reasons:
+        return ""
+    why = ", ".join(f"{reason.replace('_', ' ')} {count}" for reason, count in reasons.most_common())
+    return f"not judged: {reasons.total() / (reasons.total() + result['judged']):.1%} of the samples of fans ({why})"
 
 
 def _print_recordings(console: Console, result: dict[str, Any]) -> None:

@@ -20,7 +20,14 @@ from fantwin.pipeline.errors import UsageError, UserError
 from fantwin.pipeline.files import write_whole
 from fantwin.pipeline.learning.drops_found import drops_found
 from fantwin.pipeline.learning.fitting import calibrated_on, with_calibration
-from fantwin.pipeline.learning.healthy_evidence import Check, check_declared_rate, marked_running, outlier_warnings
+from fantwin.pipeline.learning.healthy_evidence import (
+    Check,
+    check_declared_rate,
+    marked_running,
+    outlier_warnings,
+    training_warnings,
+)
+from fantwin.pipeline.prediction.tray_twin import load_tray_twin
 from fantwin.pipeline.replay.offline.calibration_of_twin import (
     LARGEST_PER_DAY,
     number_text,
@@ -132,7 +139,8 @@ def calibrate(
             calibration, speed_unit = found.calibration, found.learned[0].tray.speed_unit
             output = output or twin
             write_whole(output, with_calibration(twin, calibration))
-            drops, warnings = drops_found(output, RAD_S_PER_UNIT[speed_unit]), outlier_warnings(found)
+            drops = drops_found(output, RAD_S_PER_UNIT[speed_unit])
+            warnings = [*training_warnings(load_tray_twin(twin).card, calibration), *outlier_warnings(found)]
             result = {
                 "twin": str(output),
                 "alarms": marked.as_json(),

@@ -11,7 +11,6 @@ import typer
 
 from fantwin.pipeline.errors import UsageError, UserError
 from fantwin.pipeline.files import make_folder
-from fantwin.pipeline.learning.training_data import TrainingData
 from fantwin.pipeline.recordings.remote import matching, recording_path
 from fantwin.schemas.reference_conditions import HOLD_S
 
@@ -69,9 +68,9 @@ TACHO_CONSEQUENCE = (
 )
 
 
-def report_damage(data: TrainingData) -> None:
+def report_damage(damage: Sequence[str]) -> None:
     """Say on stderr what could not be read."""
-    for line in data.damage:
+    for line in damage:
         typer.echo(line, err=True)
 
 

@@ -28,11 +28,12 @@ from fantwin.pipeline.cli.twins.data_options import (
     report_damage,
     show_hints,
 )
-from fantwin.pipeline.cli.twins.figures import figures_in, sentence
+from fantwin.pipeline.cli.twins.figures import sentence
 from fantwin.pipeline.errors import UsageError
 from fantwin.pipeline.extras import require
 from fantwin.pipeline.files import write_whole
 from fantwin.pipeline.learning.drops_found import drops_found
+from fantwin.pipeline.learning.evaluation import figures_in
 from fantwin.pipeline.learning.training_data import Part, TrainingData, data_cards, read_training_data, twin_errors
 from fantwin.schemas.fan_names import fan_cell
 
@@ -113,7 +114,7 @@ def _write_page(
         check_writable(output, ".html")
         with pool:
             training_data = read_training_data(recordings, part, pool.map)
-        report_damage(training_data)
+        report_damage(training_data.damage)
         unit = SpeedUnit(training_data.speed_unit, training_data.rad_s_per_unit)
         with working(f"drawing {output}"):
             content = report_content(
@@ -167,7 +168,7 @@ def show_fans(recordings: Sequence[Path], part: Part, pool: RecordingsInParallel
 
         with pool:
             training_data = read_training_data(recordings, part, pool.map)
-        report_damage(training_data)
+        report_damage(training_data.damage)
         if not json_output:
             show_hints(training_data.hints)
         with training_progress(training_data) as start:

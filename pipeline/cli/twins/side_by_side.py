@@ -15,9 +15,10 @@ from rich.table import Table
 from fantwin.pipeline.cli.in_parallel import RecordingsInParallel
 from fantwin.pipeline.cli.printing import table_of
 from fantwin.pipeline.cli.progress import training_progress
-from fantwin.pipeline.cli.twins.figures import figures_in, shown
+from fantwin.pipeline.cli.twins.figures import shown
 from fantwin.pipeline.errors import UsageError
 from fantwin.pipeline.files import make_folder, write_whole
+from fantwin.pipeline.learning.evaluation import figures_in
 from fantwin.pipeline.learning.fitting import TrainingSettings, fit_twin
 from fantwin.pipeline.learning.training_data import TrainingData
 

@@ -29,11 +29,12 @@ from fantwin.pipeline.cli.twins.data_options import (
     report_damage,
     show_hints,
 )
-from fantwin.pipeline.cli.twins.figures import figures_in, sentence, shown
+from fantwin.pipeline.cli.twins.figures import sentence, shown
 from fantwin.pipeline.cli.twins.side_by_side import Data, train_side_by_side
 from fantwin.pipeline.errors import UsageError
 from fantwin.pipeline.extras import require_torch
 from fantwin.pipeline.files import write_whole
+from fantwin.pipeline.learning.evaluation import figures_in
 from fantwin.pipeline.learning.fitting import DEFAULT_SETTINGS, NETWORKS, Trainer, TrainingSettings, fit_twin
 from fantwin.pipeline.learning.training_data import (
     Part,
@@ -179,7 +180,7 @@ def _read(
         training_data = read_training_data(recordings, part, pool.map)
         others = [read_held_out(training_data, paths, part, pool.map) if paths else None for paths in (validate, test)]
     for data in filter(None, (training_data, *others)):
-        report_damage(data)
+        report_damage(data.damage)
     return training_data, others[0], others[1]
 
 

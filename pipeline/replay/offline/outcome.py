@@ -11,14 +11,16 @@ from pathlib import Path
 from typing import Any
 
 from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.prediction.tray_twin import TrayTwin, load_tray_twin
 from fantwin.pipeline.recordings.records import MADE_BY_KEY, this_program
 from fantwin.pipeline.replay.offline.alarm_episodes import compare_episodes, episodes
 from fantwin.pipeline.replay.offline.comparison import CannotCompareError
 from fantwin.pipeline.replay.offline.replay_input import ReplayInput, open_replay_input
 from fantwin.pipeline.replay.offline.rescoring import Progress, RescoredTray, rescore
+from fantwin.schemas.twin_card import NOT_CALIBRATED
 
-SUMS = ("hours", "samples", "lost", "restarts")
-LISTS = ("not_scored", "damage", "other_version")
+SUMS = ("hours", "samples", "judged", "lost", "restarts")
+LISTS = ("not_scored", "damage", "other_version", "warnings")
 """of an outcome, that those of many recordings have together"""
 
 
@@ -53,6 +55,8 @@ def score_again(
             )
         trays = rescore(replay_input, output, again.verify, progress)
         outcome = _outcome(replay_input, trays)
+        if again.twin:
+            outcome["warnings"] = twin_warnings(again.twin, load_tray_twin(again.twin), trays)
     if outcome["not_scored"] and not again.verify and not any(tray.scored for tray in trays):
         if output:
             output.unlink()
@@ -84,12 +88,14 @@ def _outcome(replay_input: ReplayInput, trays: Sequence[RescoredTray]) -> dict[s
         "hours": sum(tray.hours for tray in trays),
         "samples": sum(tray.samples for tray in trays),
         "lost": sum(tray.lost for tray in trays),
+        "judged": sum(tray.judged for tray in trays),
         "not_judged": {tray.tray: dict(tray.not_judged.most_common()) for tray in trays},
         "not_scored": [tray.problem for tray in trays if tray.problem],
         "counts": {tray.tray: dict(sorted(tray.counts.items())) for tray in trays},
         "restarts": sum(tray.plan.restarts for tray in trays),
         "damage": list(replay_input.damage.values()),
         "other_version": [versions] if made_by != this_program() else [],
+        "warnings": [],
     }
     if compared := [tray.comparison.as_json() for tray in trays if tray.comparison]:
         outcome["verified"] = _verified(compared)
@@ -101,6 +107,12 @@ def _outcome(replay_input: ReplayInput, trays: Sequence[RescoredTray]) -> dict[s
             name: [episode.as_json() for episode in found] for name, found in compare_episodes(now, before).items()
         }
     return outcome
+
+
+def twin_warnings(name: Path | str, twin: TrayTwin, trays: Sequence[RescoredTray]) -> list[str]:
+    """What speaks against the decisions of a twin: it is not calibrated, or does not follow the fans."""
+    uncalibrated = f"{name} {NOT_CALIBRATED}; see `fantwin calibrate`"
+    return [*([] if twin.card.calibration else [uncalibrated]), *(tray.misfit for tray in trays if tray.misfit)]
 
 
 def _verified(found: Sequence[dict[str, Any]]) -> dict[str, Any]:

@@ -24,11 +24,25 @@ from fantwin.pipeline.replay.offline.verify import TrayVerifier
 from fantwin.schemas.blocks import cut
 from fantwin.schemas.codec import CodecError
 from fantwin.schemas.enums import InvalidReason
+from fantwin.schemas.fan_names import NO_NAMES, FanNames
 from fantwin.schemas.header import Header
-from fantwin.schemas.messages import Alarm, Grid, Message, Overview, Prediction, Raw, Request, Score, newest_t_ns
+from fantwin.schemas.messages import (
+    Alarm,
+    Array,
+    Grid,
+    Message,
+    Overview,
+    Prediction,
+    Raw,
+    Request,
+    Score,
+    newest_t_ns,
+)
 from fantwin.schemas.streams import LOSS_PREFIX
 from fantwin.schemas.topics import TOPICS, tray_key
+from fantwin.schemas.twin_card import LOOSER
 from fantwin.schemas.units import NS_PER_S
+from fantwin.scoring.score_message import BAND_SIGMAS
 
 MESSAGE_SAMPLES = 100
 """samples a message: few, for a player that steps by messages and for a file that is truncated"""
@@ -102,8 +116,12 @@ class RescoredTray:
     """samples of the tray that have a score message, each once"""
     scored: int = 0
     """those that could be scored for at least one fan"""
+    judged: int = 0
+    """samples of fans that could be scored"""
     not_judged: Counter[str] = field(default_factory=Counter)
     """samples of fans that could not be scored, by reason"""
+    errors: Array = field(default_factory=lambda: np.zeros((2, 1)))
+    """(2, fans) number of residuals, and sum of their squares relative to the variance of the band"""
     period_ns: int = 0
     start_ns: int = np.iinfo(np.int64).max
     end_ns: int = np.iinfo(np.int64).min
@@ -114,6 +132,7 @@ class RescoredTray:
     """the stages' counters"""
     raw_missing: int = 0
     comparison: Comparison | None = None
+    names: FanNames = NO_NAMES
     _newest_t_ns: int = np.iinfo(np.int64).min
 
     @property
@@ -130,6 +149,16 @@ class RescoredTray:
             return f"{self.tray}: no sample lies between --start and --end"
         reasons = ", ".join(f"{count} {why.replace('_', ' ')}" for why, count in self.not_judged.most_common(3))
         return f"{self.tray}: no sample could be scored (of fans: {reasons}): does the twin fit this recording?"
+
+    @property
+    def misfit(self) -> str:
+        """A line on the fans that the twin does not follow; empty where it follows all."""
+        rms = np.sqrt(self.errors[1] / np.maximum(self.errors[0], 1.0))
+        fans = np.flatnonzero(rms > LOOSER)
+        if not len(fans):
+            return ""
+        which = f"{self.names.labels(fans.tolist())}: rmse {'up to ' if len(fans) > 1 else ''}{rms.max():.2f}"
+        return f"{self.tray}: the twin does not follow {which} times its sigma: a fault, or not its twin"
 
     @property
     def lost(self) -> int:
@@ -153,6 +182,9 @@ class RescoredTray:
         valid = score.valid[new]
         self.samples += int(new.sum())
         self.scored += int(valid.any(axis=1).sum())
+        self.judged += int(valid.sum())
+        errors = np.where(valid, score.residual_rad_s[new] ** 2 / (score.band_variance[new] / BAND_SIGMAS**2), np.nan)
+        self.errors = self.errors + np.array([np.isfinite(errors).sum(axis=0), np.nansum(errors, axis=0)])
         for reason, count in zip(*np.unique(score.invalid_reason[new][~valid], return_counts=True), strict=True):
             self.not_judged[InvalidReason(reason).name.lower()] += int(count)
 
@@ -204,7 +236,7 @@ def _rescore_tray(
     progress: Progress,
     observe_all: Observe,
 ) -> RescoredTray:
-    rescored = RescoredTray(tray, found.plan, recorded_alarms=found.alarms)
+    rescored = RescoredTray(tray, found.plan, recorded_alarms=found.alarms, names=replay_input.metadata.names(tray))
     output = TrayOutput(writer, replay_input.config.site, tray) if writer else None
     verifier: TrayVerifier | None = None
 

@@ -126,6 +126,9 @@ def test_a_broken_rate_is_exit_code_3_and_recordings_that_made_the_twin_prove_no
     assert f"{copy}: {calibrated} was calibrated on it, so it proves nothing" in error
     error = error_of("calibrate", calibrated, "--verify", healthy / "training.mcap")
     assert f"{calibrated} was trained on it" in error
+    words = ("calibrate", healthy / "twin.onnx", healthy / "training.mcap", *RATE, "--extrapolate", "--json")
+    found = json.loads(done(*words, "-o", tmp_path / "own.onnx"))
+    assert found["warnings"][0].startswith("training.mcap: the twin was trained on it, so its errors are too small")
     old = changed(tmp_path / "old.onnx", calibrated, detectors={})
     error = error_of("calibrate", old, "--verify", other)
     assert error.startswith(f"{old}: its card has calibration.detectors: ") and error.endswith("; calibrate it again")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from dataclasses import replace
 from functools import cache
@@ -21,6 +22,7 @@ from fantwin.schemas.messages import Alarm, Raw, Score
 from fantwin.schemas.twin_card import CARD_PROPERTY
 from fantwin.schemas.units import NS_PER_S
 from fantwin.scoring.diagnosis.causes import short_name
+from fantwin.twin.export.onnx_export import with_card_entries
 from tests.support.fantwin_command import error_of, fantwin
 from tests.support.killed_site import Site
 from tests.support.offline_replay import changed
@@ -134,6 +136,25 @@ def test_the_list_names_severity_and_probable_cause_and_is_not_wide(golden, outp
     assert alarm["severity"] in gone and cause in gone
     files = (str(output[0]), str(GOLDEN))  # lines that name one are as long as its path
     assert max(len(line) for line in lines + what_if if not any(file in line for file in files)) <= 100
+
+
+def test_a_twin_that_is_not_calibrated_or_does_not_follow_is_said_and_what_was_not_judged_too(golden, tmp_path):
+    content, twin = read_metadata(GOLDEN).attachments["tray1.onnx"], tmp_path / "other.onnx"
+    (card,) = (each for each in onnx.load_model_from_string(content).metadata_props if each.key == CARD_PROPERTY)
+    sigma = [value / 5.0 for value in json.loads(card.value)["sigma_rad_s"]]
+    entries = {"calibration": None, "sigma_rad_s": sigma, "reading_sigma_rad_s": [], "model_uncertainty": None}
+    twin.write_bytes(with_card_entries(content, entries))
+    found = json.loads(replay("--json", GOLDEN, "--twin", twin, "--end", "5").stdout)
+    uncalibrated, misfit = found["warnings"]
+    assert uncalibrated.startswith(f"{twin} is not calibrated: its alarms are by the priors of a population")
+    assert re.match(r"tray1: the twin does not follow fans 0, 1.*: rmse up to [\d.]+ times its sigma: a fault", misfit)
+    shown = replay(GOLDEN, "--twin", twin, "--end", "5").stdout
+    assert f"warning: {misfit}" in shown and f"warning: {uncalibrated}" in shown
+    reasons = found["not_judged"]["tray1"]
+    share = sum(reasons.values()) / (found["judged"] + sum(reasons.values()))
+    why = ", ".join(f"{reason.replace('_', ' ')} {count}" for reason, count in reasons.items())
+    assert f"not judged: {share:.1%} of the samples of fans ({why})" in shown.splitlines()
+    assert golden["warnings"] == []
 
 
 def test_another_configuration_file_is_taken(golden, tmp_path):
