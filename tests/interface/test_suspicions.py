@@ -216,7 +216,7 @@ def test_too_short_tables_are_refused_before_the_work_and_a_target_is_called_one
     slow = table.assign(rpm=table["rpm"].where(table["fan"] != "rear", table["rpm"] * 0.9))
     both = partial(fantwin.calibrate, twin, [table, slow], COLUMNS, false_alarms_per_day=8, extrapolate=True)
     target, said = quiet(both)
-    assert any(line.startswith("table 2: table rear (fan 2) is 10 % slower than its twin") for line in said), said
+    assert any(line.startswith("table 2: table rear is 10 % slower than its twin") for line in said), said
     assert repr(target).endswith("1 Hz, calibrated, its rate of false alarms is only a target)")
 
 
@@ -224,9 +224,9 @@ def test_errors_of_a_training_name_the_fans_of_the_table(table):
     (_, said) = quiet(
         lambda: fantwin.train(table.assign(rpm=(table["rpm"] / 30).round() * 30), COLUMNS, model="physical")
     )
-    assert any("CPU (fan 0)" in line and 'tacho="count:pulses=2,window_s=1.0"' in line for line in said)
+    assert any(line.startswith("CPU") and 'tacho="count:pulses=2,window_s=1.0"' in line for line in said)
     assert not [line for line in said if "/tmp" in line or "[[" in line or "--" in line]
-    with pytest.raises(fantwin.FantwinError, match=r"CPU \(fan 0\): the command never changes"):
+    with pytest.raises(fantwin.FantwinError, match="^CPU: the command never changes"):
         quiet(lambda: fantwin.train(table.assign(pwm=100.0), COLUMNS))
 
 
