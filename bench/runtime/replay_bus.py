@@ -40,7 +40,7 @@ def main(runs: int = 10, json_output: JsonOption = False) -> None:
             rows.append({"run": run, **measured(source, where)})
     lost = sum(row["lost"] + row["not recorded"] for row in rows)
     notes = [f"{lost} of {runs * SAMPLES * 4:,} messages lost in {runs} runs"]
-    show({"replay on the bus, --rate max --from raw": rows}, notes, as_json=json_output)
+    show({"replay on the bus, --rate max --from-topic raw": rows}, notes, as_json=json_output)
     if lost:
         raise typer.Exit(3)
 
@@ -54,7 +54,7 @@ def measured(source: Path, folder: Path) -> dict[str, Any]:
         up = chain.start_up()
         with chain.watcher() as watcher:
             eventually(lambda: {v.health.stage for v in watcher.stages() if v.alive} == set(STAGES), "all are there")
-            done = fantwin("replay", source, "--rate", "max", "--from", "raw", "--json", *chain.words("")[1:])
+            done = fantwin("replay", source, "--rate", "max", "--from-topic", "raw", "--json", *chain.words("")[1:])
         status, account = up.end(), up.output()
     finally:
         chain.close()

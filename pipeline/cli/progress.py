@@ -13,13 +13,22 @@ from typing import TYPE_CHECKING, Self
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+from rich.progress import (
+    BarColumn,
+    Progress,
+    TaskID,
+    TaskProgressColumn,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 
 if TYPE_CHECKING:
     from fantwin.pipeline.learning.training_data import TrainingData
     from fantwin.twin.progress import Progress as ProgressCallback
 
-LINE_PERIOD_S = 5.0
+LINE_PERIOD_S, LONGEST_LINE_PERIOD_S = 5.0, 60.0
+"""between lines of the same work: it doubles up to the second"""
 EXIT_INTERRUPTED = 130
 """as of a program that SIGINT ends"""
 _SHOW_PART: ContextVar[Callable[[str], None] | None] = ContextVar("show_part", default=None)
@@ -44,7 +53,7 @@ def interruptible(outcome: str) -> Iterator[None]:
 class Reporter:
     """Shows on standard error what is being done: a bar on a terminal or in a notebook, which disappears at the end.
 
-    Elsewhere a line comes when something else is done than before, and every LINE_PERIOD_S. A context manager.
+    Elsewhere a line comes when something else is done than before, and then ever more rarely. A context manager.
     """
 
     def __init__(self, quietly: str = "", *, only_bar: bool = False) -> None:
@@ -53,24 +62,32 @@ class Reporter:
         """what is printed with it stands above the bar"""
         has_bar = console.is_terminal or (console.is_jupyter and find_spec("ipywidgets") is not None)
         self._has_lines = not has_bar and not only_bar
-        columns = (TextColumn("{task.description}", markup=False), BarColumn(), TextColumn("{task.fields[count]}"))
-        self._bars = Progress(*columns, TimeElapsedColumn(), console=console, transient=True, disable=not has_bar)
+        work = (TextColumn("{task.description}", markup=False), BarColumn(20), TextColumn("{task.fields[count]}"))
+        times = (TimeElapsedColumn(), TextColumn("so far, up to"), TimeRemainingColumn(), TextColumn("left"))
+        columns = (*work, TaskProgressColumn(), *times)
+        self._bars = Progress(*columns, console=console, transient=True, disable=not has_bar)
         self._bar: TaskID | None = None
         self._doing = quietly
         self.restart()
 
     def restart(self) -> None:
         """Count the time from now on."""
-        self._started_s = self._shown_s = time.monotonic()
+        self._started_s = self._shown_s = self._part_s = time.monotonic()
+        self._period_s, self._part_done = LINE_PERIOD_S, 0
 
     def show(self, doing: str, done: int = 0, at_most: int = 0, note: str = "") -> None:
         """Say what is being done, how much of it is done, and more about it."""
         count = f"{done}/{at_most}" if at_most else ""
         is_new, now_s = doing != self._doing, time.monotonic()
         self._doing = doing
-        if self._has_lines and (is_new or now_s - self._shown_s >= LINE_PERIOD_S):
+        if is_new:
+            self._part_s, self._part_done, self._period_s = now_s, done, LINE_PERIOD_S
+        if self._has_lines and (is_new or now_s - self._shown_s >= self._period_s):
+            self._period_s = self._period_s if is_new else min(2.0 * self._period_s, LONGEST_LINE_PERIOD_S)
             self._shown_s, took_s = now_s, now_s - self._started_s
-            took = f", {took_s:.0f} s" if at_most or took_s >= 1.0 else ""
+            took = f", {took_s:.0f} s so far" if at_most or took_s >= 1.0 else ""
+            if done > self._part_done and (left := (at_most - done) / (done - self._part_done)) > 0.0:
+                took += f", up to {left * (now_s - self._part_s):.0f} s left"
             typer.echo(f"{doing}{f' {count}' if count else ''}{f', {note}' if note else ''}{took}", err=True)
         text = ", ".join(filter(None, (doing, note)))
         if is_new and self._bar is not None:  # each has a bar of its own

@@ -70,23 +70,30 @@ class TrainingData:
         return [self.names.label(fan) for fan in self.fans]
 
     def with_fan_numbers(self, warnings: Sequence[str]) -> list[str]:
-        """The outlier warnings, then those of the model maker with its column numbers replaced by the fans of the
-        recordings, and with its speeds in their unit, too."""
+        """The outlier warnings, then those of the model maker, with the fans and the speed unit of the recordings.
 
-        def fan_of(found: re.Match[str]) -> str:
-            return f"{self.names.label(self.fans[int(found[1])])}:"
+        Fans share a line where it is the same. The w of an equation remains in rad/s, as its parameters are.
+        """
+        columns: dict[str, list[int]] = {}
+        for line in warnings:
+            of_fans = re.match(r"fans? ([\d, ]+)(?=:)", line)
+            text = self._in_unit(line[of_fans.end() :] if of_fans else line)
+            columns.setdefault(text, []).extend(map(int, of_fans[1].split(",")) if of_fans else ())
+        labels = {
+            text: self.names.labels([self.fans[each] for each in sorted(set(of))]) if of else ""
+            for text, of in columns.items()
+        }
+        return [*self.outliers, *(f"{labels[text]}{text}" for text in columns)]
 
-        return [*self.outliers, *(self._with_unit(re.sub(r"^fan (\d+):", fan_of, line)) for line in warnings)]
-
-    def _with_unit(self, line: str) -> str:
+    def _in_unit(self, line: str) -> str:
         if self.speed_unit == "rad/s":
             return line
 
-        def in_both(found: re.Match[str]) -> str:
+        def converted(found: re.Match[str]) -> str:
             in_unit = re.sub(_NUMBER, lambda number: _rounded(float(number[0]) / self.rad_s_per_unit), found[1])
-            return f"{found[0]} ({in_unit} {self.speed_unit})"
+            return f"{in_unit} {self.speed_unit}"
 
-        return re.sub(rf"({_NUMBER}(?: and {_NUMBER})?) rad/s", in_both, line)
+        return re.sub(rf"(?<!w = )({_NUMBER}(?: and {_NUMBER})?) rad/s", converted, line)
 
 
 def _rounded(value: float) -> str:
@@ -174,8 +181,9 @@ def joined(parts: Sequence[TrainingData]) -> TrainingData:
     """Training data of several recordings, or parts of them, together.
 
     Raises:
-        UserError: they are not in one unit.
+        UserError: they are not in one unit, or of one number of fans.
     """
+    require_same_fans(parts)
     longest = max(parts, key=lambda part: max(source.samples for source in part.sources))
     return TrainingData(
         runs=[run for part in parts for run in part.runs],
@@ -188,6 +196,18 @@ def joined(parts: Sequence[TrainingData]) -> TrainingData:
         sha256={path: digest for part in parts for path, digest in part.sha256.items()},
         names=parts[0].names,
     )
+
+
+def require_same_fans(parts: Sequence[TrainingData]) -> None:
+    """Raise UserError for recordings of different numbers of fans."""
+    files: dict[int, Path] = {}
+    for part in parts:
+        files.setdefault(len(part.fans), part.sources[0].path)
+    if len(files) > 1:
+        found = " and ".join(f"{fans} ({path})" for fans, path in files.items())
+        raise UserError(
+            f"recordings of different numbers of fans, {found}: give those of one tray, or choose with --fans"
+        )
 
 
 def common_unit(found: Sequence[tuple[str, Path]]) -> str:
@@ -259,7 +279,7 @@ def read_held_out(
     part: of the training data.
 
     Raises:
-        UserError: they cannot be used, are in another unit, or overlap the training data.
+        UserError: they cannot be used, are in another unit or of other fans, or overlap the training data.
     """
     trained_on = frozenset(source.path for source in training_data.sources)
     read = partial(_read_held_out, part=part, trained_on=trained_on)
@@ -269,6 +289,7 @@ def read_held_out(
             f"{recordings[0]}: speeds in {held_out.speed_unit}, the training data are in {training_data.speed_unit}: "
             "give recordings of one unit"
         )
+    require_same_fans([training_data, held_out])
     for own in held_out.sources:
         for other in training_data.sources:
             if own.path == other.path and own.first_s <= other.last_s and other.first_s <= own.last_s:

@@ -74,7 +74,7 @@ def test_a_twin_of_the_first_part_predicts_the_rest_and_is_believed_only_where_i
 ):
     recording, twin, judged = (tmp_path / name for name in ("all.mcap", "twin.onnx", "judged.mcap"))
     imported(measured_data / file, recording, *columns)
-    part = ("--start", first_part_s, "--end", end_s)
+    part = ("--from", first_part_s, "--to", end_s)
     for words in (
         ("train", recording, "--model", "physical", "--to", first_part_s, "-o", twin),
         ("replay", recording, "--offline", "--twin", twin, *part, "-o", judged),

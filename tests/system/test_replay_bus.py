@@ -174,7 +174,7 @@ def test_at_full_speed_stages_take_every_message_change_to_the_learned_twins_and
         up = chain.start_up()
         with chain.watcher() as watcher:
             eventually(lambda: {v.health.stage for v in watcher.stages() if v.alive} == set(WORKING), "all are there")
-        done = as_typed("replay", source, "--rate", "max", "--from", "raw", "--json", *chain.words("")[1:])
+        done = as_typed("replay", source, "--rate", "max", "--from-topic", "raw", "--json", *chain.words("")[1:])
         status, account = up.end(), up.output()
     finally:
         chain.close()
@@ -209,7 +209,7 @@ def test_a_replay_paused_for_longer_than_the_watermark_gives_the_grid_of_a_resam
     core = ResamplerCore(8, ResamplerConfig(rate_hz=100.0))
     expected = [grid for entry in read_recording(recording) for grid in core.step(cast(Raw, entry.message))]
     site.start("resampler")
-    terminals.append(Terminal(site.words(recording, "--from", "raw", "--rate", 8, "--json")))
+    terminals.append(Terminal(site.words(recording, "--from-topic", "raw", "--rate", 8, "--json")))
     while site.next(Clock).t_ns < START_NS + 10**9:
         pass
     terminals[0].press(b" ")
@@ -263,7 +263,7 @@ def test_a_stage_that_writes_what_a_replay_writes_ends_it_and_keeps_the_next_fro
     while site.next(Health).status != StageStatus.STOPPED:
         pass
     refused = site.replay(recording)
-    assert (refused.returncode, refused.stderr) == (1, f"fantwin: {writes}: replay with --from raw, or stop it\n")
+    assert (refused.returncode, refused.stderr) == (1, f"fantwin: {writes}: replay with --from-topic raw, or stop it\n")
 
 
 @pytest.mark.parametrize("listens", [False], ids=["the replay is met first"])
@@ -310,6 +310,6 @@ def test_unreadable_parts_are_reported_in_the_output_and_the_exit_code(tmp_path,
     report = json.loads(done.stdout)
     assert report["damage"]
     assert 0 < report["messages"]["raw"] < 2000
-    none = as_typed("replay", whole, "--from", "grid", "--set", f"bus.endpoint={endpoint}")
-    expected = f"fantwin: {whole}: it holds no grid, or none between --start and --end"
+    none = as_typed("replay", whole, "--from-topic", "grid", "--set", f"bus.endpoint={endpoint}")
+    expected = f"fantwin: {whole}: it holds no grid, or none between --from and --to"
     assert (none.returncode, none.stderr.splitlines()[-1]) == (1, expected)

@@ -94,16 +94,21 @@ def short_warnings(pieces: Sequence[Run], time_constant_s: Array) -> tuple[str, 
 
 
 def misfit_warnings(pieces: Sequence[Run], rmse_rad_s: Array, floor_rad_s: Array) -> tuple[str, ...]:
-    """One line for each fan whose free run stays clear of its noise. pieces: without gaps.
+    """One line for the fans whose free run stays clear of their noise. pieces: without gaps.
 
     rmse_rad_s: (fans,). floor_rad_s: (fans,) of it due to the tacho alone, 0 where that is instantaneous.
     """
-    return tuple(
-        f"fan {fan}: the physical model misses the speed by {rmse:.3g} rad/s, of which noise explains {noise:.3g}: "
-        "friction, dead zone or drive bend its parameters, and their intervals, which hold for the equation as it is, "
-        "are too narrow; a hybrid learns the difference"
-        for fan, rmse in enumerate(rmse_rad_s)
-        if rmse > MISFIT * (noise := floor_rad_s[fan] or _noise(pieces, fan)) > 0.0
+    noise_rad_s = [floor_rad_s[fan] or _noise(pieces, fan) for fan in range(len(rmse_rad_s))]
+    fans = [fan for fan, noise in enumerate(noise_rad_s) if rmse_rad_s[fan] > MISFIT * noise > 0.0]
+    if not fans:
+        return ()
+    worst = max(fans, key=lambda fan: rmse_rad_s[fan])
+    which = f"fan{'s' * (len(fans) > 1)} {', '.join(map(str, fans))}"
+    misses = f"{'up to ' * (len(fans) > 1)}{rmse_rad_s[worst]:.3g} rad/s"
+    return (
+        f"{which}: the physical model misses the speed by {misses}, of which noise explains "
+        f"{noise_rad_s[worst]:.3g} rad/s: use a hybrid; here friction, a dead zone or a drive bend the parameters and "
+        "their intervals",
     )
 
 

@@ -70,7 +70,7 @@ class Identification:
     parameters, standard_errors: (fans, 4). covariance: (fans, 4, 4), degrees_of_freedom: (fans, 4) that it has.
     interval_95: (fans, 4, 2). A lag that was not found is zero, and so is its uncertainty. lambda_per_s, rmse_rad_s,
     time_constant_s, top_speed_rad_s: (fans,); the time constant is taken at the median speed. iterations: those of the
-    refinement. warnings: one line each, empty when all is well. misfits: one line for each fan that physics alone do
+    refinement. warnings: one line each, empty when all is well. misfits: one line for the fans that physics alone do
     not describe, which is what a hybrid is for.
     """
 

@@ -163,7 +163,7 @@ def _about_fans(content: Summary) -> Iterator[tuple[Callable[[FanSummary], bool]
     yield _few, f"{certain}; use longer recordings"
     yield lambda fan: _biased(fan) and fan.residual.mean_rad_s > 0.0, "on average faster than the twin"
     yield lambda fan: _biased(fan) and fan.residual.mean_rad_s < 0.0, "on average slower than the twin"
-    at_speeds = "the mean error exceeds sigma at some speeds: see Error over speed in `fantwin report`"
+    at_speeds = "the mean error exceeds sigma at some speeds, as the report shows (Error over speed)"
     yield _biased_at_a_speed, at_speeds
     misses = "the error correlates with the command: the twin misses part of its effect"
     yield lambda fan: abs(fan.residual.cross_over_bound) > CHANCE_PEAK, misses

@@ -11,7 +11,7 @@ from markupsafe import Markup
 
 from fantwin.schemas.model_uncertainty import ModelUncertainty
 from fantwin.schemas.twin_card import AS_DECLARED, LOOSER
-from fantwin.twin.evaluation.residual_analysis import SIGNIFICANCE
+from fantwin.twin.evaluation.residual_analysis import SETTLING_S, SIGNIFICANCE
 from fantwin.twin.kinds import kind_title
 from fantwin.twin.report import figures
 from fantwin.twin.report.assessment import Assessment, assess, least_known, level_of
@@ -65,6 +65,7 @@ def report_page(content: Content, assessment: Assessment | None = None, alarms: 
         alarms=alarms,
         as_declared=AS_DECLARED,
         looser=LOOSER,
+        settling_s=SETTLING_S,
         drawn=drawn,
         figures_of={fan.number: fan_figures(content, fan) for fan in drawn},
     )

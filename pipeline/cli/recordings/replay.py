@@ -50,8 +50,8 @@ def replay(
     rate: Annotated[
         str | None, typer.Option(metavar="X|max", help="Seconds of the recording per second; max: as fast as possible.")
     ] = None,
-    start: Annotated[float, typer.Option(help="Start, in s since the first message.")] = 0.0,
-    end: Annotated[float, typer.Option(help="End, in s since the first message.")] = math.inf,
+    start: Annotated[float, typer.Option("--from", metavar="S", help="Start, in s since the first message.")] = 0.0,
+    end: Annotated[float, typer.Option("--to", metavar="S", help="End, in s since the first message.")] = math.inf,
     pause: Annotated[bool, typer.Option("--pause", help="Start paused; space continues.")] = False,
     loop: Annotated[bool, typer.Option("--loop", help="Repeat until Ctrl-C; times continue.")] = False,
     topics: Annotated[
@@ -60,7 +60,6 @@ def replay(
     from_topic: Annotated[
         str | None,
         typer.Option(
-            "--from",
             metavar="TOPIC",
             help="Publish only the input of the stages that read TOPIC (raw, grid or prediction), and learned twins.",
         ),
@@ -100,17 +99,17 @@ def replay(
 
     With --offline, files of many recordings can be given: they are scored at once, and one result covers them all.
 
-    Example: fantwin replay recording.mcap --rate 4 --from raw -c fantwin.toml
+    Example: fantwin replay recording.mcap --rate 4 --from-topic raw -c fantwin.toml
 
     Example: fantwin replay --offline --verify site-*/*.mcap
     """
-    viewing = {"--rate": rate, "--pause": pause, "--loop": loop, "--topics": topics, "--from": from_topic}
+    viewing = {"--rate": rate, "--pause": pause, "--loop": loop, "--topics": topics, "--from-topic": from_topic}
     deciding = {"--twin": twin, "--output": output, "--verify": verify}
     deciding |= {"--jobs": jobs, "--skip-bad": skip_bad}
     for name in (name for name, value in (viewing if offline else deciding).items() if value):
         raise UsageError(f"{name} {'cannot be used' if offline else 'can only be used'} with --offline")
     if not 0.0 <= start < min(end, LONGEST_S) or (end > LONGEST_S and not math.isinf(end)):
-        raise UsageError("--start and --end: give 0 <= --start < --end, in seconds")
+        raise UsageError("--from and --to: give 0 <= --from < --to, in seconds")
     if offline:
         from fantwin.pipeline.cli.recordings.replay_offline import run_offline  # noqa: PLC0415  loads the stages
         from fantwin.pipeline.replay.offline.outcome import Again  # noqa: PLC0415
@@ -168,10 +167,10 @@ def replay(
 def _chosen_topics(topics: str | None, from_topic: str | None) -> tuple[str, ...]:
     if from_topic is not None:
         if topics is not None:
-            raise UsageError("give --topics or --from, not both")
+            raise UsageError("give --topics or --from-topic, not both")
         starts = replay_starts()
         if from_topic not in starts:
-            raise UsageError(f"--from {from_topic}: is not one of {', '.join(starts)}")
+            raise UsageError(f"--from-topic {from_topic}: is not one of {', '.join(starts)}")
         return starts[from_topic]
     if topics is None:
         return REPLAYED

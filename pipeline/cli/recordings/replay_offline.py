@@ -76,7 +76,7 @@ def _scored(files: tuple[Path, ...], again: Again, folder: Path | None) -> dict[
 
     def progress(tray: str, t_ns: int) -> None:
         since_s = (t_ns - first.setdefault(tray, t_ns)) / NS_PER_S
-        show_part(f"{tray}: {since_s:.0f} s so far")
+        show_part(f"{tray}: {since_s:.0f} s of the recording")
 
     return score_again(files, again, folder, progress)
 

@@ -82,7 +82,13 @@ def _fan_table(result: dict[str, Any]) -> Table:
     unit = result["speed_unit"]
     figures = (f"rmse\n{unit}", f"max error\n{unit}", "R2", f"one step\n{unit}")
     tests = (f"in ±2σ\n({EXPECTED_COVERAGE:.1%})", "white p", "cross\n/ bound")
-    table = table_of(["fan"], (*figures, *tests), padding=0)  # narrow: numbers are whole on a terminal of 80 columns
+    caption = (
+        "one step: corrected at each sample. white p: how probable the error is as noise. cross / bound: beyond ±2 the "
+        "error follows the command."
+    )
+    table = table_of(
+        ["fan"], (*figures, *tests), padding=0, caption=caption
+    )  # narrow: numbers are whole on a terminal of 80 columns
     for figures in result["fans"]:
         residual = figures["residual"]
         tests = (_probability(residual["ljung_box_p"]), shown(residual["cross_over_bound"], ".1f", "-"))

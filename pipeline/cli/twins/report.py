@@ -122,7 +122,8 @@ def _write_page(
             )
             assessment = assess(content)
             drops = drops_found(twin, training_data.rad_s_per_unit)
-            alarms = [drop.line(unit.name) for drop in drops] or ["alarms are not calibrated: fantwin calibrate"]
+            calibrate = f"fantwin calibrate {twin} HEALTHY.mcap... --false-alarms-per-day X"
+            alarms = [drop.line(unit.name) for drop in drops] or [f"alarms are not calibrated: {calibrate}"]
             page = report_page(content, assessment, alarms)
     write_whole(output, page.encode())
     warnings = [*training_data.outliers, *assessment.warnings]
@@ -221,12 +222,12 @@ def _table(result: dict[str, Any]) -> Table:
     """A row for each fan, the half width of each interval below its value."""
     mechanical = [name for name in result["parameters"] if name != "lag_s"]
     units = "; ".join(f"{name} in {result['units'][name]}" for name in mechanical)
-    columns = (*mechanical, "lag\nms", "time\nconst. s", f"rmse\n{result['speed_unit']}", "lambda\n1/s")
+    columns = (*mechanical, "lag\nms", "time\nconst. s", f"rmse\n{result['speed_unit']}")
     caption = f"{units}. ± is half a 95 % interval; the time constant is that at the median speed."
     table = table_of(["fan"], columns, pad_edge=False, caption=caption)
     for fan in result["fans"]:
         values = [_with_interval(fan[name], fan[f"{name}_95"]) for name in mechanical]
-        figures = (f"{fan['time_constant_s']:.3g}", f"{fan['rmse']:.4g}", f"{fan['lambda_per_s']:.3g}")
+        figures = (f"{fan['time_constant_s']:.3g}", f"{fan['rmse']:.4g}")
         table.add_row(escape(fan_cell(fan["fan"], fan["name"])), *values, _lag(fan), *figures)
     return table
 

@@ -61,7 +61,7 @@ def conflict(present: Collection[Present], topics: Collection[str], trays: Colle
         for topic in each.stage.writes:
             if topic in topics:
                 other = _another_start(present)
-                way_out = f"replay with --from {other}, or stop it" if other else "stop it"
+                way_out = f"replay with --from-topic {other}, or stop it" if other else "stop it"
                 return f"{each.label} of site {site!r} is running and writes {topic} itself: {way_out}"
     answering = [each for each in present if "request" in each.stage.reads and "alarm" in each.stage.writes]
     if "request" in topics and answering:

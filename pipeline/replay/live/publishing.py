@@ -104,7 +104,7 @@ def publish(
                 rounds = playback.rounds() if loop else ((0, entry) for entry in playback)
                 player.play((number, entry) for number, entry in rounds if entry.topic in topics)
                 if not sender.sent:
-                    none = f"it holds no {' or '.join(recorded_topics)}, or none between --start and --end"
+                    none = f"it holds no {' or '.join(recorded_topics)}, or none between --from and --to"
                     raise UserError(f"{playback.files[0]}: {none}")
                 outcome.behind = listeners.wait_until_drained(
                     sender.producer, sender.published(), stop, player.heartbeat_after_end

@@ -146,7 +146,7 @@ class RescoredTray:
         if self.scored:
             return ""
         if not self.not_judged:
-            return f"{self.tray}: no sample lies between --start and --end"
+            return f"{self.tray}: no sample lies between --from and --to"
         reasons = ", ".join(f"{count} {why.replace('_', ' ')}" for why, count in self.not_judged.most_common(3))
         return f"{self.tray}: no sample could be scored (of fans: {reasons}): does the twin fit this recording?"
 
@@ -208,7 +208,7 @@ def rescore(
     """
     if verify and replay_input.is_part:
         raise CannotCompareError(
-            f"{replay_input.paths[0]}: a part of a run cannot be compared: leave out --start and --end"
+            f"{replay_input.paths[0]}: a part of a run cannot be compared: leave out --from and --to"
         )
     plans = {tray.name: replay_input.read_plan(tray.name) for tray in replay_input.trays}
     if verify and all(found.why_not_verified for found in plans.values()):

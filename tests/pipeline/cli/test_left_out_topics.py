@@ -107,7 +107,7 @@ def test_an_export_has_raw_samples_and_names_what_is_missing(lean, tmp_path):
 
 
 def test_topics_that_are_not_there_cannot_be_replayed(lean):
-    for words in (("--from", "grid"), ("--topics", "grid,alarm")):
+    for words in (("--from-topic", "grid"), ("--topics", "grid,alarm")):
         assert error_of("replay", lean, *words) == f"{lean}: {advice(lean, 'grid')}"
 
 

@@ -1,13 +1,17 @@
 """Progress on stderr while a command works without a terminal."""
 
 import math
+import re
 import signal
 from collections.abc import Iterator
+from functools import partial
+from io import StringIO
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, cast
 
 import pytest
 import typer
+from rich.console import Console
 
 from fantwin.pipeline.cli import progress
 
@@ -17,27 +21,39 @@ if TYPE_CHECKING:
 TRAINING_DATA = cast("TrainingData", SimpleNamespace(rad_s_per_unit=0.1, speed_unit="rpm"))
 
 
-def test_without_a_terminal_a_line_reports_each_part_and_then_its_progress_every_few_seconds(
+def test_without_a_terminal_a_line_reports_each_part_and_then_its_progress_ever_more_rarely(
     monkeypatch, capsys
 ) -> None:
     now_s = [100.0]
     monkeypatch.setattr(progress.time, "monotonic", lambda: now_s[0])
     with progress.training_progress(TRAINING_DATA) as start:
         report = start("hybrid")
-        for iteration in range(1, 14):
+        for iteration in range(1, 50):
             now_s[0] += 1.0
             report("training", iteration, 60, 0.5)
         report("evaluation", 0, 0, math.nan)
         start("NARX")("identification", 1, 9, math.nan)
     output = capsys.readouterr()
     assert output.err.splitlines() == [
-        "hybrid: training 1/60, free-run rmse 5 rpm, 1 s",
-        "hybrid: training 6/60, free-run rmse 5 rpm, 6 s",
-        "hybrid: training 11/60, free-run rmse 5 rpm, 11 s",
-        "hybrid: evaluation, 13 s",
-        "NARX: identification 1/9, 0 s",
+        "hybrid: training 1/60, free-run rmse 5 rpm, 1 s so far",
+        "hybrid: training 6/60, free-run rmse 5 rpm, 6 s so far, up to 54 s left",
+        "hybrid: training 16/60, free-run rmse 5 rpm, 16 s so far, up to 44 s left",
+        "hybrid: training 36/60, free-run rmse 5 rpm, 36 s so far, up to 24 s left",
+        "hybrid: evaluation, 49 s so far",
+        "NARX: identification 1/9, 0 s so far",
     ]
     assert output.out == ""
+
+
+def test_on_a_terminal_the_bar_has_the_share_and_the_time_left(monkeypatch) -> None:
+    screen = StringIO()
+    monkeypatch.setattr(progress, "Console", partial(Console, file=screen, force_terminal=True, width=120))
+    with progress.training_progress(TRAINING_DATA) as start:
+        report = start("hybrid")
+        for iteration in (0, 15, 30):
+            report("training", iteration, 60, 0.5)
+    assert "30/60" in screen.getvalue() and "50%" in screen.getvalue()
+    assert re.search(r"so far, up to.*\d:\d\d:\d\d.*left", screen.getvalue())
 
 
 def test_without_a_terminal_work_is_reported_once(capsys: pytest.CaptureFixture[str]) -> None:

@@ -130,7 +130,7 @@ def test_the_list_names_severity_and_probable_cause_and_is_not_wide(golden, outp
     for expected in (alarm["severity"], cause, what):
         assert expected in row
     twin = unlimited(read_metadata(GOLDEN).attachments["tray1.onnx"], tmp_path)
-    what_if = replay(GOLDEN, "--twin", twin, "--end", "12").stdout.splitlines()
+    what_if = replay(GOLDEN, "--twin", twin, "--to", "12").stdout.splitlines()
     assert "against the recording: 1 alarms lost" in what_if
     (gone,) = [line for line in what_if if line.lstrip().startswith("tray1")]
     assert alarm["severity"] in gone and cause in gone
@@ -144,11 +144,11 @@ def test_a_twin_that_is_not_calibrated_or_does_not_follow_is_said_and_what_was_n
     sigma = [value / 5.0 for value in json.loads(card.value)["sigma_rad_s"]]
     entries = {"calibration": None, "sigma_rad_s": sigma, "reading_sigma_rad_s": [], "model_uncertainty": None}
     twin.write_bytes(with_card_entries(content, entries))
-    found = json.loads(replay("--json", GOLDEN, "--twin", twin, "--end", "5").stdout)
+    found = json.loads(replay("--json", GOLDEN, "--twin", twin, "--to", "5").stdout)
     uncalibrated, misfit = found["warnings"]
     assert uncalibrated.startswith(f"{twin} is not calibrated: its alarms are by the priors of a population")
     assert re.match(r"tray1: the twin does not follow fans 0, 1.*: rmse up to [\d.]+ times its sigma: a fault", misfit)
-    shown = replay(GOLDEN, "--twin", twin, "--end", "5").stdout
+    shown = replay(GOLDEN, "--twin", twin, "--to", "5").stdout
     assert f"warning: {misfit}" in shown and f"warning: {uncalibrated}" in shown
     reasons = found["not_judged"]["tray1"]
     share = sum(reasons.values()) / (found["judged"] + sum(reasons.values()))
@@ -162,7 +162,7 @@ def test_another_configuration_file_is_taken(golden, tmp_path):
     text = text.replace("alarm_share = 0.2", "alarm_share = 0.01")
     config = tmp_path / "other.toml"
     config.write_text(text.replace('twin = "twin.onnx"\n', ""))
-    before, now = golden["alarms"], json.loads(replay("--json", GOLDEN, "-c", config, "--end", "8").stdout)["alarms"]
+    before, now = golden["alarms"], json.loads(replay("--json", GOLDEN, "-c", config, "--to", "8").stdout)["alarms"]
     assert [each["severity"] for each in (*before, *now)] == ["warning", "alarm"]
 
 
@@ -200,7 +200,7 @@ def test_an_imported_table_is_judged_at_the_rate_of_the_twin(tmp_path):
 
 
 def test_times_of_a_table_without_dates_are_seconds_since_its_first_sample(tmp_path):
-    zero_ns, part = 5 * NS_PER_S, ("--start", "1", "--end", "6")
+    zero_ns, part = 5 * NS_PER_S, ("--from", "1", "--to", "6")
     recorded = [entry.message for entry in read_recording(GOLDEN, ("raw",))]
     table, twin = tmp_path / "table.mcap", tmp_path / "twin.onnx"
     twin.write_bytes(read_metadata(GOLDEN).attachments["tray1.onnx"])
@@ -229,7 +229,7 @@ def test_no_file_is_ever_written_over(tmp_path):
 
 
 def test_a_time_range_is_judged_and_compared_with_the_recorded_alarms_of_that_range():
-    document = json.loads(replay("--json", GOLDEN, "--end", "3", "--set", "scorer.alarm_share=0.2").stdout)
+    document = json.loads(replay("--json", GOLDEN, "--to", "3", "--set", "scorer.alarm_share=0.2").stdout)
     assert document["what_if"] == {"gained": [], "lost": [], "kept": []}, "the alarm comes later"
     assert 120 < document["samples"] < 160
 
@@ -242,7 +242,7 @@ def test_files_of_two_runs_are_two_recordings(golden, short):
         assert both[name] == sum(one[name] for one in each)
     assert both["verified"]["samples_equal"] == sum(one["verified"]["samples_equal"] for one in each)
     assert both["verified"]["equal"]
-    shown = replay(GOLDEN, short, "--end", "6").stdout
+    shown = replay(GOLDEN, short, "--to", "6").stdout
     assert "1 alarm in" in shown and f"{GOLDEN}: alarms, s since the first sample" in shown
 
 

@@ -101,6 +101,20 @@ def test_the_tacho_of_a_recording_counts_and_readings_that_speak_for_another_are
     assert OnnxTwin(tmp_path / "twin.onnx").card.tacho == (tacho,)
 
 
+def test_recordings_of_other_fans_are_named_before_anything_is_made_of_them(folder, twin, tmp_path):
+    one, two = folder / "healthy.mcap", folder / "two.mcap"
+    expected = f"recordings of different numbers of fans, 1 ({one}) and 2 ({two}): give those of one tray"
+    page = tmp_path / "page.html"
+    for words in (
+        ("evaluate", twin, one, two),
+        ("report", twin, one, two, "-o", page),
+        ("train", one, two, "-o", tmp_path / "t.onnx"),
+        ("train", one, "--validate", two, "-o", tmp_path / "t.onnx"),
+    ):
+        assert error_of(*words).startswith(expected)
+        assert not list(tmp_path.iterdir())
+
+
 def test_ctrl_c_during_training_leaves_no_twin(folder, tmp_path, monkeypatch):
     def interrupted(*_arguments, **_options):
         raise KeyboardInterrupt
@@ -133,17 +147,19 @@ def test_the_error_of_a_good_twin_is_the_noise_in_the_recordings_own_unit(folder
     assert " rpm, max error " in fantwin("evaluate", twin, folder / "healthy-rpm.mcap").stdout
 
 
-def test_warnings_name_the_recordings_fans_and_speeds_in_their_own_unit_too():
+def test_warnings_name_the_recordings_fans_together_and_speeds_in_their_unit():
     data = TrainingData([], [], "rpm", [3, 5], ("b.mcap: fan 3: outliers",))
-    warnings = ["fan 1: it misses the speed by 5.9 rad/s", "fan 0: the speed keeps between 44 and 1.2e+02 rad/s"]
+    slow = "the speed keeps between 44 and 1.2e+02 rad/s"
+    warnings = ["fans 0, 1: they miss the speed by 5.9 rad/s", f"fan 0: {slow}", "too short", f"fan 1: {slow}"]
     assert data.with_fan_numbers(warnings) == [
         "b.mcap: fan 3: outliers",
-        "fan 5: it misses the speed by 5.9 rad/s (56.3 rpm)",
-        "fan 3: the speed keeps between 44 and 1.2e+02 rad/s (420 and 1150 rpm)",
+        "fans 3, 5: they miss the speed by 56.3 rpm",
+        "fans 3, 5: the speed keeps between 420 and 1150 rpm",
+        "too short",
     ]
     assert replace(data, speed_unit="rad/s").with_fan_numbers(warnings[:1]) == [
         data.outliers[0],
-        "fan 5: it misses the speed by 5.9 rad/s",
+        "fans 3, 5: they miss the speed by 5.9 rad/s",
     ]
 
 

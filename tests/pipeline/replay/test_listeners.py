@@ -35,9 +35,13 @@ def there(*labels: str) -> list[Present]:
         (["acquisition/a"], ALL, ["acquisition/a", "commands", "not for the fans of today"]),
         (["acquisition/other", "resampler"], ("raw",), []),
         (["acquisition/a", "resampler"], ("raw",), ["acquisition/a", "writes raw itself: stop it"]),
-        (["resampler", "scorer", "viewer"], ALL, ["resampler", "writes grid itself", "--from raw, or stop it"]),
-        (["twin_integrator", "scorer"], ("raw", "grid", "prediction"), ["writes prediction itself", "--from grid"]),
-        (["scorer", "viewer"], ALL, ["scorer", "writes score itself", "--from prediction"]),
+        (["resampler", "scorer", "viewer"], ALL, ["resampler", "writes grid itself", "--from-topic raw, or stop it"]),
+        (
+            ["twin_integrator", "scorer"],
+            ("raw", "grid", "prediction"),
+            ["writes prediction itself", "--from-topic grid"],
+        ),
+        (["scorer", "viewer"], ALL, ["scorer", "writes score itself", "--from-topic prediction"]),
         (["scorer", "viewer"], ("prediction", "twin"), []),
         (["resampler", "scorer"], ("raw", "request"), ["scorer", "recorded requests are not", "leave request out"]),
         (["viewer", "recorder"], (*ALL, "request"), []),
@@ -57,8 +61,12 @@ def test_recorded_versions_of_a_twin_are_left_to_a_learner_that_is_running_and_r
     assert conflict(there(*others), topics, {"a"}, "plant") == ""
     assert made_by_stages(there(*others, "learner"), topics) == {"new_twin": "learner"}
     line = conflict(there(*others, "learner"), topics, {"a"}, "plant")
-    assert line == ("learner of site 'plant' is running and writes new_twin itself: replay with --from raw, or stop it")
-    assert "--from raw" in conflict(there(*others, "learner"), ALL, {"a"}, "plant"), "a learner is no obstacle to that"
+    assert line == (
+        "learner of site 'plant' is running and writes new_twin itself: replay with --from-topic raw, or stop it"
+    )
+    assert "--from-topic raw" in conflict(there(*others, "learner"), ALL, {"a"}, "plant"), (
+        "a learner is no obstacle to that"
+    )
 
 
 class FakeStage:

@@ -41,7 +41,9 @@ def test_95_percent_intervals_hold_the_truth_in_95_percent_of_recordings() -> No
 def test_a_fan_that_physics_alone_do_not_describe_is_reported(published) -> None:
     assert published[1].misfits == ()
     found = identify([fan_data.rough_run(1, 40.0)])
-    assert "the physical model misses the speed" in found.misfits[0]
+    assert "fan 0: the physical model misses the speed by " in found.misfits[0]
+    (line,) = identify([fan_data.rough_run(1, 40.0, fans=3)]).misfits
+    assert line.startswith("fans 0, 1, 2: the physical model misses the speed by up to ") and "use a hybrid" in line
 
 
 def test_a_lag_is_found_where_there_is_one_and_none_where_there_is_none(published) -> None:

@@ -165,6 +165,8 @@ def test_the_page_holds_every_section_and_every_figure_and_needs_nothing_but_its
     assert len(parsed.ids) == len(set(parsed.ids))
     targets = {reference[1:] for reference in parsed.references} | set(re.findall(r"url\(#([^)]*)\)", page))
     assert targets <= set(parsed.ids)
+    of_all = re.search(r"over ([\d,]+) of\s([\d,]+) samples, without the first 3 s of each run", parsed.text)
+    assert of_all and of_all[1] != of_all[2], parsed.text
 
 
 def test_json_and_page_hold_the_figures_of_evaluate(reported, page, evaluated):
