@@ -64,6 +64,26 @@ def test_imrclab_is_imported_as_four_fans_of_one_command_without_times(measured_
     assert result["duration_s"] == pytest.approx((len(ours) - 1) * 0.01)
 
 
+IMRCLAB = ("--period", "10ms", "--command", "pwm", *(f"--speed=rpm{k}:rpm" for k in (1, 2, 3, 4)))
+
+
+@pytest.mark.parametrize(
+    ("file", "columns", "trained_on", "held_out"),
+    [
+        ("esc_test/f40_steps_5-2.csv", ESC_TEST, ("--from", 20), ("--to", 20)),
+        ("imrclab/cf21_stock2.csv", IMRCLAB, ("--to", 9), ("--from", 9, "--to", 14)),
+    ],
+)
+def test_a_recipe_for_public_data_ends_in_a_twin_that_follows(
+    file, columns, trained_on, held_out, measured_data, tmp_path
+):
+    recording, twin = tmp_path / "all.mcap", tmp_path / "twin.onnx"
+    imported(measured_data / file, recording, *columns)
+    assert fantwin("train", recording, *trained_on, "--model", "physical", "-o", twin).exit_code == 0
+    found = json.loads(fantwin("evaluate", twin, recording, *held_out, "--json").stdout)
+    assert found["assessment"] == "as declared", found["headline"]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("file", "columns", "first_part_s", "end_s"),

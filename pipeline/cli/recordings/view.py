@@ -46,7 +46,8 @@ def view(
 ) -> None:
     """Turn a recording into a view file for Rerun, or plot its speeds, predictions, bands, alarms and states.
 
-    Topics that the recorder left out (recorder.topics) are made again first.
+    Topics that the recorder left out (recorder.topics) are made again first. An imported recording has no twin: make
+    its scores with `fantwin replay REC.mcap --offline --twin TWIN.onnx -o SCORED.mcap`.
 
     Exits with 3 if the recording could not be read in full, or if making the topics again shows that data were lost.
     The rest is shown then.
