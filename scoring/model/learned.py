@@ -175,8 +175,9 @@ def _of_growth(
     """Return the standard deviation of what makes segments that are farther apart differ more, by a share of its
     variance. pairs, squares, apart: of the nearer and the farther ones.
 
-    Its variance is log-normal around the prior, and the growth is known with the error of two estimated variances: a
-    growth that noise hides says nothing against the prior.
+    Its variance is log-normal around the prior, and the growth is known with the error of two estimated variances; the
+    upper end of the standard error of the logarithm is returned. A growth that noise hides says little against the
+    prior.
     """
     numbers = [number / distance for number, distance in zip(pairs, apart, strict=True)]
     if min(numbers) < 1.0:
@@ -187,7 +188,8 @@ def _of_growth(
     misfit = (far - near - share * prior**2 * np.exp(logs)) / error if error > 0.0 else np.zeros_like(logs)
     density = -0.5 * (np.square(misfit) + np.square(logs) / POPULATION)
     weights = np.exp(density - density.max())
-    log = float(weights @ logs / weights.sum())
+    mean = float(weights @ logs / weights.sum())
+    log = mean + math.sqrt(float(weights @ np.square(logs - mean) / weights.sum()))
     if log < 0.0:
         log *= POPULATION / (POPULATION + DAY / max(fan_days, 1e-9))
     return prior * math.exp(0.5 * log)

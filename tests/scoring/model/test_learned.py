@@ -70,7 +70,7 @@ def test_what_noise_hides_widens_no_prior_so_that_a_fan_that_is_slow_from_its_fi
     """A tray read once a second, whose readings scatter by a per cent: the air is not seen, and was taken for six."""
     pairs, noise = np.array([600.0, 300.0, 75.0]), 0.01
     priors = learned_priors([RunSums(np.full(3, 7200.0), np.zeros(3), pairs, 2.0 * pairs * noise**2)])
-    assert priors.air == pytest.approx(Priors().air, rel=0.3)
+    assert priors.air < 0.025
     whole = running(FANS, 20.0, 0)
     slow = replace(whole, measured_speed_rad_s=0.82 * whole.measured_speed_rad_s)
     fans = made_fans(FANS)
