@@ -264,4 +264,4 @@ def _tachos(t_s: Array, speed_rad_s: Array, tray: TrayConfig) -> Iterator[Findin
 
 def _speeds(speed_rad_s: Array, unit: SpeedUnit) -> str:
     slowest, fastest = (float(of(speed_rad_s)) / RAD_S_PER_UNIT[unit] for of in (np.nanmin, np.nanmax))
-    return f"{slowest:.0f} to {fastest:.0f} {unit}"
+    return f"{round(slowest)} to {round(fastest)} {unit}"

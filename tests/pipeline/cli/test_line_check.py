@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import fantwin.client
-from fantwin.pipeline.cli.watch.line_check import _findings, check_line, refusal
+from fantwin.pipeline.cli.watch.line_check import Finding, _findings, check_line, refusal
 from fantwin.pipeline.config.loading import parse_config
 from fantwin.pipeline.config.settings import Config
 from fantwin.pipeline.runtime.stage import Context
@@ -49,7 +49,7 @@ def line_of(at_s: Array, speed_rad_s: Array, fans: int = 2) -> list[Raw]:
     ]
 
 
-def found(rate_hz: float, speed_rad_s: float = 300.0, fans: int = 2, **keys: object) -> list[tuple[bool, str]]:
+def found(rate_hz: float, speed_rad_s: float = 300.0, fans: int = 2, **keys: object) -> list[Finding]:
     config, numbers = config_of(**keys), np.arange(max(3, round(2 * rate_hz)))
     line = line_of(numbers / rate_hz, speed_rad_s + numbers, fans)
     return list(_findings(line, config.trays[0], config, None, {}))
