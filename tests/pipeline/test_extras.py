@@ -127,7 +127,7 @@ def printed_by(command: str, capsys: pytest.CaptureFixture[str], monkeypatch: py
     ("command", "requirement"),
     [
         ("export r.mcap --to parquet", "fantwin[logs]"),
-        ("import log.ulg --list", "fantwin[logs]"),
+        ("import log.ulg --preview", "fantwin[logs]"),
         ("view r.mcap -o view.rrd", "fantwin[view]"),
         ("view r.mcap -o r.png", "fantwin[report]"),
         (f"report {DEMO / 'twin.onnx'} r.mcap", "fantwin[report]"),

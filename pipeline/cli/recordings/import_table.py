@@ -6,23 +6,23 @@ import re
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
-import numpy as np
 import typer
 
 from fantwin.pipeline.cli.options import JsonOption
 from fantwin.pipeline.cli.printing import show
+from fantwin.pipeline.cli.recordings.import_preview import show_previews
 from fantwin.pipeline.config.settings import NAME_PATTERN
 from fantwin.pipeline.errors import UsageError, UserError
 from fantwin.pipeline.recordings.raw_recordings import write_table
-from fantwin.pipeline.sources.logs.formats import LogFormat, log_format, open_log
+from fantwin.pipeline.sources.logs.formats import log_format, open_log
+from fantwin.pipeline.sources.logs.preview import preview_of_log
 from fantwin.pipeline.sources.logs.samples_of_log import read_samples
 from fantwin.pipeline.sources.tables.measured_table import Table, read_table
 from fantwin.pipeline.sources.tables.tachos import parse_tachos
 from fantwin.pipeline.sources.tacho_evidence import tacho_hints
 from fantwin.schemas.channels import CHANNELS
-from fantwin.schemas.messages import Array
 from fantwin.schemas.topics import RESERVED_TRAY_NAMES
 from fantwin.schemas.units import NS_PER_S
 
@@ -78,8 +78,9 @@ def import_table(
         ),
     ] = None,
     poles: Annotated[int | None, typer.Option(help="Magnetic poles of a motor, for speeds in erpm.")] = None,
-    list_fields: Annotated[
-        bool, typer.Option("--list", help="Show the fields of a log and their rates; import nothing.")
+    preview: Annotated[
+        bool,
+        typer.Option("--preview", help="Show what was understood, and the command that imports it; write nothing."),
     ] = False,
     force: Annotated[bool, typer.Option("--force", help="Replace an existing recording.")] = False,
     json_output: JsonOption = False,
@@ -94,11 +95,13 @@ def import_table(
     Example: fantwin import FLIGHT.ulg --command 'out.u[*]' --speed 'esc.rpm[*]:rpm' -o REC.mcap
     """
     kind = log_format(file)
-    if list_fields:
-        _list_fields(file, kind, json_output=json_output)
+    if preview:
+        if kind is None:
+            raise UsageError(f"{file}: --preview is for logs; the first line of a table names its columns")
+        show_previews([preview_of_log(file, kind, open_log(file, kind))], json_output=json_output)
         return
     if output is None or not command or not speed:
-        what = "-o, --command and --speed" if kind is None else "-o, --command and --speed; --list shows the fields"
+        what = "-o, --command and --speed" if kind is None else "-o, --command and --speed; --preview shows the fields"
         raise UsageError(f"an import needs {what}")
     if not re.match(NAME_PATTERN, tray) or tray in RESERVED_TRAY_NAMES:
         raise UsageError(f"--tray {tray}: use letters, digits, - and _, but not {' or '.join(RESERVED_TRAY_NAMES)}")
@@ -125,30 +128,6 @@ def import_table(
     show(import_summary(table, output) | {"hints": hints, "notes": notes}, *lines, json_output=json_output)
     for hint in hints if not json_output else ():
         typer.echo(f"hint: {hint}; see --tacho", err=True)
-
-
-def _list_fields(file: Path, kind: LogFormat | None, *, json_output: bool) -> None:
-    """Show the fields of a log, with the number of their values and their rates."""
-    if kind is None:
-        raise UsageError(f"{file}: --list is for logs; the first line of a table names its columns")
-    log = open_log(file, kind)
-    series = log.read(log.names)
-    width = max(map(len, log.names), default=0)
-    rows: list[dict[str, Any]] = []
-    lines: list[str] = []
-    for name, each in series.items():
-        low, high = _range(each.values)
-        count, span = len(each.values), "no numbers" if low is None else f"{low:10.6g} to {high:.6g}"
-        rows.append({"name": name, "values": count, "rate_hz": each.rate_hz, "lowest": low, "highest": high})
-        lines.append(f"{name:{width}}  {count:7d} values  {each.rate_hz:8.3g} Hz  {span}")
-    lines.append(f"{file}: {kind.title}, {len(log.names)} fields")
-    show({"format": kind.title, "fields": rows}, *lines, json_output=json_output)
-
-
-def _range(values: Array) -> tuple[float, float] | tuple[None, None]:
-    """Lowest and highest value; None without a number."""
-    known = values[np.isfinite(values)]
-    return (float(known.min()), float(known.max())) if len(known) else (None, None)
 
 
 def _channels(given: Sequence[str]) -> dict[str, list[str]]:

@@ -53,4 +53,4 @@ def _formats(folder: Path) -> Iterator[tuple[str, Path]]:
 
 def _import_of(title: str, path: Path) -> str:
     named = f"fantwin import {shlex.quote(str(path))}"
-    return f"{named} --time t:s --command u --speed y:rpm -o REC.mcap" if title == "table" else f"{named} --list"
+    return f"{named} --time t:s --command u --speed y:rpm -o REC.mcap" if title == "table" else f"{named} --preview"

@@ -150,5 +150,5 @@ def _there_are(names: Sequence[str], given: str) -> str:
     if close:
         return f"did you mean {' or '.join(map(repr, close))}?"
     known = list(filter(None, names))
-    more = " and more; --list shows those of a log" if len(known) > MOST_SHOWN else ""
+    more = " and more; --preview shows those of a log" if len(known) > MOST_SHOWN else ""
     return f"it has {', '.join(known[:MOST_SHOWN])}{more}"

@@ -86,14 +86,14 @@ def test_a_ros_bag_with_times_of_its_messages(tmp_path: Path, storage: str) -> N
     np.testing.assert_allclose(speed_rad_s / RPM, SPEEDS, rtol=1e-12)
 
 
-def test_the_fields_are_listed_with_their_rates(tmp_path: Path) -> None:
+def test_a_preview_shows_the_fields_with_their_rates_and_the_command_that_imports_the_log(tmp_path: Path) -> None:
     path, field = ulog(tmp_path), "esc_status.esc[1].esc_rpm"
-    listed = json.loads(fantwin("import", path, "--list", "--json").stdout)
-    assert listed["format"] == "ULog"
-    found = {each["name"]: each for each in listed["fields"]}
+    (shown,) = json.loads(fantwin("import", path, "--preview", "--json").stdout)["files"]
+    found = {each["name"]: each for each in shown["columns"]}
     assert (found[field]["values"], found[field]["rate_hz"]) == (200, pytest.approx(50))
-    lines = fantwin("import", path, "--list").stdout.splitlines()
-    assert lines[-1].startswith(f"{path}: ULog, {len(found)} fields")
+    lines = fantwin("import", path, "--preview").stdout.splitlines()
+    assert lines[0] == f"{path}: ULog, {len(found)} fields"
     assert any(line.startswith(field) for line in lines)
+    assert lines[-1].startswith(f"to import it: fantwin import {path} --command ")
     path.write_bytes(path.read_bytes()[:20])
-    assert "this ULog has no fields with numbers; is it damaged?" in error_of("import", path, "--list")
+    assert "this ULog has no fields with numbers; is it damaged?" in error_of("import", path, "--preview")

@@ -134,7 +134,7 @@ def test_logs_need_no_configuration_and_the_command_that_reads_them_is_said(file
     (logs / "bench.csv").write_text("t,u,y\n0,1,2\n")
     shown = fantwin("init", "--logs", logs).stdout.splitlines()
     assert shown[-2:] == [
-        f"next: fantwin import {logs}/day/flight.ulg --list",
+        f"next: fantwin import {logs}/day/flight.ulg --preview",
         f"next: fantwin import {logs}/bench.csv --time t:s --command u --speed y:rpm -o REC.mcap",
     ]
     assert not file.exists()

@@ -40,7 +40,7 @@ def test_a_format_with_a_row_is_recognised_listed_and_imported(tmp_path: Path, m
     lines = [f"{0.1 * k:.1f} {0.5 + 0.01 * (k % 7):.2f} {600 + k}" for k in range(50)]
     log.write_bytes(START + "\n".join(lines).encode())
 
-    listed = fantwin("import", log, "--list")
+    listed = fantwin("import", log, "--preview")
     assert "duty" in listed.stdout and "toy log, 2 fields" in listed.stdout
     words = ("--command", "duty", "--speed", "rpm:rpm", "-o", recording)
     imported = fantwin("import", log, *words)

@@ -1,0 +1,16 @@
+"""What a log was understood to be: its format and its fields, each with its rate and range."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from fantwin.pipeline.sources.logs.formats import LogFormat
+from fantwin.pipeline.sources.logs.log_file import LogFile
+from fantwin.pipeline.sources.preview import Preview, column_of
+
+
+def preview_of_log(path: Path, kind: LogFormat, log: LogFile) -> Preview:
+    """The fields of an open log. Raises LogError."""
+    series = log.read(log.names)
+    columns = tuple(column_of(name, each.values, rate_hz=each.rate_hz) for name, each in series.items())
+    return Preview(path, (f"{kind.title}, {len(columns)} fields",), columns, notes=tuple(log.notes))
