@@ -9,9 +9,8 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 from fantwin.pipeline.errors import FantwinError
-from fantwin.pipeline.sources.tables.cells import NS_PER_UNIT
 from fantwin.pipeline.sources.tables.fan_columns import with_unit
-from fantwin.pipeline.sources.tables.measured_table import RAD_S_PER_TABLE_UNIT
+from fantwin.pipeline.sources.tables.units import NS_PER_UNIT, RAD_S_PER_TABLE_UNIT
 from fantwin.schemas.channels import CHANNELS
 
 Fan: TypeAlias = int | str

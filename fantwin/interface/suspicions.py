@@ -12,7 +12,8 @@ from fantwin.interface.tables import NAME, Array, FanTable
 from fantwin.interface.words import warn
 from fantwin.pipeline.errors import FantwinError
 from fantwin.pipeline.prediction.tray_twin import Balance, TrayTwin
-from fantwin.pipeline.sources.tables.measured_table import RAD_S_PER_TABLE_UNIT, Table
+from fantwin.pipeline.sources.tables.measured_table import Table
+from fantwin.pipeline.sources.tables.units import RAD_S_PER_TABLE_UNIT
 from fantwin.schemas.messages import Score
 from fantwin.schemas.twin_card import TwinCard
 

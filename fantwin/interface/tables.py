@@ -19,7 +19,8 @@ from fantwin.interface.columns import SUFFIX_OF_UNIT, Columns, Fan, FoundColumns
 from fantwin.interface.words import warn
 from fantwin.pipeline.errors import FantwinError
 from fantwin.pipeline.sources.tables.fan_columns import FanColumns
-from fantwin.pipeline.sources.tables.measured_table import RAD_S_PER_TABLE_UNIT, Table, table_of
+from fantwin.pipeline.sources.tables.measured_table import Table, table_of
+from fantwin.pipeline.sources.tables.units import RAD_S_PER_TABLE_UNIT
 from fantwin.schemas.messages import FURTHEST_T_NS
 from fantwin.schemas.units import NS_PER_S
 

@@ -17,7 +17,7 @@ from fantwin.pipeline.errors import UsageError, UserError
 from fantwin.pipeline.recordings.checksum import sha256_of
 from fantwin.pipeline.recordings.training_runs import RecordedRun, RecordedTray, read_runs
 from fantwin.pipeline.replay.offline.healthy_runs import MapRecordings
-from fantwin.pipeline.sources.tables.measured_table import RAD_S_PER_TABLE_UNIT
+from fantwin.pipeline.sources.tables.units import RAD_S_PER_TABLE_UNIT
 from fantwin.pipeline.sources.tacho_evidence import tacho_hints
 from fantwin.schemas.fan_names import NO_NAMES, FanNames
 from fantwin.schemas.tacho import Tacho

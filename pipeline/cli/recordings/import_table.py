@@ -1,10 +1,11 @@
-"""`fantwin import`: turns a measured table, or the log of another system, into a recording."""
+"""`fantwin import`: turns measured tables, or logs of other systems, into a recording."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Sequence
 from dataclasses import asdict
+from glob import glob
 from pathlib import Path
 from typing import Annotated
 
@@ -16,10 +17,8 @@ from fantwin.pipeline.cli.recordings.import_preview import show_previews
 from fantwin.pipeline.config.settings import NAME_PATTERN
 from fantwin.pipeline.errors import UsageError, UserError
 from fantwin.pipeline.recordings.raw_recordings import write_table
-from fantwin.pipeline.sources.logs.formats import log_format, open_log
-from fantwin.pipeline.sources.logs.preview import preview_of_log
-from fantwin.pipeline.sources.logs.samples_of_log import read_samples
-from fantwin.pipeline.sources.tables.measured_table import Table, read_table
+from fantwin.pipeline.sources.imported_file import Wanted, in_one, preview_of, read_file
+from fantwin.pipeline.sources.tables.measured_table import Reading, Table, period_in_words
 from fantwin.pipeline.sources.tables.tachos import parse_tachos
 from fantwin.pipeline.sources.tacho_evidence import tacho_hints
 from fantwin.schemas.channels import CHANNELS
@@ -28,11 +27,12 @@ from fantwin.schemas.units import NS_PER_S
 
 
 def import_table(
-    file: Annotated[
-        Path,
+    files: Annotated[
+        list[Path],
         typer.Argument(
-            metavar="FILE",
-            help="A text file whose first line names the columns, or a log: ULog, ROS 2 bag.",
+            metavar="FILE...",
+            help="Tables, series, or logs (ULog, ROS 2 bag); several, or a pattern such as 'log-*.csv', become one "
+            "recording.",
         ),
     ],
     output: Annotated[
@@ -50,12 +50,16 @@ def import_table(
         list[str] | None,
         typer.Option(
             metavar="COLUMN[:UNIT]",
-            help="Speed column, one per fan. Units: rpm, hz, deg/s, rad/s (default); in a log also erpm. Repeatable.",
+            help="Speed column, one per fan. Units: rpm, hz, deg/s, rad/s, erpm; default: that of the file, else "
+            "rad/s. Repeatable.",
         ),
     ] = None,
     time: Annotated[
         str | None,
-        typer.Option(metavar="COLUMN[:UNIT]", help="Time column. Units: s (default), ms, us, ns, iso (dates)."),
+        typer.Option(
+            metavar="COLUMN[:UNIT]",
+            help="Time column, or DATE+TIME, two of them; default: found. Units: s, ms, us, ns, iso (dates).",
+        ),
     ] = None,
     period: Annotated[
         str | None, typer.Option(metavar="TIME", help="Time between rows of a table without a time column, e.g. 10ms.")
@@ -78,6 +82,15 @@ def import_table(
         ),
     ] = None,
     poles: Annotated[int | None, typer.Option(help="Magnetic poles of a motor, for speeds in erpm.")] = None,
+    dates: Annotated[
+        str | None, typer.Option(metavar="dmy|mdy|ymd", help="Order of dates that the table leaves open.")
+    ] = None,
+    zone: Annotated[
+        str | None, typer.Option(help="Time zone of dates without one, such as Europe/Berlin; default UTC.")
+    ] = None,
+    decimal: Annotated[
+        str | None, typer.Option(metavar=".|,", help="Decimal mark of numbers that the table leaves open.")
+    ] = None,
     preview: Annotated[
         bool,
         typer.Option("--preview", help="Show what was understood, and the command that imports it; write nothing."),
@@ -85,49 +98,59 @@ def import_table(
     force: Annotated[bool, typer.Option("--force", help="Replace an existing recording.")] = False,
     json_output: JsonOption = False,
 ) -> None:
-    """Turn a measured table or a log into a recording, the data format of training, evaluation and replay.
+    """Turn measured tables or logs into a recording, the data format of training, evaluation and replay.
 
-    Irregularities (repeated times, gaps, empty cells) are counted and reported; speeds are never filled in. Tachos of
-    ordinary fans count pulses: say over which time, or see the hint.
+    Encoding, delimiter, line of the names, times, units and decimal marks are found by what the file shows; --preview
+    says what was found. Irregularities (repeated times, gaps, empty cells) are counted and reported; speeds are never
+    filled in. Tachos of ordinary fans count pulses: say over which time, or see the hint.
+
+    Example: fantwin import FILE.csv --preview
 
     Example: fantwin import FILE.csv --time t:s --command u --speed y:rpm --tacho count:window_s=1 -o REC.mcap
 
     Example: fantwin import FLIGHT.ulg --command 'out.u[*]' --speed 'esc.rpm[*]:rpm' -o REC.mcap
     """
-    kind = log_format(file)
+    paths = _existing(files)
+    wanted = Wanted(
+        command or (),
+        speed or (),
+        time,
+        period,
+        _channels(channel or ()),
+        Reading(dates or "", zone or "", decimal or "", poles),
+    )
     if preview:
-        if kind is None:
-            raise UsageError(f"{file}: --preview is for logs; the first line of a table names its columns")
-        show_previews([preview_of_log(file, kind, open_log(file, kind))], json_output=json_output)
+        show_previews([preview_of(path, wanted) for path in paths], json_output=json_output)
         return
-    if output is None or not command or not speed:
-        what = "-o, --command and --speed" if kind is None else "-o, --command and --speed; --preview shows the fields"
-        raise UsageError(f"an import needs {what}")
+    if output is None:
+        raise UsageError("an import needs -o REC.mcap; --preview shows what is in the file")
     if not re.match(NAME_PATTERN, tray) or tray in RESERVED_TRAY_NAMES:
         raise UsageError(f"--tray {tray}: use letters, digits, - and _, but not {' or '.join(RESERVED_TRAY_NAMES)}")
     if output.exists() and not force:
         raise UserError(f"{output}: exists; name another file with -o, or replace it with --force")
-    auxiliary = _channels(channel or ())
-    if kind is None:
-        tachos = parse_tachos(tacho or (), len(speed))
-        table, of_log = read_table(file, time, command, speed, period=period, auxiliary=auxiliary), ()
-    else:
-        if time or period:
-            raise UsageError(f"--time and --period are for tables: a {kind.title} has its own times")
-        log = open_log(file, kind)
-        table, of_log = read_samples(file, log, command, speed, poles, auxiliary=auxiliary)
-        tachos = parse_tachos(tacho or (), table.fans)
-    notes = list(filter(None, (table.assumed, *of_log)))
+    imported = in_one(paths, [read_file(path, wanted) for path in paths])
+    table = imported.table
+    tachos = parse_tachos(tacho or (), table.fans)
+    notes = list(filter(None, (table.assumed, *imported.notes)))
     write_table(table, output, tray, tachos)
     hints = tacho_hints(table.t_ns / NS_PER_S, table.speed_rad_s, tachos, range(table.fans))
     fans = "1 fan" if table.fans == 1 else f"{table.fans} fans"
-    period_s = table.median_period_s
-    period = f"{f'{period_s:.3g} s' if period_s >= 1.0 else f'{period_s * 1e3:.3g} ms'} apart (median)"
-    line = f"{output}: {len(table.t_ns)} samples of {fans} over {table.duration_s:.1f} s, {period}"
+    period_text = f"{period_in_words(table.median_period_s)} apart (median)"
+    line = f"{output}: {len(table.t_ns)} samples of {fans} over {table.duration_s:.1f} s, {period_text}"
     lines = (line, *(f"  {note}" for note in (*notes, *table.notes)))
-    show(import_summary(table, output) | {"hints": hints, "notes": notes}, *lines, json_output=json_output)
+    found = import_summary(table, output) | {"hints": hints, "notes": notes, "remarks": list(table.remarks)}
+    show(found, *lines, json_output=json_output)
     for hint in hints if not json_output else ():
         typer.echo(f"hint: {hint}; see --tacho", err=True)
+
+
+def _existing(files: Sequence[Path]) -> list[Path]:
+    """The files, with those that a pattern matches where the shell has left it as it is."""
+    found: list[Path] = []
+    for file in files:
+        matches = [] if file.exists() else sorted(map(Path, glob(str(file))))  # noqa: PTH207  a pattern may be absolute
+        found += matches or [file]
+    return list(dict.fromkeys(found))
 
 
 def _channels(given: Sequence[str]) -> dict[str, list[str]]:

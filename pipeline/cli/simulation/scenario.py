@@ -14,8 +14,9 @@ from pydantic import Field
 from fantwin.pipeline.config.loading import checked_section, set_key
 from fantwin.pipeline.config.settings import Section
 from fantwin.pipeline.errors import UsageError, UserError
+from fantwin.pipeline.sources.imported_file import Wanted, read_file
 from fantwin.pipeline.sources.simulated.table import TableDevice
-from fantwin.pipeline.sources.tables.measured_table import read_table
+from fantwin.pipeline.sources.tables.measured_table import Reading
 from fantwin.schemas import wire
 from fantwin.schemas.channels import CHANNELS
 from fantwin.schemas.tacho import INSTANTANEOUS, Tacho, Tachos
@@ -52,8 +53,8 @@ class SurroundingsScenario(Section):
 class FileScenario(Section):
     """A measured file that is played at its own times instead of a simulation."""
 
-    path: Path = Field(description="a text file whose first line names the columns")
-    time: str | None = Field(default=None, description="time column[:unit]; s (default), ms, us, ns, iso (dates)")
+    path: Path = Field(description="a table, or what else `fantwin import` reads")
+    time: str | None = Field(default=None, description="time column[:unit], or DATE+TIME; without it, found")
     period: str | None = Field(default=None, description="time between rows without a time column, such as 10ms")
     command: tuple[str, ...] = Field(min_length=1, description="command columns: one for all fans, or one for each")
     speed: tuple[str, ...] = Field(
@@ -63,6 +64,9 @@ class FileScenario(Section):
         default={},
         description=f"columns of {', '.join(column.name for column in CHANNELS)}: one for all fans, or one for each",
     )
+    dates: str = Field(default="", description="order of dates that the table leaves open: dmy, mdy, ymd")
+    zone: str = Field(default="", description="time zone of dates without one; without it, UTC")
+    decimal: str = Field(default="", description="decimal mark that the table leaves open: . or ,")
     from_s: float = Field(default=0.0, ge=0.0, description="start, since the first row")
     to_s: float | None = Field(default=None, description="end, since the first row; without it, the last row")
 
@@ -110,9 +114,9 @@ class Scenario(Section):
         if unknown := [name for name in file.channels if name not in names]:
             raise UsageError(f"file.channels.{unknown[0]}: known are {', '.join(names)}")
         channels = {name: list(columns) for name, columns in file.channels.items()}
-        table = read_table(
-            file.path, file.time, list(file.command), list(file.speed), period=file.period, auxiliary=channels
-        )
+        reading = Reading(file.dates, file.zone, file.decimal)
+        wanted = Wanted(file.command, file.speed, file.time, file.period, channels, reading)
+        table = read_file(file.path, wanted).table
         return TableDevice(table, file.from_s, math.inf if file.to_s is None else file.to_s)
 
     def tray(self, tachos: tuple[Tacho, ...], rate_hz: float) -> SimulatedTray:

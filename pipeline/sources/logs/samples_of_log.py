@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from fantwin.pipeline.errors import UsageError
 from fantwin.pipeline.sources.logs.log_file import LogFile, Series
 from fantwin.pipeline.sources.tables.fan_columns import FanColumns, fan_columns
-from fantwin.pipeline.sources.tables.measured_table import NO_COLUMNS, RAD_S_PER_TABLE_UNIT, Table, table_of
+from fantwin.pipeline.sources.tables.measured_table import NO_COLUMNS, Table, rad_s_per, table_of, used_fans
+from fantwin.pipeline.sources.tables.units import SPEED_UNITS
 from fantwin.schemas.messages import Array
-
-ELECTRICAL = "erpm"
-UNITS = (*RAD_S_PER_TABLE_UNIT, ELECTRICAL)
 
 
 def read_samples(
@@ -36,14 +32,15 @@ def read_samples(
     Raises:
         UserError: the fields or units cannot be used.
     """
-    chosen = fan_columns(path, log.names, command, speed, auxiliary, UNITS)
+    chosen = fan_columns(path, log.names, command, speed, auxiliary, SPEED_UNITS)
     series = log.read(chosen.names)
     t_ns, speeds = _speeds([series[name] for name in chosen.speed])
     values = {name: _held(each, t_ns) for name, each in series.items()} | dict(zip(chosen.speed, speeds.T, strict=True))
+    chosen, left_out = used_fans(path, chosen, values)
     has_time = np.ones(len(t_ns), np.bool_)
-    table = table_of(path, chosen, values, t_ns, has_time, *_rad_s_per(chosen.unit or "rad/s", poles))
+    table = table_of(path, chosen, values, t_ns, has_time, *rad_s_per(chosen.unit or "rad/s", poles))
     assumed = f"speeds in rad/s assumed; if that is wrong, use for example {chosen.assumed}" if chosen.assumed else ""
-    return replace(table, assumed=assumed), (*log.notes, *chosen.notes, *_rates(series, chosen))
+    return replace(table, assumed=assumed), (*log.notes, *chosen.notes, *left_out, *_rates(series, chosen))
 
 
 def _rates(series: Mapping[str, Series], chosen: FanColumns) -> list[str]:
@@ -76,16 +73,3 @@ def _held(command: Series, t_ns: Array) -> Array:
     times, values = command.t_ns[known][order], command.values[known][order]
     at = np.searchsorted(times, t_ns, "right") - 1
     return np.where(at >= 0, values[np.maximum(at, 0)], np.nan) if len(values) else np.full(len(t_ns), np.nan)
-
-
-def _rad_s_per(unit: str, poles: int | None) -> tuple[float, str]:
-    """rad/s of one unit, and the unit that people are shown."""
-    if unit != ELECTRICAL:
-        return RAD_S_PER_TABLE_UNIT[unit], unit
-    if poles is None:
-        raise UsageError(
-            "speeds in erpm are electrical revolutions: give the magnetic poles of the motor, for example --poles 14"
-        )
-    if poles < 2 or poles % 2:
-        raise UsageError(f"--poles {poles}: magnetic poles come in pairs, for example 14")
-    return 2.0 * math.pi / 60.0 / (poles / 2), "rpm"

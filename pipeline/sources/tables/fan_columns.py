@@ -25,6 +25,7 @@ class FanColumns:
         unit: of the speeds; empty if none was given.
         assumed: how to give a unit of the speeds, as an option of a command; empty if one was given.
         notes: what was left out, a line each.
+        is_pattern: whether the fans are those that a pattern matches, and none was named.
     """
 
     command: tuple[str, ...]
@@ -33,6 +34,7 @@ class FanColumns:
     unit: str
     assumed: str
     notes: tuple[str, ...]
+    is_pattern: bool = False
 
     @property
     def names(self) -> list[str]:
@@ -82,6 +84,7 @@ def fan_columns(
         unit=given_units[0],
         assumed="" if given_units[0] else f"--speed {shlex.quote(f'{speeds[0]}:rpm')}",
         notes=(note,) if left_out else (),
+        is_pattern=_is_pattern(speeds, names),
     )
 
 
@@ -101,15 +104,9 @@ def with_unit(given: str, names: Sequence[str], units: Collection[str]) -> tuple
 
 
 def require(path: Path, names: Sequence[str], name: str) -> None:
-    """Raise an error where not exactly one column has this name.
-
-    Raises:
-        UserError: there is none, or there are several.
-    """
+    """Raise UserError where no column has this name."""
     if name not in names:
         raise UserError(f"{path}: no column {name!r}; {_there_are(names, name)}")
-    if names.count(name) > 1:
-        raise UserError(f"{path}: {names.count(name)} columns are called {name!r}; rename them in its first line")
 
 
 def _is_pattern(given: Sequence[str], names: Sequence[str]) -> bool:
@@ -150,5 +147,5 @@ def _there_are(names: Sequence[str], given: str) -> str:
     if close:
         return f"did you mean {' or '.join(map(repr, close))}?"
     known = list(filter(None, names))
-    more = " and more; --preview shows those of a log" if len(known) > MOST_SHOWN else ""
+    more = " and more; --preview shows them" if len(known) > MOST_SHOWN else ""
     return f"it has {', '.join(known[:MOST_SHOWN])}{more}"

@@ -32,6 +32,16 @@ GOLDEN = Path(__file__).parents[2] / "support" / "data" / "golden.mcap"
 TRAYS = ("tray1", "tray2")
 ESCS = ("uint64_t timestamp;esc_report[2] esc;", [(1000 * k, 3000, 12.0, 3000, 12.0) for k in range(3)])
 
+TABLES = {
+    "bare.csv": "u,y1\n1,2\n2,3\n",
+    "again.csv": "t,u,y1,y2\n0,1,2,2\n1,2,3,4\n",
+    "open-date.csv": "Time,u,y1\n06/09/2026 21:59:50,1,2\n06/09/2026 21:59:51,2,3\n",
+    "open-mark.csv": "t;u;y1\n0;1;1.016\n1;2;1.018\n",
+    "zone.csv": "Time,u,y1\n09-Jun-2026 21:59:50 CST,1,2\n09-Jun-2026 21:59:51 CST,2,3\n",
+    "set-back.csv": "Time,u,y1\n" + "".join(f"2026-10-25 0{2 - (k > 19)}:00:{k:02},1,2\n" for k in range(40)),
+    "long.csv": "Series;Time;Value\n" + "".join(f"{of};{k};{k + 1}\n" for of in ("fan1", "pwm1") for k in range(5)),
+}
+
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -46,6 +56,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "named.toml").write_text('[[tray]]\nname = "tray1"\nfans = ["CPU", "GPU"]\n', encoding="utf-8")
     (folder / "users.toml").write_text(tray.format("a") + '[gateway]\nusers = "none.toml"\n', encoding="utf-8")
     (folder / "table.csv").write_text("t,u,y1,y2\n0,1,2,2\n1,2,3,4\n2,2,2,2\n3,2,2,2\n", encoding="utf-8")
+    for name, text in TABLES.items():
+        (folder / name).write_text(text, encoding="utf-8")
     run = published_run(1, 20.0, fans=2)
     write_run(folder / "r.mcap", run)
     write_run(folder / "rpm.mcap", published_run(2, 20.0, fans=2), unit="rpm")

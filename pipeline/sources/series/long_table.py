@@ -1,0 +1,237 @@
+"""Long tables: a row for each value, with the name of its series beside it, as databases of time series export them.
+
+Such a table is found by evidence: times go back or repeat from row to row, and within a series they do not. Annotated
+tables of InfluxDB, which name their columns again for each result, are long tables with several heads.
+"""
+
+from __future__ import annotations
+
+import re
+from array import array
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import islice
+
+import numpy as np
+
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.sources.series.series_file import Label, SeriesFile, named
+from fantwin.pipeline.sources.tables.fan_columns import with_unit
+from fantwin.pipeline.sources.tables.layout import Layout, all_rows_of, rows_of
+from fantwin.pipeline.sources.tables.measured_table import AS_FOUND, Reading
+from fantwin.pipeline.sources.tables.numbers import Marks, NumberColumn, OtherMarkError
+from fantwin.pipeline.sources.tables.times import TIME_UNITS, TimeColumn, time_names, usual_time
+from fantwin.schemas.messages import Array
+
+MOST_SERIES = 10_000
+_LEAST_VALUES = 2
+"""of a series, on average"""
+_ROWS_IN_PART = 4096
+_TOO_MANY_BACK = 0.1
+"""steps back within series, as a share of those from row to row"""
+_ANNOTATION = "#"
+_FIELD, _VALUE, _TIME = "_field", "_value", "_time"
+_NOT_TAGS = {"", "result", "table", "_start", "_stop", _TIME, _VALUE, _FIELD}
+_NUMBER_TYPES = ("long", "double", "unsignedLong")
+_LIKE_A_KEY = re.compile(
+    r"(?i)(.*[._ ])?(fan|series|sensor|metric|field|name|id|slot|motor|esc|instance|channel|unit|device|host|tags?)"
+)
+
+
+@dataclass(frozen=True)
+class _Columns:
+    """Which columns of a long table are what."""
+
+    names: tuple[str, ...]
+    time: str
+    keys: tuple[str, ...]
+    values: tuple[str, ...]
+
+
+def is_annotated(layout: Layout) -> bool:
+    """Whether a table has the annotations of InfluxDB, or its columns."""
+    return _TIME in layout.names and (_VALUE in layout.names or "result" in layout.names)
+
+
+def long_table(layout: Layout, time: str | None = None, reading: Reading = AS_FOUND) -> SeriesFile | None:
+    """The series of a table; None: it is not long. time: as for `TimeColumn`.
+
+    Raises:
+        UserError: it is one, and its times or numbers cannot be read.
+    """
+    columns = _of_influx(layout) if is_annotated(layout) else _of_any(layout, time)
+    if columns is None:
+        return None
+    shown: dict[str, str] = {}
+    while True:
+        try:
+            return _read(layout, columns, reading, shown)
+        except OtherMarkError as found:
+            shown[found.name] = found.decimal
+
+
+def _read(layout: Layout, columns: _Columns, reading: Reading, shown: dict[str, str]) -> SeriesFile | None:
+    whole = replace(
+        layout,
+        names=columns.names,
+        second_names=(),
+        units=tuple(layout.unit(name) if name in layout.names else "" for name in columns.names),
+        kinds=tuple(layout.kinds[layout.index(name)] if name in layout.names else "" for name in columns.names),
+        marks=tuple(layout.marks[layout.index(name)] if name in layout.names else Marks() for name in columns.names),
+    )
+    decimal = reading.decimal or shown.get(with_unit(columns.time, columns.names, TIME_UNITS)[0], "")
+    times = TimeColumn(whole, columns.time, reading.dates, reading.zone, decimal)
+    numbers = [
+        NumberColumn(
+            layout.path,
+            name,
+            columns.names.index(name),
+            reading.decimal or shown.get(name) or (layout.decimal_of(name) if name in layout.names else layout.decimal),
+            is_final=bool(reading.decimal) or name in shown,
+        )
+        for name in columns.values
+    ]
+    at = [columns.names.index(key) for key in columns.keys]
+    known: dict[tuple[str, ...], int] = {}
+    of_row = array("i")
+    rows = _annotated_rows(layout, columns.names) if is_annotated(layout) else rows_of(layout)
+    while part := list(islice(rows, _ROWS_IN_PART)):
+        times.add(part)
+        for column in numbers:
+            column.add(part)
+        of_row.extend([known.setdefault(tuple(row[k] for k in at), len(known)) for row in part])
+        if len(known) > MOST_SERIES:
+            return None
+    if not of_row:
+        return None
+    t_ns, has_time = times.values()
+    series = np.asarray(of_row)
+    if not is_annotated(layout) and not _is_long(t_ns[has_time], series[has_time], len(known)):
+        return None
+    order = np.argsort(series, kind="stable")
+    starts = np.searchsorted(series[order], np.arange(len(known) + 1))
+    arrays = [column.values(may_be_empty=True) for column in numbers]
+    parts = [(key, order[starts[k] : starts[k + 1]]) for key, k in known.items()]
+    by = " and ".join(map(repr, columns.keys)) or "nothing"
+    notes = [*times.notes, *(f"{column.name!r}: {texts}" for column in numbers if (texts := column.texts(has_time)))]
+    found = [
+        (_label(columns, key, name), t_ns[rows][is_value], values[rows][is_value])
+        for key, rows in parts
+        for name, values in zip(columns.values, arrays, strict=True)
+        if (is_value := has_time[rows] & np.isfinite(values[rows])).any()
+    ]
+    return SeriesFile(f"long table, {len(found)} series by {by}", named(found), tuple(notes))
+
+
+def _label(columns: _Columns, key: Sequence[str], value_column: str) -> Label:
+    tags = [(name, text) for name, text in zip(columns.keys, key, strict=True) if text]
+    field = next((text for name, text in tags if name == _FIELD), "")
+    if field:
+        return Label(field, tuple(tag for tag in tags if tag[0] != _FIELD))
+    if len(columns.values) == 1:
+        return Label("", tuple(tags))
+    return Label(value_column, tuple(("", text) if len(tags) == 1 else (name, text) for name, text in tags))
+
+
+def _is_long(t_ns: Array, series: Array, count: int) -> bool:
+    """Whether times go on within series, and not from row to row."""
+    if count < 2 or len(t_ns) < _LEAST_VALUES * count:
+        return False
+    back = int(np.count_nonzero(np.diff(t_ns) <= 0))
+    order = np.argsort(series, kind="stable")
+    within = np.diff(t_ns[order])[np.diff(series[order]) == 0]
+    return back >= count - 1 and int(np.count_nonzero(within <= 0)) <= _TOO_MANY_BACK * back
+
+
+def _of_any(layout: Layout, time: str | None) -> _Columns | None:
+    time = time or usual_time(layout)
+    if not time:
+        return None
+    try:
+        of_time, _ = time_names(layout, time)
+    except UserError:
+        return None
+    pairs = [
+        (name, kind) for name, kind in zip(layout.names, layout.kinds, strict=True) if name and name not in of_time
+    ]
+    numbers = [name for name, kind in pairs if kind == "number"]
+    keys = [name for name, kind in pairs if kind == "text"]
+    likely = [name for name in numbers if _LIKE_A_KEY.fullmatch(name) and len(numbers) > 1 and _few_whole(layout, name)]
+    values = [name for name in numbers if name not in likely]
+    if not (keys or likely) or not values:
+        return None
+    return _Columns(layout.names, time, (*keys, *likely), tuple(values))
+
+
+def _few_whole(layout: Layout, name: str) -> bool:
+    """Whether a column of numbers has few whole ones in the sample, as numbers of fans are."""
+    k = layout.names.index(name)
+    cells = [row[k] for row in layout.sample if k < len(row) and row[k]]
+    return all(cell.isdecimal() for cell in cells) and len(set(cells)) <= max(1, len(cells) // 2)
+
+
+def _of_influx(layout: Layout) -> _Columns:
+    heads = list(_heads(layout))
+    names = tuple(dict.fromkeys(name for head, _ in heads for name in head))
+    if _VALUE in names:
+        values: tuple[str, ...] = (_VALUE,)
+    else:
+        values = tuple(
+            dict.fromkeys(
+                name
+                for head, types in heads
+                for name, kind in zip(head, types, strict=False)
+                if kind in _NUMBER_TYPES and name not in _NOT_TAGS
+            )
+        )
+        values = values or tuple(
+            name
+            for name, kind in zip(layout.names, layout.kinds, strict=True)
+            if kind == "number" and name not in _NOT_TAGS
+        )
+    field = (_FIELD,) if _FIELD in names else ()
+    tags = tuple(name for name in names if name not in _NOT_TAGS and name not in values)
+    return _Columns(names, _TIME, (*field, *tags), values)
+
+
+def _heads(layout: Layout) -> Iterator[tuple[list[str], list[str]]]:
+    """The lines of names of an annotated table, each with the types of its columns if it says them."""
+    yield list(layout.written), []
+    for head, types, _ in _blocks(layout):
+        yield head, types
+
+
+def _annotated_rows(layout: Layout, names: Sequence[str]) -> Iterator[list[str]]:
+    for head, _, rows in _blocks(layout):
+        place = [head.index(name) if name in head else -1 for name in names]
+        for row in rows:
+            yield [row[k] if 0 <= k < len(row) else "" for k in place]
+
+
+def _blocks(layout: Layout) -> Iterator[tuple[list[str], list[str], Iterator[list[str]]]]:
+    """Names, types and rows of each result. The rows of one are read before the next is asked for."""
+    rows = all_rows_of(layout)
+    types: list[str] = []
+    pending = next(rows, None)
+    while pending is not None:
+        if pending and pending[0].startswith(_ANNOTATION):
+            types = pending if pending[0].startswith("#datatype") else types
+            pending = next(rows, None)
+        elif _TIME in pending:
+            last: list[list[str] | None] = [None]
+
+            def of_result(last: list[list[str] | None] = last) -> Iterator[list[str]]:
+                for row in rows:
+                    if any(row) and (row[0].startswith(_ANNOTATION) or _TIME in row):
+                        last[0] = row
+                        return
+                    if any(row):
+                        yield row
+
+            of_this = of_result()
+            yield pending, types, of_this
+            for _ in of_this:
+                pass
+            pending = last[0]
+        else:
+            pending = next(rows, None)

@@ -1,0 +1,315 @@
+"""Dates and times of day of a table: ISO, day or month first, 12-hour clocks, names of zones.
+
+Whether `06/09/2026` is in June or September is found by the whole column: a number above 12 is no month, and the rows
+are in the order of time. Where neither tells, the user is asked.
+"""
+
+from __future__ import annotations
+
+import re
+from array import array
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, date, datetime, timedelta
+from pathlib import Path
+from typing import TypeAlias
+
+import numpy as np
+
+from fantwin.pipeline.errors import UserError
+from fantwin.schemas.messages import Array
+from fantwin.schemas.units import NS_PER_S
+
+Order: TypeAlias = str
+"""of the parts of a date: `d`, `m` and `y`"""
+ORDERS: tuple[Order, ...] = ("dmy", "mdy", "ymd")
+ZONES = {
+    **dict.fromkeys(("Z", "UTC", "GMT", "WET"), 0.0),
+    **dict.fromkeys(("CET", "WEST", "MEZ"), 1.0),
+    **dict.fromkeys(("CEST", "EET", "MESZ", "SAST"), 2.0),
+    **dict.fromkeys(("EEST", "MSK"), 3.0),
+    **{"JST": 9.0, "KST": 9.0, "HKT": 8.0, "SGT": 8.0, "AEST": 10.0, "AEDT": 11.0, "NZST": 12.0, "NZDT": 13.0},
+    **{"EST": -5.0, "EDT": -4.0, "CDT": -5.0, "MST": -7.0, "MDT": -6.0, "PST": -8.0, "PDT": -7.0, "AKST": -9.0},
+}
+"""hours east of UTC, of names that mean one zone; CST, IST and BST mean several"""
+_MONTHS = {
+    name: k + 1
+    for k, name in enumerate(["jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec"])
+}
+_DATE = r"(?P<a>\d{1,4})(?P<by>[./-])\s?(?P<b>\d{1,2}|[A-Za-z]{3,9})(?P=by)\s?(?P<c>\d{1,4})\.?"
+_WORDY = r"(?P<month>[A-Za-z]{3,9})\.?\s+(?P<day>\d{1,2}),?\s+(?P<year>\d{4})"
+_TIME = (
+    r"(?P<h>\d{1,2})[:.](?P<m>\d{2})(?:[:.](?P<s>\d{2})(?:[.,:](?P<f>\d+))?)?"
+    r"\s*(?P<half>[AaPp]\.?[Mm]\.?)?\s*(?P<zone>Z|[A-Za-z]{3,4}|(?:UTC|GMT)?[+-]\d\d:?\d\d)?"
+)
+_DATED = re.compile(rf"(?:[A-Za-z]{{2,9}}\.?,?\s+)?(?:{_DATE}|{_WORDY})(?:[T,\s]\s*{_TIME})?")
+_OF_DAY = re.compile(rf"(?:(?P<days>\d+)[ d.]+)?{_TIME}")
+_MINUTES = re.compile(r"(?P<m>\d{1,4}):(?P<s>[0-5]\d)(?P<f>[.,]\d+)?")
+_FRACTION = re.compile(r"(\d\d:\d\d:\d\d)[:,](\d+)")  # some loggers write 17:14:08:947, or 17:14:08,947
+_UNIX_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+_EPOCH_DAY = _UNIX_EPOCH.toordinal()
+_NS_PER_DAY = 86_400 * NS_PER_S
+_LARGER_STEPS = 10.0
+_TWO_DIGITS = 100
+_ORDER_IN_WORDS = {"dmy": "day, month, year", "mdy": "month, day, year", "ymd": "year, month, day"}
+
+
+def is_date_or_time(text: str) -> bool:
+    """Whether a cell holds a date, a time of day, or both."""
+    text = text.strip()
+    return bool(_DATED.fullmatch(text) or _OF_DAY.fullmatch(text) or _MINUTES.fullmatch(text) or _iso(text))
+
+
+def is_time_of_day(text: str) -> bool:
+    """Whether a cell holds a time of day and no date."""
+    return bool(_OF_DAY.fullmatch(text.strip()) or _MINUTES.fullmatch(text.strip()))
+
+
+@dataclass(frozen=True)
+class _Part:
+    """A date as it is written: three numbers, of which one is the year. is_fixed: it can be read in one way only."""
+
+    numbers: tuple[int, int, int]
+    by: str
+    month_is_word: bool = False
+
+
+class DateColumn:
+    """A column of dates, or of times of day, in ns."""
+
+    def __init__(self, path: Path, name: str, order: Order, *, has_zone: bool = False) -> None:
+        """order: of the parts of a date, as the user or the writer of such files gives it;
+        empty: found. has_zone: the user names the
+        zone that a name of several stands for."""
+        self._path, self._name, self._given, self._has_zone = path, name, order, has_zone
+        self._t_ns = array("q")
+        self._known = bytearray()
+        self._zoned = bytearray()
+        self._dates: dict[str, _Part] = {}
+        self._texts: list[str] = []
+        """of the dates in the order of rows, where they change"""
+        self._changes: list[tuple[int, int]] = []
+        """row and time of day, in ns, at each of them"""
+        self._last_ns = 0
+        self._first_cell = ""
+        self._of_day = False
+        self._hours_lost = False
+        self.is_iso = False
+
+    def add(self, cells: Sequence[str]) -> None:
+        """Append some cells. Raises UserError for a name of a zone that means several."""
+        for text in cells:
+            self._first_cell = self._first_cell or text
+            t_ns = None if self._texts else _iso_ns(text)
+            if t_ns is not None:
+                self.is_iso = True
+                self._append(t_ns[0], is_zoned=t_ns[1])
+            else:
+                self._other(text.strip())
+
+    def _append(self, t_ns: int, *, is_zoned: bool, is_known: bool = True) -> None:
+        self._t_ns.append(t_ns)
+        self._known.append(is_known)
+        self._zoned.append(is_zoned)
+
+    def _other(self, text: str) -> None:
+        """A cell that is not ISO: its time of day now, its date when all are known."""
+        found = _DATED.fullmatch(text)
+        if found is None:
+            self._time_of_day(text)
+            return
+        part = _part_of(found)
+        of_day_ns = _of_day_ns(found)
+        if part is None or of_day_ns is None:
+            self._append(0, is_zoned=False, is_known=False)
+            return
+        key = repr(part)
+        if not self._texts or self._texts[-1] != key:
+            self._dates[key] = part
+            self._texts.append(key)
+            self._changes.append((len(self._t_ns), self._last_ns))
+        offset_ns = self._offset_ns(found["zone"])
+        self._last_ns = of_day_ns
+        self._append(of_day_ns - (offset_ns or 0), is_zoned=offset_ns is not None)
+
+    def _time_of_day(self, text: str) -> None:
+        found = _OF_DAY.fullmatch(text)
+        minutes = _MINUTES.fullmatch(text)
+        if minutes and (minutes["f"] or int(minutes["m"]) > 23):
+            t_ns = (int(minutes["m"]) * 60 + int(minutes["s"])) * NS_PER_S + _fraction_ns((minutes["f"] or "0")[1:])
+            self._hours_lost = self._of_day = True
+            self._append(t_ns, is_zoned=False)
+            return
+        of_day_ns = _of_day_ns(found) if found else None
+        if found is None or of_day_ns is None:
+            self._append(0, is_zoned=False, is_known=False)
+            return
+        self._of_day = True
+        self._append(int(found["days"] or 0) * _NS_PER_DAY + of_day_ns, is_zoned=False)
+
+    def _offset_ns(self, zone: str | None) -> int | None:
+        if not zone:
+            return None
+        if zone.upper() in ZONES:
+            hours = ZONES[zone.upper()]
+        elif found := re.fullmatch(r"(?:UTC|GMT)?([+-])(\d\d):?(\d\d)", zone):
+            hours = (int(found[2]) + int(found[3]) / 60) * (-1 if found[1] == "-" else 1)
+        elif self._has_zone:
+            return None
+        else:
+            raise UserError(
+                f"{self._path}: column {self._name!r}: {zone!r} is no zone, or the name of several: give the one that "
+                "is meant, for example --zone Asia/Shanghai"
+            )
+        return round(hours * 3600) * NS_PER_S
+
+    @property
+    def is_time_of_day(self) -> bool:
+        """Whether it has times of day without a date."""
+        return self._of_day and not self._texts and not self.is_iso
+
+    def values(self) -> tuple[Array, Array, Array, str]:
+        """(rows,) times in ns since 1970, whether each could be read, whether each has a zone, and the format in words.
+
+        Those without a zone are as if they were in UTC. Raises UserError if none could be read, or their order is open.
+        """
+        known = np.frombuffer(bytes(self._known), dtype=np.bool_)
+        zoned = np.frombuffer(bytes(self._zoned), dtype=np.bool_)
+        if not known.any():
+            raise UserError(
+                f"{self._path}: column {self._name!r} has no times in iso, but for example {self._first_cell!r}; use "
+                "numbers in s, ms, us or ns, or dates such as 2026-01-31 13:45:00.250"
+            )
+        t_ns = np.asarray(self._t_ns)
+        if self.is_time_of_day:
+            return _unwrapped(t_ns, known, self._hours_lost), known, zoned, "times of day without a date"
+        if not self._texts:
+            return t_ns, known, zoned, "dates (ISO)"
+        order = self._order()
+        days = [_day(self._dates[text], order) for text in self._texts]
+        starts = [row for row, _ in self._changes]
+        day_of_row = np.zeros(len(t_ns), np.int64)
+        steps = np.diff(np.array([0, *(day or 0 for day in days)], np.int64))
+        np.add.at(day_of_row, starts, steps)
+        possible = np.ones(len(t_ns), np.bool_)
+        for k, day in enumerate(days):
+            if day is None:
+                possible[starts[k] : starts[k + 1] if k + 1 < len(starts) else None] = False
+        t_ns = t_ns + np.cumsum(day_of_row) * _NS_PER_DAY
+        words = "dates with the name of the month" if self._is_wordy else f"dates as {_ORDER_IN_WORDS[order]}"
+        return t_ns, known & possible, zoned, words
+
+    @property
+    def _is_wordy(self) -> bool:
+        return all(part.month_is_word for part in self._dates.values())
+
+    def _order(self) -> Order:
+        """The order of day, month and year."""
+        parts = list(self._dates.values())
+        if self._given:
+            return self._given
+        orders = _orders(parts[0])
+        days = {order: [_day(self._dates[text], order) for text in self._texts] for order in orders}
+        possible = [order for order in orders if None not in days[order]]
+        if not possible:  # some date is damaged: the order that reads the most
+            possible = sorted(orders, key=lambda order: days[order].count(None))[:1]
+        days = {order: days[order] for order in possible}
+        if len({tuple(found) for found in days.values()}) == 1:
+            return possible[0]
+        by_rows = _by_order_of_rows({order: [day for day in of if day is not None] for order, of in days.items()})
+        if by_rows is None:
+            example = self._first_cell.split()[0]
+            either = " or ".join(f"--dates {order} ({_ORDER_IN_WORDS[order]})" for order in possible)
+            raise UserError(
+                f"{self._path}: column {self._name!r}: {example} can be read in {len(possible)} ways, and no row "
+                f"tells: give {either}"
+            )
+        return by_rows
+
+
+def _by_order_of_rows(days: dict[Order, list[int]]) -> Order | None:
+    """The order with which dates follow one another; None: none is clearly better.
+
+    days: of the dates in the order of rows, by order.
+    """
+    steps = {order: np.diff(found) for order, found in days.items()}
+    largest: dict[Order, int] = {
+        order: int(step.max()) for order, step in steps.items() if len(step) and (step >= 0).all()
+    }
+    ranked = sorted(largest, key=largest.__getitem__)
+    if len(ranked) > 1 and largest[ranked[1]] < _LARGER_STEPS * max(1, largest[ranked[0]]):
+        return None
+    return ranked[0] if ranked else None
+
+
+def _orders(part: _Part) -> Sequence[Order]:
+    """Orders in which a date may be written, by its form."""
+    if part.numbers[0] >= _TWO_DIGITS:
+        return ("ymd",)
+    if part.month_is_word or part.by == ".":
+        return ("dmy",)
+    return ("dmy", "mdy") if part.numbers[2] >= _TWO_DIGITS else ("dmy", "mdy", "ymd")
+
+
+def _part_of(found: re.Match[str]) -> _Part | None:
+    if found["month"]:
+        month = _MONTHS.get(found["month"][:3].lower())
+        return _Part((int(found["day"]), month, int(found["year"])), " ", month_is_word=True) if month else None
+    middle = int(found["b"]) if found["b"].isdigit() else _MONTHS.get(found["b"][:3].lower())
+    if middle is None:
+        return None
+    return _Part((int(found["a"]), middle, int(found["c"])), found["by"], month_is_word=not found["b"].isdigit())
+
+
+def _day(part: _Part, order: Order) -> int | None:
+    """Days since 1970; None: there is no such date."""
+    by_letter = dict(zip("ymd" if part.numbers[0] >= _TWO_DIGITS else order, part.numbers, strict=True))
+    year = by_letter["y"] + (2000 if by_letter["y"] < _TWO_DIGITS else 0)
+    try:
+        return date(year, by_letter["m"], by_letter["d"]).toordinal() - _EPOCH_DAY
+    except ValueError:
+        return None
+
+
+def _of_day_ns(found: re.Match[str]) -> int | None:
+    """Time of day; midnight if there is none; None: there is no such time."""
+    if found["h"] is None:
+        return 0
+    hour, minute, second = int(found["h"]), int(found["m"]), int(found["s"] or 0)
+    if found["half"]:
+        if not 1 <= hour <= 12:
+            return None
+        hour = hour % 12 + (12 if found["half"][0] in "pP" else 0)
+    if hour > 24 or minute > 59 or second > 60:
+        return None
+    return (hour * 3600 + minute * 60 + second) * NS_PER_S + _fraction_ns(found["f"])
+
+
+def _fraction_ns(digits: str | None) -> int:
+    return int(f"{digits:0<9.9}") if digits else 0
+
+
+def _unwrapped(t_ns: Array, known: Array, hours_lost: bool) -> Array:
+    """Times of day that go on after midnight, or after the full hour where hours are lost."""
+    period_ns = 3600 * NS_PER_S if hours_lost else _NS_PER_DAY
+    found = t_ns.copy()
+    steps = np.diff(t_ns[known], prepend=t_ns[known][:1])
+    found[known] += np.cumsum(steps < -period_ns // 2) * period_ns
+    return found
+
+
+def _iso(text: str) -> datetime | None:
+    try:
+        return datetime.fromisoformat(_FRACTION.sub(r"\1.\2", text))
+    except ValueError:
+        return None
+
+
+def _iso_ns(text: str) -> tuple[int, bool] | None:
+    """Time in ns, and whether it has a zone."""
+    found = _iso(text)
+    if found is None:
+        return None
+    is_zoned = found.tzinfo is not None
+    since = (found if is_zoned else found.replace(tzinfo=UTC)) - _UNIX_EPOCH
+    return since // timedelta(microseconds=1) * 1000, is_zoned

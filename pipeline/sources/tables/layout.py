@@ -1,0 +1,345 @@
+"""How a text file holds a table, found by evidence: its encoding, what separates its columns, where its names are.
+
+Loggers write lines of their own before the names: `sep=;`, comments, keys with values, a second line of names, a line
+of units. The rows are what repeats: the names are in the line above the first of them.
+"""
+
+from __future__ import annotations
+
+import codecs
+import csv
+import io
+import re
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.sources.tables.dates import is_date_or_time
+from fantwin.pipeline.sources.tables.numbers import Marks, file_decimal, is_number
+from fantwin.pipeline.sources.tables.units import is_unit, unit_in_name
+
+LONGEST_LINE = 1 << 20
+"""characters"""
+BLANKS = " "
+"""as a delimiter: runs of blanks"""
+_DELIMITERS = {",": "','", ";": "';'", "\t": "tabs", "|": "'|'", BLANKS: "blanks"}
+_SAMPLE_BYTES = 1 << 18
+_SAMPLE_LINES = 400
+_LEAST_ALIKE = 0.6
+"""share of the cells of a row that are of the kind that its column has"""
+_LONGEST_SENTENCE = 6
+"""words of a cell; a longer one is a sentence, not a name"""
+_RULER = re.compile(r"[-=+:|\s,;]*[-=][-=+:|\s,;]*")
+_SEP_LINE = re.compile(r"\s*\"?sep=(.)\"?\s*", re.IGNORECASE)
+_BOMS = {codecs.BOM_UTF8: "utf-8-sig", codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16"}
+_ENCODINGS = {"utf-8": "UTF-8", "utf-8-sig": "UTF-8", "utf-16": "UTF-16", "utf-16-le": "UTF-16"}
+_AS_WINDOWS = "as-windows-1252"
+
+
+def _as_windows(error: UnicodeError) -> tuple[str, int]:
+    """Bytes that are no UTF-8, as Windows-1252."""
+    assert isinstance(error, UnicodeDecodeError)
+    return error.object[error.start : error.end].decode("cp1252", "replace"), error.end
+
+
+codecs.register_error(_AS_WINDOWS, _as_windows)
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where the names and the rows of a table are.
+
+    Attributes:
+        encoding: as Python calls it; bytes that are no UTF-8 are Windows-1252.
+        title: of the encoding, for people.
+        head: the line of the names, counted from 1; 0: there is none.
+        first_row: the line of the first row.
+        names: of the columns, each once: a second `Fan` is `Fan [2]`.
+        second_names: those of another line of names above, where it is as wide; else empty.
+        written: the names as they are in the file.
+        units: of each column, as its name or a line of units says; empty if neither does.
+        about: keys and values in the lines before the names, such as `debug_mode`.
+        kinds: of each column: `number`, `time`, `text`, or empty where the sample has no cell.
+        marks: of the numbers in each column of the sample.
+        decimal: the decimal mark of the numbers of the file; empty: they do not show it.
+    """
+
+    path: Path
+    encoding: str
+    title: str
+    delimiter: str
+    head: int
+    first_row: int
+    names: tuple[str, ...]
+    second_names: tuple[str, ...]
+    written: tuple[str, ...]
+    units: tuple[str, ...]
+    about: Mapping[str, str]
+    kinds: tuple[str, ...]
+    marks: tuple[Marks, ...]
+    decimal: str
+    sample: tuple[tuple[str, ...], ...]
+
+    @property
+    def all_names(self) -> list[str]:
+        """What columns can be called: names, then second names."""
+        return [*self.names, *(name for name in self.second_names if name and name not in self.names)]
+
+    def index(self, name: str) -> int:
+        """The column of a name or a second name."""
+        return (self.names if name in self.names else self.second_names).index(name)
+
+    def unit(self, name: str) -> str:
+        """The unit that the file gives for a column."""
+        return self.units[self.index(name)]
+
+    def decimal_of(self, name: str) -> str:
+        """The decimal mark of a column: what its own numbers show in the sample, else those of the file."""
+        marks = self.marks[self.index(name)]
+        return marks.decimal or ("" if marks.point and marks.comma else self.decimal)
+
+    def second_name(self, name: str) -> str:
+        """What a column is called in another line of names; empty without one."""
+        k = self.index(name)
+        return self.second_names[k] if self.second_names and self.second_names[k] != name else ""
+
+    @property
+    def in_words(self) -> str:
+        """For people: encoding, delimiter, and where the names are."""
+        where = f"names in line {self.head}" if self.head else "no line of names"
+        return f"{self.title}, columns separated by {_DELIMITERS.get(self.delimiter, repr(self.delimiter))}, {where}"
+
+
+def find_layout(path: Path) -> Layout:
+    """The layout of a table.
+
+    Raises:
+        UserError: it cannot be read, or is no text file.
+    """
+    try:
+        with path.open("rb") as file:
+            start = file.read(_SAMPLE_BYTES)
+    except OSError as error:
+        raise UserError(f"{path}: cannot read the table: {error.strerror}") from error
+    encoding = _encoding(path, start)
+    text = codecs.getincrementaldecoder(encoding)(_AS_WINDOWS).decode(start)
+    lines = list(islice(io.StringIO(text, newline=""), _SAMPLE_LINES))
+    if len(start) == _SAMPLE_BYTES and len(lines) > 1 and not lines[-1].endswith("\n"):
+        lines.pop()  # cut by the end of the sample
+    title = _ENCODINGS[encoding]
+    if encoding == "utf-8" and not _is_utf_8(start):
+        title = "Windows-1252"
+    skipped = 0
+    delimiter = ""
+    if lines and (found := _SEP_LINE.fullmatch(lines[0])):
+        delimiter, skipped = found[1], 1
+    if "".join(lines[skipped:]).strip() == "":
+        raise UserError(f"{path}: a line must name the columns, but the file is empty")
+    delimiter = delimiter or _delimiter(lines)
+    rows = [(1 + skipped + k, [cell.strip() for cell in row]) for k, row in _numbered(path, lines[skipped:], delimiter)]
+    return _layout(path, encoding, title, delimiter, [(number, row) for number, row in rows if any(row)])
+
+
+def rows_of(layout: Layout) -> Iterator[list[str]]:
+    """The rows of a table, without those that are empty or repeat its names, each at least as wide as its names.
+
+    Raises:
+        UserError: it cannot be read.
+    """
+    width, names, first = len(layout.names), list(layout.written), layout.written[0]
+    try:
+        for row in islice(_cells(layout), layout.first_row - 1, None):
+            if len(row) < width:
+                row.extend([""] * (width - len(row)))
+            if any(row) and not (row[0] == first and [cell.strip() for cell in row] == names):
+                yield row
+    except csv.Error as error:
+        raise UserError(f"{layout.path}: not a text file with columns: {error}") from error
+
+
+def all_rows_of(layout: Layout) -> Iterator[list[str]]:
+    """All rows of the file, those before the names, too."""
+    return _cells(layout)
+
+
+def _cells(layout: Layout) -> Iterator[list[str]]:
+    try:
+        with layout.path.open(encoding=layout.encoding, errors=_AS_WINDOWS, newline="") as file:
+            yield from _split(_lines(layout.path, file), layout.delimiter)
+    except OSError as error:
+        raise UserError(f"{layout.path}: cannot read the table: {error.strerror}") from error
+
+
+def _lines(path: Path, file: io.TextIOWrapper) -> Iterator[str]:
+    while line := file.readline(LONGEST_LINE):
+        if len(line) == LONGEST_LINE:
+            raise UserError(f"{path}: not a text file with columns: a line is longer than {LONGEST_LINE:,} characters")
+        yield line
+
+
+def _split(lines: Iterable[str], delimiter: str) -> Iterator[list[str]]:
+    if delimiter == BLANKS:
+        lines = (line.strip().replace("\t", " ") for line in lines)
+    return csv.reader(lines, delimiter=delimiter, skipinitialspace=True)
+
+
+def _numbered(path: Path, lines: Sequence[str], delimiter: str) -> Iterator[tuple[int, list[str]]]:
+    if any(len(line) >= LONGEST_LINE or len(line) > csv.field_size_limit() for line in lines):
+        raise UserError(f"{path}: not a text file with columns: a line is longer than {LONGEST_LINE:,} characters")
+    reader = csv.reader([]) if not lines else _split(lines, delimiter)
+    try:
+        yield from enumerate(reader)
+    except csv.Error as error:
+        raise UserError(f"{path}: not a text file with columns: {error}") from error
+
+
+def _encoding(path: Path, start: bytes) -> str:
+    found = next((encoding for bom, encoding in _BOMS.items() if start.startswith(bom)), "")
+    if not found and b"\0" in start:
+        if start[1::2].count(0) < 0.4 * len(start) or start[0::2].count(0):
+            raise UserError(f"{path}: not a text file with columns; export it as CSV")
+        return "utf-16-le"
+    return found or "utf-8"
+
+
+def _is_utf_8(start: bytes) -> bool:
+    try:
+        codecs.getincrementaldecoder("utf-8")().decode(start)
+    except UnicodeDecodeError:
+        return False
+    return True
+
+
+def _delimiter(lines: Sequence[str]) -> str:
+    """The delimiter that gives the most lines one width, with cells that are numbers, dates or short words."""
+    filled = [line for line in lines if line.strip() and not _RULER.fullmatch(line.strip())]
+    scores = {each: _score(filled, each) for each in _DELIMITERS}
+    best = max(scores, key=lambda each: scores[each])
+    return best if scores[best] > 0 else ","
+
+
+def _score(lines: Sequence[str], delimiter: str) -> float:
+    try:
+        rows = [row for row in _split(lines, delimiter) if row]
+    except csv.Error:
+        return 0.0
+    last = rows[len(rows) // 3 :]
+    width, count = Counter(map(len, last)).most_common(1)[0]
+    if width < 2:
+        return 0.0
+    cells = [cell.strip() for row in last if len(row) == width for cell in row]
+    plain = sum(_kind(cell) in ("number", "time", "") for cell in cells) / len(cells)
+    if delimiter == BLANKS:
+        plain *= 0.5  # blanks stand within dates and names, too
+    return (count / len(last)) * (0.1 + plain)
+
+
+def _kind(cell: str) -> str:
+    if not cell:
+        return ""
+    if is_number(cell):
+        return "number"
+    return "time" if is_date_or_time(cell) else "text"
+
+
+def _layout(path: Path, encoding: str, title: str, delimiter: str, lines: Sequence[tuple[int, list[str]]]) -> Layout:
+    usual = [row for _, row in lines[len(lines) // 2 :]]
+    width = Counter(map(len, usual)).most_common(1)[0][0] if usual else 0
+    alike = [[_kind(cell) for cell in row] for row in usual if len(row) == width]
+    kinds = [_most_common(column) for column in zip(*alike, strict=True)]
+    first = next((k for k, (_, row) in enumerate(lines) if _is_row(row, kinds)), len(lines))
+    if not any(kind in ("number", "time") for kind in kinds):
+        first = next((k for k, (_, row) in enumerate(lines) if len(row) == width), 0) + 1
+    above = [(number, row) for number, row in lines[:first] if not _is_ruler(row)]
+    first_row = lines[first][0] if first < len(lines) else (lines[-1][0] + 1 if lines else 1)
+    sample = [row + [""] * (width - len(row)) for _, row in lines[first:]]
+    head, written, second, units, about = _head(above, width)
+    if not written:
+        written = [f"column {k + 1}" for k in range(width)]
+    if delimiter == BLANKS and len(written) == width - 1 and kinds[:2] == ["time", "time"]:
+        written = ["Date", *written]  # the blank within a date
+    names = _each_once(written)
+    marks = tuple(Marks.of(row[k] for row in sample if k < len(row)) for k in range(len(names)))
+    found_units = [units[k] if k < len(units) and units[k] else unit_in_name(name) for k, name in enumerate(written)]
+    return Layout(
+        path=path,
+        encoding=encoding,
+        title=title,
+        delimiter=delimiter,
+        head=head,
+        first_row=first_row,
+        names=tuple(names),
+        second_names=tuple(second) if len(second) == len(names) else (),
+        written=tuple(written),
+        units=tuple(found_units),
+        about=about,
+        kinds=tuple(kinds[k] if k < len(kinds) else "" for k in range(len(names))),
+        marks=marks,
+        decimal=file_decimal(marks, delimiter),
+        sample=tuple(map(tuple, sample)),
+    )
+
+
+def _head(
+    above: Sequence[tuple[int, list[str]]], width: int
+) -> tuple[int, list[str], list[str], list[str], dict[str, str]]:
+    """Line of the names, names, second names, units, and what the lines before say."""
+    rest = list(above)
+    units: list[str] = []
+    if len(rest) > 1 and all(is_unit(cell) for cell in rest[-1][1] if cell) and len(rest[-2][1]) > 1:
+        units = [cell.strip("[]() ") for cell in rest.pop()[1]]
+    if not rest:
+        return 0, [], [], units, {}
+    head, cells = rest.pop()
+    if len(cells) > width and not cells[0].strip("# \t"):
+        cells = cells[1:]  # the mark of a comment
+    names = [cell.strip("# \t") for cell in cells]
+    second: list[str] = []
+    if rest and len(rest[-1][1]) == len(names) and not rest[-1][1][0].startswith("#"):
+        # a second line of names, and no key with its value
+        above_names = rest[-1][1]
+        if width > 2 and sum(map(bool, above_names)) > len(names) / 2:
+            second = above_names
+            filled = list(filter(None, second))
+            if len(set(filled)) < len(names) - 1:  # names of groups of columns
+                names = [f"{top} {name}".strip() for top, name in zip(_held(second), names, strict=True)]
+    about = {row[0].strip("# \t"): row[1] for _, row in rest if len(row) >= 2 and row[0]}
+    return head, names, second, units, about
+
+
+def _held(cells: Sequence[str]) -> list[str]:
+    """Each cell, or the last one before it: groups of columns have their name over the first."""
+    held: list[str] = []
+    for cell in cells:
+        held.append(cell or (held[-1] if held else ""))
+    return held
+
+
+def _is_row(row: Sequence[str], kinds: Sequence[str]) -> bool:
+    """Whether a line is alike what repeats: its cells are of the kinds that the columns have."""
+    pairs = [(_kind(cell), kind) for cell, kind in zip(row, kinds, strict=False) if cell and kind]
+    alike = sum(cell == kind and kind != "text" for cell, kind in pairs)
+    wanted = sum(kind != "text" for _, kind in pairs)
+    return len(row) * 2 > len(kinds) and wanted > 0 and alike >= _LEAST_ALIKE * wanted
+
+
+def _is_ruler(row: Sequence[str]) -> bool:
+    return all(_RULER.fullmatch(cell) for cell in row if cell)
+
+
+def _most_common(kinds: Sequence[str]) -> str:
+    filled = Counter(filter(None, kinds))
+    return filled.most_common(1)[0][0] if filled else ""
+
+
+def _each_once(names: Sequence[str]) -> list[str]:
+    """Names, numbered where they repeat."""
+    seen: Counter[str] = Counter()
+    found: list[str] = []
+    for name in names:
+        seen[name] += 1
+        found.append(name if seen[name] == 1 or not name else f"{name} [{seen[name]}]")
+    return found

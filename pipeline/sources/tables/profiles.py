@@ -1,0 +1,239 @@
+"""Programs whose tables and metrics are known, a row each: how they are recognised, and which columns are fans.
+
+A new program is a row. The columns of a fan are found by `(?P<fan>...)` in their names, which must be the same in the
+command and the speed; a pattern without it is of all fans.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+from fantwin.pipeline.sources.preview import ProposedFan
+from fantwin.pipeline.sources.tables.units import ELECTRICAL, ELECTRICAL_HUNDREDS
+
+
+class Named(Protocol):
+    """What has columns with names, and says something about itself."""
+
+    @property
+    def all_names(self) -> Sequence[str]:
+        """What columns can be called."""
+        ...
+
+    @property
+    def about(self) -> Mapping[str, str]:
+        """Keys and values in the lines before the names."""
+        ...
+
+
+@dataclass(frozen=True)
+class Profile:
+    """A row.
+
+    Attributes:
+        title: the program that writes such files.
+        head: patterns, each of which some name matches as a whole.
+        about: keys before the names, with a pattern of their values.
+        command, speed: patterns of the names of such columns; of several of a fan, that of the first pattern counts.
+        unit: of speeds, where the names do not have it.
+        time: patterns of the time columns, `DATE+TIME` in two. time_unit: of numbers in them.
+        dates: order of the parts of a date.
+        channels: patterns, by the name of their channel.
+        note: what a user has to know.
+    """
+
+    title: str
+    head: tuple[str, ...]
+    command: tuple[str, ...] = ()
+    speed: tuple[str, ...] = ()
+    about: Mapping[str, str] = field(default_factory=dict[str, str])
+    unit: str = ""
+    time: tuple[str, ...] = ()
+    time_unit: str = ""
+    dates: str = ""
+    channels: Mapping[str, tuple[str, ...]] = field(default_factory=dict[str, tuple[str, ...]])
+    note: str = ""
+
+    def is_of(self, table: Named) -> bool:
+        """Whether this program wrote the table."""
+        names = table.all_names
+        return all(any(re.fullmatch(each, name) for name in names) for each in self.head) and all(
+            key in table.about and re.fullmatch(value, table.about[key]) for key, value in self.about.items()
+        )
+
+    def time_in(self, table: Named) -> str:
+        """The time columns of a table, as `--time` takes them; empty: it has none of those known."""
+        found = [next((name for name in table.all_names if re.fullmatch(each, name)), "") for each in self.time]
+        unit = f":{self.time_unit}" if self.time_unit else ""
+        return f"{'+'.join(found)}{unit}" if found and all(found) else ""
+
+    def fans_in(self, names: Sequence[str], labels: Mapping[str, str]) -> tuple[ProposedFan, ...]:
+        """The fans of a table: columns of command and speed that belong together. labels: of names, for people."""
+        commands, speeds = _by_fan(self.command, names), _by_fan(self.speed, names)
+        shared = commands.get("")
+        fans: list[ProposedFan] = []
+        for fan, speed in speeds.items():
+            command = commands.get(fan) or (shared if len(commands) == 1 else None)
+            if command:
+                fans.append(ProposedFan(labels.get(speed) or labels.get(command) or speed, command, speed))
+        return tuple(fans)
+
+    def unit_of(self, speeds: Sequence[str], given: str) -> tuple[str, list[str]]:
+        """The unit of these speeds, if the user or the file gives this one, and a note on it."""
+        if not self.unit or not all(any(re.fullmatch(each, name) for each in self.speed) for name in speeds):
+            return given, []
+        if not given:
+            return self.unit, [f"speeds in {self.unit}, as usual for {self.title}"]
+        if self.unit == ELECTRICAL_HUNDREDS and given == ELECTRICAL:
+            return self.unit, [f"{speeds[0]} of {self.title} is in hundreds: multiplied by 100"]
+        if self.unit != given:
+            return given, [f"{speeds[0]} of {self.title} is usually in {self.unit}, not {given}: check the speeds"]
+        return given, []
+
+    def channels_in(self, names: Sequence[str]) -> dict[str, str]:
+        """The column of each channel beside command and speed that a table has for all fans."""
+        found = {channel: _by_fan(patterns, names).get("") for channel, patterns in self.channels.items()}
+        return {channel: name for channel, name in found.items() if name}
+
+
+_MOTORS = (r"motor\[(?P<fan>\d+)\]",)
+_BLACKBOX_CHANNELS = {
+    "supply_voltage_v": (r"vbatLatest \(V\)", r"vbatLatest"),
+    "current_a": (r"amperageLatest \(A\)",),
+}
+_DEBUG = (r"debug\[(?P<fan>\d+)\]",)
+PROFILES = (
+    Profile(
+        "HWiNFO",
+        head=("Date", "Time", r".+\[(RPM|°C|V|W|MHz|%)\]"),
+        time=("Date", "Time"),
+        command=(r"(?P<fan>.+?)(?: Fan)?(?: PWM| Duty| Control| Speed)? \[%\]",),
+        speed=(r"(?P<fan>.+?)(?: Fan)?(?: Speed)? \[RPM\]",),
+        unit="rpm",
+    ),
+    Profile(
+        "LibreHardwareMonitor or Open Hardware Monitor",
+        head=("Time", r"/.+/(fan|control|temperature|voltage|load|clock)/\d+"),
+        time=("Time",),
+        dates="mdy",
+        command=(r"(?P<fan>/.+)/control/(?P<number>\d+)",),
+        speed=(r"(?P<fan>/.+)/fan/(?P<number>\d+)",),
+        unit="rpm",
+    ),
+    Profile(
+        "Betaflight blackbox with debug_mode RPM_FILTER",
+        head=(r"motor\[0\]", r"debug\[0\]", r"time( \(us\))?"),
+        about={"debug_mode": r"46|RPM_FILTER"},
+        time=(r"time( \(us\))?",),
+        time_unit="us",
+        command=_MOTORS,
+        speed=_DEBUG,
+        unit="hz",
+        channels=_BLACKBOX_CHANNELS,
+    ),
+    Profile(
+        "Betaflight blackbox with debug_mode DSHOT_RPM_TELEMETRY",
+        head=(r"motor\[0\]", r"debug\[0\]", r"time( \(us\))?"),
+        about={"debug_mode": r"45|DSHOT_RPM_TELEMETRY"},
+        time=(r"time( \(us\))?",),
+        time_unit="us",
+        command=_MOTORS,
+        speed=_DEBUG,
+        unit=ELECTRICAL_HUNDREDS,
+        channels=_BLACKBOX_CHANNELS,
+        note="electrical revolutions: add --poles with the magnetic poles of the motors",
+    ),
+    Profile(
+        "Betaflight blackbox",
+        head=(r"motor\[0\]", r"eRPM(\(/100\))?\[0\]", r"time( \(us\))?"),
+        time=(r"time( \(us\))?",),
+        time_unit="us",
+        command=_MOTORS,
+        speed=(r"eRPM(?:\(/100\))?\[(?P<fan>\d+)\]",),
+        unit=ELECTRICAL_HUNDREDS,
+        channels=_BLACKBOX_CHANNELS,
+        note="electrical revolutions: add --poles with the magnetic poles of the motors",
+    ),
+    Profile(
+        "INAV blackbox",
+        head=(r"motor\[0\]", "escRPM", r"time( \(us\))?"),
+        time=(r"time( \(us\))?",),
+        time_unit="us",
+        command=_MOTORS,
+        note="escRPM is the mean of all motors, so no column is the speed of one motor",
+    ),
+    Profile(
+        "blackbox without speeds",
+        head=(r"motor\[0\]", r"time( \(us\))?"),
+        time=(r"time( \(us\))?",),
+        time_unit="us",
+        command=_MOTORS,
+        note="no speeds in it: switch on bidirectional DShot, or debug_mode RPM_FILTER, before the flight",
+    ),
+    Profile(
+        "RCbenchmark",
+        head=(r"Time \(s\)", r"(ESC.*|Throttle.*) \(.s\)", r"Motor (Electrical|Optical) Speed.* \((RPM|rad/s|Hz)\)"),
+        time=(r"Time \(s\)",),
+        command=(r"(?:ESC signal|ESC|ESC throttle|Throttle)(?: (?P<fan>[AB12]))? \([µμu]s\)",),
+        speed=(
+            r"Motor Electrical Speed(?: (?P<fan>[AB12]))? \((?:RPM|rad/s|Hz)\)",
+            r"Motor Optical Speed(?: (?P<fan>[AB12]))? \((?:RPM|rad/s|Hz)\)",
+        ),
+        channels={"supply_voltage_v": (r"Voltage \(V\)",), "current_a": (r"Current \(A\)",)},
+    ),
+    Profile(
+        "ArduPilot (mavlogdump)",
+        head=(r"(ESC\.)?RPM.*|ESC\d?\.RPM.*", r"(RCOU\.)?C1.*|RCOU\.C1.*"),
+        time=("timestamp",),
+        command=(r"RCOU\.C(?P<fan>\d+)",),
+        speed=(r"ESC(?P<fan>\d+)\.RPM",),
+        unit="rpm",
+        note="ESC instances are counted from 0 and outputs from 1, and SERVOn_FUNCTION may order them otherwise",
+    ),
+    Profile(
+        "fan2go",
+        head=(r"fan2go_fan_rpm.*", r"fan2go_fan_pwm.*"),
+        command=(r"fan2go_fan_pwm(?:\{(?P<fan>.*)\})?",),
+        speed=(r"fan2go_fan_rpm(?:\{(?P<fan>.*)\})?",),
+        unit="rpm",
+    ),
+    Profile(
+        "node_exporter",
+        head=(r"node_hwmon_fan_rpm.*",),
+        command=(r"node_hwmon_pwm(?:\{(?P<fan>.*?)(?:sensor=)?(?:pwm(?P<number>\d+))?(?P<more>,.*)?\})?",),
+        speed=(r"node_hwmon_fan_rpm(?:\{(?P<fan>.*?)(?:sensor=)?(?:fan(?P<number>\d+))?(?P<more>,.*)?\})?",),
+        unit="rpm",
+    ),
+    Profile(
+        "Telegraf",
+        head=(r"(sensors\.)?fan_input.*",),
+        command=(r"(?:sensors\.)?pwm_?(?:input)?(?:\{(?P<fan>.*?)(?:feature=)?(?:pwm(?P<number>\d+))?\})?",),
+        speed=(r"(?:sensors\.)?fan_input(?:\{(?P<fan>.*?)(?:feature=)?(?:fan(?P<number>\d+))?\})?",),
+        unit="rpm",
+    ),
+    Profile(
+        "files named as in hwmon",
+        head=(r"(?i).*\bfan_?\d+(_input|_rpm|_speed)?( .*)?",),
+        command=(r"(?i)pwm_?(?P<fan>\d+)(?:_pct|_duty)?(?: [\[(].*[\])])?",),
+        speed=(r"(?i)fan_?(?P<fan>\d+)(?:_input|_rpm|_speed)?(?: [\[(].*[\])])?",),
+        unit="rpm",
+    ),
+)
+
+
+def profile_of(table: Named) -> Profile | None:
+    """The program that wrote a table, by its names; None: it is not known."""
+    return next((each for each in PROFILES if each.is_of(table)), None)
+
+
+def _by_fan(patterns: Sequence[str], names: Sequence[str]) -> dict[str, str]:
+    """Names that match, by their fan; empty for one of all fans."""
+    found: dict[str, str] = {}
+    for pattern in patterns:
+        for name in names:
+            if match := re.fullmatch(pattern, name):
+                found.setdefault("|".join(filter(None, match.groups())).strip().lower(), name)
+    return found

@@ -1,0 +1,222 @@
+"""The times of a table: numbers with a unit, dates, or a date and a time of day in two columns."""
+
+from __future__ import annotations
+
+import math
+import shlex
+from array import array
+from collections.abc import Sequence
+
+import numpy as np
+
+from fantwin.pipeline.errors import UsageError, UserError
+from fantwin.pipeline.sources.tables.dates import ORDERS, DateColumn, is_time_of_day
+from fantwin.pipeline.sources.tables.fan_columns import require, with_unit
+from fantwin.pipeline.sources.tables.layout import Layout
+from fantwin.pipeline.sources.tables.numbers import NumberColumn
+from fantwin.pipeline.sources.tables.units import NS_PER_UNIT
+from fantwin.pipeline.sources.tables.zones import as_utc, zone_of
+from fantwin.schemas.messages import FURTHEST_T_NS, Array
+from fantwin.schemas.units import NS_PER_S
+
+DATE_UNIT = "iso"
+_FINER_UNIT = {"s": "ms", "ms": "us", "us": "ns"}
+_YEAR_2000_NS = 946_684_800 * NS_PER_S
+TIME_UNITS = (*NS_PER_UNIT, DATE_UNIT)
+
+
+class TimeColumn:
+    """The column of times, or the two of date and time of day, in ns."""
+
+    def __init__(self, layout: Layout, given: str, dates: str = "", zone: str = "", decimal: str = "") -> None:
+        """given: `NAME`, `NAME:UNIT` or `DATE+TIME`. dates: the order of the parts of a date; empty: found. decimal:
+        mark of the numbers; empty: found, as of other columns.
+
+        Without a unit, numbers are in the one that the file names, else since 1970 in the one that fits, else in s, and
+        anything else is a date.
+
+        Raises:
+            UserError: there is no such column, order or zone.
+        """
+        if dates and dates not in ORDERS:
+            raise UsageError(f"--dates {dates}: give {', '.join(ORDERS[:-1])} or {ORDERS[-1]}, the order in the file")
+        names = layout.all_names
+        self._path = layout.path
+        self.names, self._unit = time_names(layout, given)
+        pair = usual_time(layout).split("+")
+        if len(pair) == 2 and self.names[0] in pair and len(self.names) == 1:
+            self.names, self._unit = pair, DATE_UNIT  # the date is beside it
+        for name in self.names:
+            require(layout.path, names, name)
+        self.name = "+".join(self.names)
+        self._indices = [layout.index(name) for name in self.names]
+        self._zone = zone_of(zone) if zone else None
+        self._is_given = bool(self._unit)
+        self._by_file = False
+        if not self._unit and len(self.names) == 1 and layout.unit(self.name) in NS_PER_UNIT:
+            self._unit, self._by_file = layout.unit(self.name), True
+        self._dates = DateColumn(layout.path, self.name, dates, has_zone=bool(zone))
+        self._is_final = bool(decimal)
+        self._decimal = decimal or layout.decimal_of(self.names[0])
+        self._numbers = NumberColumn(layout.path, self.name, self._indices[0], self._decimal, is_final=self._is_final)
+        self._first = ""
+        self._far = 0
+        self._t_ns = array("q")
+        self._known = bytearray()
+        self.notes: list[str] = []
+        self.format = ""
+        self.has_dates = False
+
+    def add(self, rows: Sequence[Sequence[str]]) -> None:
+        """Append the cells of some rows. Raises UserError for a time beyond the year 2116."""
+        cells = self._cells(rows)
+        self._first = self._first or next(filter(None, map(str.strip, cells)), "")
+        if not self._first:
+            self._t_ns.extend([0] * len(cells))
+            self._known.extend(bytes(len(cells)))
+            return
+        if not self._unit or (self._by_file and not self._t_ns and self._unit != DATE_UNIT):
+            self._unit = self._found_unit()
+        if self._unit == DATE_UNIT:
+            if self._t_ns:  # rows before the first time
+                self._dates.add([""] * len(self._t_ns))
+                del self._t_ns[:]
+            self._dates.add(cells)
+            return
+        t_ns, known = self._counted(cells, NS_PER_UNIT[self._unit])
+        self._t_ns.frombytes(t_ns.tobytes())
+        self._known.extend(known.tobytes())
+
+    def _counted(self, cells: Sequence[str], scale: int) -> tuple[Array, Array]:
+        """(cells,) times in ns, and whether each could be read. Whole numbers are exact: a float cannot hold ns since
+        1970."""
+        try:
+            whole = np.array(list(map(int, cells)), np.int64)
+        except (ValueError, OverflowError):
+            pass
+        else:
+            near = np.abs(whole.astype(np.float64)) * scale < FURTHEST_T_NS
+            self._far += int(np.count_nonzero(~near))
+            return np.where(near, whole, 0) * scale, near
+        try:
+            values = np.array([float(cell) if cell else math.nan for cell in cells])
+            if self._is_final or self._decimal != ".":
+                raise ValueError
+        except ValueError:
+            values = np.array([self._numbers.number(cell) for cell in cells])
+        finite = np.isfinite(values)
+        near = finite & (np.abs(values) < FURTHEST_T_NS / scale)
+        self._far += int(np.count_nonzero(finite & ~near))
+        values = np.where(near, values, 0.0)
+        whole = values.astype(np.int64)
+        return np.where(whole == values, whole * scale, np.rint(values * scale).astype(np.int64)), near
+
+    def _cells(self, rows: Sequence[Sequence[str]]) -> list[str]:
+        if len(self._indices) == 1:
+            index = self._indices[0]
+            return [row[index] for row in rows]
+        first, second = self._indices
+        cells = [(row[first].strip(), row[second].strip()) for row in rows]
+        return [(f"{b} {a}" if is_time_of_day(a) else f"{a} {b}") if a and b else "" for a, b in cells]
+
+    def _found_unit(self) -> str:
+        """The unit of the first time: what the file names, dates, or numbers since 1970 in the one that fits."""
+        value = self._numbers.number(self._first)
+        if math.isnan(value):
+            return DATE_UNIT
+        if self._unit:
+            return self._unit
+        if abs(value) * NS_PER_S < FURTHEST_T_NS:
+            self._by_file = value * NS_PER_S > _YEAR_2000_NS  # since 1970
+            return "s"
+        fits = [unit for unit in ("ms", "us", "ns") if _YEAR_2000_NS < value * NS_PER_UNIT[unit] < FURTHEST_T_NS]
+        if len(fits) == 1:
+            self._by_file = True
+            self.notes.append(f"times of {self.name!r} are in {fits[0]} since 1970, by their size")
+            return fits[0]
+        return "s"
+
+    def values(self) -> tuple[Array, Array]:
+        """(rows,) times in ns, and whether each could be read. Raises UserError if none could."""
+        if self._unit == DATE_UNIT:
+            return self._date_values()
+        known = np.frombuffer(bytes(self._known), dtype=np.bool_)
+        if self._far > np.count_nonzero(known):
+            self._refuse_furthest()
+        if not known.any():
+            raise UserError(
+                f"{self._path}: column {self.name!r} has no times in {self._unit or DATE_UNIT}, but for example "
+                f"{self._first!r}; use numbers in s, ms, us or ns, or dates such as 2026-01-31 13:45:00.250"
+            )
+        self._numbers.check()
+        t_ns = np.asarray(self._t_ns)
+        since = " since 1970" if np.median(t_ns[known]) > _YEAR_2000_NS else ""
+        self.has_dates = bool(since)
+        self.format = f"numbers in {self._unit}{since}"
+        return t_ns, known
+
+    def _date_values(self) -> tuple[Array, Array]:
+        t_ns, known, zoned, self.format = self._dates.values()
+        self.has_dates = not self._dates.is_time_of_day
+        naive = known & ~zoned
+        if naive.any() and self._zone and self.has_dates:
+            t_ns = t_ns.copy()
+            t_ns[naive], notes = as_utc(self._path, self.name, t_ns[naive], self._zone)
+            self.notes += notes
+            self.format += f", {self._zone.key}"
+        elif naive.any() and self.has_dates:
+            self.notes.append(f"dates of {self.name!r} have no time zone: UTC assumed; --zone Europe/Berlin names one")
+        is_far = known & (np.abs(t_ns) >= FURTHEST_T_NS)
+        if 2 * np.count_nonzero(is_far) > np.count_nonzero(known):
+            self._refuse_furthest()
+        return t_ns, known & ~is_far
+
+    @property
+    def is_notable(self) -> bool:
+        """Whether how the times are written is worth a line: they are no ISO dates, and no numbers."""
+        return self._unit == DATE_UNIT and not self._dates.is_iso
+
+    @property
+    def assumed(self) -> tuple[str, str] | None:
+        """What was assumed of the unit, and the option that says otherwise; None: nothing was."""
+        if self._is_given or self._by_file or self._unit != "s":
+            return None
+        return "times in s", f"--time {shlex.quote(f'{self.name}:ms')}"
+
+    def _refuse_furthest(self) -> None:
+        finer = _FINER_UNIT.get(self._unit)
+        hint = f"is it in ms, us or ns? use --time {self.name}:{finer}" if finer else "choose another time column"
+        raise UserError(f"{self._path}: column {self.name!r} in {self._unit} gives times beyond the year 2116: {hint}")
+
+
+def time_names(layout: Layout, given: str) -> tuple[list[str], str]:
+    """The one or two columns that a user means by `NAME`, `NAME:UNIT` or `DATE+TIME`, and the unit."""
+    names = layout.all_names
+    name, unit = with_unit(given, names, TIME_UNITS)
+    parts = [part.strip() for part in name.split("+")]
+    if name not in names and len(parts) == 2 and all(part in names for part in parts):
+        return parts, DATE_UNIT
+    return [name], unit
+
+
+def usual_time(layout: Layout) -> str:
+    """The time column that a table shows by its names and cells, as `--time` takes it; empty: none, or several."""
+    names, kinds = layout.names, layout.kinds
+    lower = [name.lower() for name in names]
+    dated = [k for k, kind in enumerate(kinds) if kind == "time"]
+    if len(dated) == 2:
+        is_of_day = [is_time_of_day(_first(layout, k)) for k in dated]
+        if sorted(is_of_day) == [False, True]:
+            return "+".join(names[k] for k in dated)
+    if len(dated) == 1:
+        return names[dated[0]]
+    usual = ("time", "timestamp", "t", "date", "datetime", "zeit", "_time", "datum", "elapsed", "ts")
+    for word in usual:
+        for k, name in enumerate(lower):
+            if kinds[k] and (name == word or name.split()[:1] == [word] or name.startswith((f"{word}_", f"{word}("))):
+                return names[k]
+    return names[dated[0]] if dated else ""
+
+
+def _first(layout: Layout, column: int) -> str:
+    return next((row[column] for row in layout.sample if column < len(row) and row[column]), "")

@@ -1,0 +1,386 @@
+"""`fantwin import` of tables as programs and instruments write them: the numbers and times of each are those in it.
+
+Each table below has 60 rows of the same fan, in the form of public files and reports: docs/reference/tried.md.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from tests.support.fantwin_command import fantwin
+from tests.support.written_recordings import raw_columns
+
+RPM = 2 * np.pi / 60
+N = 60
+COMMAND = np.repeat([40, 80, 30], 20)
+SPEED = np.repeat([1020, 1744, 840], 20) + np.arange(N) % 5
+SECONDS = np.arange(N)
+START = datetime(2026, 6, 9, 21, 59, 50, tzinfo=UTC)
+AUTUMN = datetime(2026, 10, 25, 0, 40, tzinfo=UTC)
+"""20 minutes before summer time ends in Berlin"""
+DATES = [START + timedelta(seconds=int(second)) for second in SECONDS]
+EPOCH_S = START.timestamp() + SECONDS
+ISO = [each.strftime("%Y-%m-%d %H:%M:%S") for each in DATES]
+GERMAN = [f"{each.day}.{each.month}.{each.year}" for each in DATES]
+OF_DAY = [f"{each:%H:%M:%S}.000" for each in DATES]
+COLUMNS = ("--command", "pwm1", "--speed", "fan1:rpm")
+
+
+def lines(*columns: Sequence[object], by: str = ",", head: str = "", before: str = "", after: str = "") -> str:
+    """A table: rows of these columns, with a head and what stands before and after them."""
+    rows = [by.join(map(str, row)) for row in zip(*columns, strict=True)]
+    return "\n".join(filter(None, [before, head, *rows, after])) + "\n"
+
+
+def thousands(mark: str) -> list[str]:
+    return [f"{speed:,}".replace(",", mark) for speed in SPEED]
+
+
+def quoted(cells: Sequence[object]) -> list[str]:
+    return [f'"{cell}"' for cell in cells]
+
+
+class Table(NamedTuple):
+    """A table and what must come of it. t_s: times; 0 at the start without dates. notes: that are said."""
+
+    content: str | bytes
+    options: tuple[str, ...] = COLUMNS
+    t_s: np.ndarray = SECONDS
+    notes: tuple[str, ...] = ()
+
+
+UTC_ASSUMED = "have no time zone: UTC assumed"
+LHM_HEAD = (
+    ',/lpc/chip/fan/0,/lpc/chip/fan/1,/lpc/chip/control/0,/lpc/chip/control/1\nTime,"Fan #1","Fan #2","Fan #1","Fan #2"'
+)
+US = [f"{each:%m/%d/%Y %H:%M:%S}" for each in DATES]
+HWINFO = 'Date,Time,"CPU Package [°C]","Fan1 [RPM]","Fan1 PWM [%]",'
+HALF = [each.strftime("%m/%d/%Y %I:%M:%S %p") for each in (DATES[0] + timedelta(hours=2.1 * k) for k in range(N))]
+MINUTES = [f"{each:%M:%S}.0" for each in DATES]
+SERIES = [("fan1", SPEED), ("pwm1", COMMAND)]
+INFLUX_HEAD = (
+    "#group,false,false,true,true,false,false,true,true,true\n"
+    "#datatype,string,long,dateTime:RFC3339,dateTime:RFC3339,dateTime:RFC3339,double,string,string,string\n"
+    "#default,_result,,,,,,,,\n,result,table,_start,_stop,_time,_value,_field,_measurement,fan"
+)
+
+
+def influx(head: str = INFLUX_HEAD, *, again: bool = True) -> str:
+    """An annotated table: a result for each series, each with its own annotations or all under one."""
+    results = [
+        "\n".join(
+            f",,{k},2026-06-09T00:00:00Z,2026-06-10T00:00:00Z,{each:%Y-%m-%dT%H:%M:%SZ},{value},{field},fans,CPU"
+            for each, value in zip(DATES, values, strict=True)
+        )
+        for k, (field, values) in enumerate([("rpm", SPEED), ("pwm", COMMAND)])
+    ]
+    return "\r\n".join([head, results[0], *(["", head] if again else []), results[1], ""]).replace("\r\n\r\n", "\n\n")
+
+
+def long(by: str = ";", *, sort_by_time: bool = False) -> str:
+    """A row a value."""
+    rows = [
+        (name, f"{each:%Y-%m-%dT%H:%M:%S}+00:00", value)
+        for name, of in SERIES
+        for each, value in zip(DATES, of, strict=True)
+    ]
+    rows = sorted(rows, key=lambda row: row[1]) if sort_by_time else rows
+    return "\n".join(by.join(map(str, row)) for row in [("Series", "Time", "Value"), *rows])
+
+
+def prometheus() -> str:
+    """The answer to a query of `{__name__=~"node_hwmon_fan_rpm|node_hwmon_pwm"}`."""
+
+    def series(name: str, sensor: str, values: Sequence[int]) -> dict[str, object]:
+        metric = {"__name__": name, "chip": "platform_nct6775_656", "instance": "a:9100", "sensor": sensor}
+        return {"metric": metric, "values": [[t, str(value)] for t, value in zip(EPOCH_S, values, strict=True)]}
+
+    result = [series("node_hwmon_fan_rpm", "fan1", SPEED.tolist()), series("node_hwmon_pwm", "pwm1", COMMAND.tolist())]
+    return json.dumps({"status": "success", "data": {"resultType": "matrix", "result": result}})
+
+
+TELEGRAF = "\n".join(
+    f'sensors,chip=nct6775-isa-0290,feature={feature},host=a\\ b {field}={value},note="a b, c" {int(t * 1e9)}'
+    for t, speed, command in zip(EPOCH_S, SPEED, COMMAND, strict=True)
+    for feature, field, value in (("fan1", "fan_input", f"{speed}i"), ("pwm1", "pwm", f"{command}i"))
+)
+BLACKBOX = "loopIteration, time (us), motor[0], motor[1], eRPM[0], eRPM[1], vbatLatest (V)"
+WRAPPED_US = (np.arange(N) * 2000 + 2**32 - 60_000) % 2**32
+
+TABLES = {
+    # numbers
+    "commas between thousands, quoted": Table(
+        lines(ISO, quoted(thousands(",")), COMMAND, head="Time,fan1,pwm1"), t_s=EPOCH_S
+    ),
+    "points between thousands beside decimal commas": Table(
+        lines([f"{t},0" for t in SECONDS], thousands("."), [f"{c},0" for c in COMMAND], by=";", head="t;fan1;pwm1")
+    ),
+    "points between thousands and decimal commas in one column": Table(
+        lines(SECONDS, [f"{each},0" for each in thousands(".")], COMMAND, by=";", head="t;fan1;pwm1")
+    ),
+    "blanks between thousands": Table(lines(SECONDS, thousands(" "), COMMAND, by=";", head="t;fan1;pwm1")),
+    "narrow no-break spaces between thousands": Table(
+        lines(SECONDS, thousands("\u202f"), COMMAND, by="\t", head="t\tfan1\tpwm1")
+    ),
+    "apostrophes between thousands": Table(lines(SECONDS, thousands("’"), COMMAND, by=";", head="t;fan1;pwm1")),
+    "times with commas between thousands": Table(
+        lines(quoted([f"{t * 1000:,}" for t in SECONDS]), SPEED, COMMAND, head="t,fan1,pwm1"),
+        ("--time", "t:ms", *COLUMNS),
+    ),
+    "units behind the numbers": Table(
+        lines(SECONDS, [f"{s} RPM" for s in SPEED], [f"{c}%" for c in COMMAND], head="t,fan1,pwm1"),
+        ("--command", "pwm1", "--speed", "fan1"),
+    ),
+    "decimal commas, quoted, between commas": Table(
+        lines(quoted([f"{t},0" for t in SECONDS]), quoted([f"{s},000" for s in SPEED]), COMMAND, head="t,fan1,pwm1")
+    ),
+    "three digits behind the decimal mark that the user gives": Table(
+        lines(
+            SECONDS,
+            [f"{s / 8:.3f}".replace(".", ",") for s in SPEED - SPEED % 8 + 1],
+            COMMAND,
+            by=";",
+            head="t;fan1;pwm1",
+        ),
+        (*COLUMNS, "--decimal", ","),
+    ),
+    # heads
+    "LibreHardwareMonitor: two lines of names": Table(
+        lines(US, SPEED, SPEED // 2, COMMAND, COMMAND, head=LHM_HEAD),
+        ("--command", "/lpc/chip/control/0", "--speed", "/lpc/chip/fan/0"),
+        EPOCH_S,
+        ("dates as month, day, year", UTC_ASSUMED),
+    ),
+    "HWiNFO: Latin-1, date and time, names again at the end": Table(
+        lines(
+            GERMAN,
+            OF_DAY,
+            [55.0] * N,
+            SPEED,
+            COMMAND,
+            [""] * N,
+            head=HWINFO,
+            after=f"{HWINFO}\n,,CPU: name,Board: chip,Board: chip,",
+        ).encode("cp1252"),
+        (),
+        EPOCH_S,
+        ("columns of HWiNFO: Fan1 [RPM]", "dates as day, month, year", "1 rows dropped: their time cannot be read"),
+    ),
+    "a line sep=": Table(lines(ISO, SPEED, COMMAND, by="|", before="sep=|", head='"Time"|"fan1"|"pwm1"'), t_s=EPOCH_S),
+    "comments": Table(
+        lines(SECONDS, SPEED, COMMAND, before="# logger v3, board 7\n# started 2026", head="t,fan1,pwm1")
+    ),
+    "names in a comment": Table(lines(SECONDS, SPEED, COMMAND, by=" ", head="# t fan1 pwm1")),
+    "keys and values before the names": Table(
+        lines(
+            SECONDS * 10_000,
+            COMMAND,
+            SPEED,
+            before='"Product","Blackbox flight data recorder"\n"firmware","4.5"',
+            head='"time","motor[0]","rpm"',
+        ),
+        ("--time", "time:us", "--command", "motor[0]", "--speed", "rpm:rpm"),
+        SECONDS / 100,
+    ),
+    "a line of units": Table(
+        lines(SECONDS / 2, COMMAND, SPEED, before="Time,Duty,Speed", head="s,%,rpm"),
+        ("--command", "Duty", "--speed", "Speed"),
+        SECONDS / 2,
+    ),
+    "groups of columns": Table(
+        lines(SECONDS, SPEED, COMMAND, SPEED // 2, COMMAND, head="t,fan1,,fan2,\n,rpm,pwm,rpm,pwm"),
+        ("--time", "t:s", "--command", "fan1 pwm", "--speed", "fan1 rpm:rpm"),
+    ),
+    "blanks in columns": Table(lines(SECONDS, COMMAND, SPEED, by="   ", head="  t pwm1    fan1")),
+    "a date with a blank among blanks": Table(lines(ISO, SPEED, COMMAND, by=" ", head="Time fan1 pwm1"), t_s=EPOCH_S),
+    "a Markdown table": Table(
+        lines(
+            ["|"] * N,
+            SECONDS,
+            SPEED,
+            COMMAND,
+            [""] * N,
+            by=" | ",
+            before="| | t | fan1 | pwm1 |",
+            head="|--|--:|--:|--:|",
+        )
+    ),
+    "UTF-16 without a mark": Table(lines(SECONDS, SPEED, COMMAND, head="t,fan1,pwm1").encode("utf-16-le")),
+    "no line of names": Table(
+        lines(SECONDS, SPEED, COMMAND), ("--time", "column 1:s", "--command", "column 3", "--speed", "column 2:rpm")
+    ),
+    "the same name twice": Table(
+        lines(SECONDS, SPEED, SPEED // 2, COMMAND, head="t,fan,fan,pwm1"),
+        ("--command", "pwm1", "--speed", "fan:rpm"),
+        notes=("several columns are called 'fan': the first is read; the next is 'fan [2]'",),
+    ),
+    # times
+    "12 hours": Table(
+        lines(HALF, SPEED, COMMAND, head="Time,fan1,pwm1"),
+        t_s=EPOCH_S[0] + 7560.0 * SECONDS,
+        notes=("month, day, year",),
+    ),
+    "names of months and zones": Table(
+        lines(
+            [f"{each + timedelta(hours=2):%d-%b-%Y %H:%M:%S} CEST" for each in DATES],
+            SPEED,
+            COMMAND,
+            head="Time,fan1,pwm1",
+        ),
+        t_s=EPOCH_S,
+    ),
+    "a date that the order of rows tells": Table(
+        lines(
+            [f"{START + timedelta(hours=k):%m/%d/%Y %H:%M}" for k in range(N)], SPEED, COMMAND, head="Time,fan1,pwm1"
+        ),
+        t_s=EPOCH_S[0] // 60 * 60 + 3600.0 * SECONDS,
+        notes=("month, day, year",),
+    ),
+    "times of day past midnight": Table(
+        lines(
+            [f"{START + timedelta(hours=2, seconds=int(t)):%H:%M:%S}" for t in SECONDS],
+            SPEED,
+            COMMAND,
+            head="Time,fan1,pwm1",
+        ),
+        t_s=86_390.0 + SECONDS,
+        notes=("times of day without a date",),
+    ),
+    "minutes and seconds, as spreadsheets cut times": Table(
+        lines(MINUTES, SPEED, COMMAND, head="Time,fan1,pwm1"), t_s=3590.0 + SECONDS
+    ),
+    "ms since 1970 without a unit": Table(
+        lines([int(t * 1000) for t in EPOCH_S], SPEED, COMMAND, head="t,fan1,pwm1"),
+        t_s=EPOCH_S,
+        notes=("in ms since 1970",),
+    ),
+    "a zone, and the hour that repeats": Table(
+        lines(
+            [f"{AUTUMN + timedelta(hours=2 - (k > 19), minutes=k):%Y-%m-%d %H:%M:%S}" for k in range(N)],
+            SPEED,
+            COMMAND,
+            head="Time,fan1,pwm1",
+        ),
+        (*COLUMNS, "--zone", "Europe/Berlin"),
+        AUTUMN.timestamp() + 60.0 * SECONDS,
+        ("40 taken as the second",),
+    ),
+    "a counter of 32 bits of microseconds that wraps": Table(
+        lines(
+            SECONDS,
+            WRAPPED_US,
+            COMMAND,
+            COMMAND,
+            SPEED * 7,
+            SPEED,
+            [12.1] * N,
+            by=", ",
+            head=BLACKBOX.replace("eRPM", "erpm"),
+        ),
+        ("--time", "time (us)", "--command", "motor[0]", "--speed", "erpm[0]:erpm", "--poles", "14"),
+        4294.967296 - 0.06 + 0.002 * SECONDS,
+        ("wrapped once (32 bits of microseconds)",),
+    ),
+    # long tables, and databases
+    "Grafana: a row a value, by series": Table(long(), t_s=EPOCH_S, notes=("long table, 2 series by 'Series'",)),
+    "a row a value, by time": Table(long(",", sort_by_time=True), t_s=EPOCH_S),
+    "InfluxDB: annotated, each result with its head": Table(
+        influx(), ("--command", "pwm", "--speed", "rpm:rpm"), EPOCH_S
+    ),
+    "InfluxDB: annotated once": Table(influx(again=False), ("--command", "pwm", "--speed", "rpm:rpm"), EPOCH_S),
+    "InfluxDB: without annotations": Table(
+        influx(INFLUX_HEAD.splitlines()[-1], again=False), ("--command", "pwm", "--speed", "rpm:rpm"), EPOCH_S
+    ),
+    "fans by number, a row each": Table(
+        "t,fan,command,rpm\n"
+        + "".join(
+            f"{t},{fan},{c},{s // (1 + fan)}\n"
+            for t, c, s in zip(SECONDS, COMMAND, SPEED, strict=True)
+            for fan in (0, 1)
+        ),
+        ("--command", "command{0}", "--speed", "rpm{0}:rpm"),
+    ),
+    "Prometheus": Table(prometheus(), (), EPOCH_S, ("columns of node_exporter",)),
+    "Telegraf: line protocol": Table(
+        TELEGRAF, (), EPOCH_S, ("columns of Telegraf", "InfluxDB line protocol, 2 series")
+    ),
+    # programs
+    "blackbox_decode": Table(
+        lines(
+            SECONDS, SECONDS * 2000, COMMAND, [""] * N, SPEED * 7 / 100, ["0"] * N, [12.1] * N, by=", ", head=BLACKBOX
+        ),
+        ("--poles", "14"),
+        0.002 * SECONDS,
+        ("columns of Betaflight blackbox: eRPM[0]",),
+    ),
+    "blackbox_decode of builds that say (/100)": Table(
+        lines(
+            SECONDS,
+            SECONDS * 2000,
+            COMMAND,
+            SPEED * 7 / 100,
+            by=", ",
+            head="loopIteration, time (us), motor[0], eRPM(/100)[0]",
+        ),
+        ("--command", "motor[*]", "--speed", "eRPM(/100)[*]:erpm", "--poles", "14"),
+        0.002 * SECONDS,
+        ("in hundreds: multiplied by 100",),
+    ),
+    "blackbox before 4.5: RPM_FILTER in debug": Table(
+        lines(
+            SECONDS * 2000,
+            COMMAND,
+            SPEED / 60,
+            before='"debug_mode","46"\n"gyro_rate","8000"',
+            head="time,motor[0],debug[0]",
+        ),
+        (),
+        0.002 * SECONDS,
+        ("columns of Betaflight blackbox with debug_mode RPM_FILTER",),
+    ),
+    "RCbenchmark": Table(
+        lines(
+            SECONDS / 40,
+            COMMAND,
+            [15.9] * N,
+            SPEED,
+            [""] * N,
+            head="Time (s),ESC signal (µs),Voltage (V),Motor Electrical Speed (RPM),Motor Optical Speed (RPM)",
+        ),
+        (),
+        SECONDS / 40,
+    ),
+    "mavlogdump": Table(lines(EPOCH_S, COMMAND, SPEED, head="timestamp,RCOU.C1,ESC1.RPM"), (), EPOCH_S),
+    # slots without a fan
+    "slots that nothing is connected to": Table(
+        lines(SECONDS, SPEED, COMMAND, [0] * N, COMMAND, [""] * N, COMMAND, head="t,fan1,pwm1,fan2,pwm2,fan3,pwm3"),
+        ("--command", "pwm*", "--speed", "fan*:rpm"),
+        notes=("left out, because the speed is always 0 or missing: fan2, fan3",),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_a_table_becomes_a_recording_of_its_numbers_and_times(name: str, tmp_path: Path) -> None:
+    table = TABLES[name]
+    path, recording = tmp_path / "table.csv", tmp_path / "r.mcap"
+    path.write_bytes(table.content if isinstance(table.content, bytes) else table.content.encode())
+    result = fantwin("import", path, *table.options, "-o", recording)
+    assert result.exit_code == 0, result.output
+    t_ns, command, speed_rad_s = raw_columns(recording)
+    expected = SPEED
+    if "--decimal" in table.options:
+        expected = (SPEED - SPEED % 8 + 1) / 8
+    np.testing.assert_allclose(t_ns / 1e9, table.t_s, rtol=0, atol=1e-6)
+    np.testing.assert_array_equal(command[:, 0], COMMAND)
+    np.testing.assert_allclose(speed_rad_s[:, 0] / RPM, expected, rtol=1e-9)
+    for note in table.notes:
+        assert note in result.stdout
+    assert "speeds in rad/s assumed" not in result.stdout
