@@ -22,7 +22,7 @@ from scipy.io import loadmat
 from fantwin.pipeline.learning.training_data import Part, read_training_data
 from fantwin.pipeline.recordings.raw_recordings import write_table
 from fantwin.pipeline.replay.offline.healthy_runs import in_this_process
-from fantwin.pipeline.sources.tables.measured_table import read_table
+from fantwin.pipeline.sources.tables.table_file import read_table
 from fantwin.pipeline.sources.tables.units import RAD_S_PER_TABLE_UNIT
 from fantwin.twin.runs import Run
 

@@ -22,8 +22,9 @@ from fantwin.pipeline.sources.series.series_file import SeriesFile
 from fantwin.pipeline.sources.tables.clocks import SetBackError
 from fantwin.pipeline.sources.tables.fan_columns import FAN_NUMBER, with_unit
 from fantwin.pipeline.sources.tables.layout import Layout, find_layout
-from fantwin.pipeline.sources.tables.measured_table import AS_FOUND, Reading, Table, read_columns, read_table
+from fantwin.pipeline.sources.tables.measured_table import Table
 from fantwin.pipeline.sources.tables.profiles import Profile, profile_of
+from fantwin.pipeline.sources.tables.table_file import AS_FOUND, Reading, read_columns, read_table
 from fantwin.pipeline.sources.tables.units import ELECTRICAL, ELECTRICAL_HUNDREDS, SPEED_UNITS
 from fantwin.schemas.units import NS_PER_S
 

@@ -18,7 +18,8 @@ from fantwin.pipeline.config.settings import NAME_PATTERN
 from fantwin.pipeline.errors import UsageError, UserError
 from fantwin.pipeline.recordings.raw_recordings import write_table
 from fantwin.pipeline.sources.imported_file import Wanted, in_one, preview_of, read_file
-from fantwin.pipeline.sources.tables.measured_table import Reading, Table, period_in_words
+from fantwin.pipeline.sources.tables.measured_table import Table, period_in_words
+from fantwin.pipeline.sources.tables.table_file import Reading
 from fantwin.pipeline.sources.tables.tachos import parse_tachos
 from fantwin.pipeline.sources.tacho_evidence import tacho_hints
 from fantwin.schemas.channels import CHANNELS

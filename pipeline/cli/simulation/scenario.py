@@ -16,7 +16,7 @@ from fantwin.pipeline.config.settings import Section
 from fantwin.pipeline.errors import UsageError, UserError
 from fantwin.pipeline.sources.imported_file import Wanted, read_file
 from fantwin.pipeline.sources.simulated.table import TableDevice
-from fantwin.pipeline.sources.tables.measured_table import Reading
+from fantwin.pipeline.sources.tables.table_file import Reading
 from fantwin.schemas import wire
 from fantwin.schemas.channels import CHANNELS
 from fantwin.schemas.tacho import INSTANTANEOUS, Tacho, Tachos

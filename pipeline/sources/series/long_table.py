@@ -18,8 +18,8 @@ from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.sources.series.series_file import Label, SeriesFile, named
 from fantwin.pipeline.sources.tables.fan_columns import with_unit
 from fantwin.pipeline.sources.tables.layout import Layout, all_rows_of, rows_of
-from fantwin.pipeline.sources.tables.measured_table import AS_FOUND, Reading
 from fantwin.pipeline.sources.tables.numbers import Marks, NumberColumn, OtherMarkError
+from fantwin.pipeline.sources.tables.table_file import AS_FOUND, Reading
 from fantwin.pipeline.sources.tables.times import TIME_UNITS, TimeColumn, time_names, usual_time
 from fantwin.schemas.messages import Array
 

@@ -56,8 +56,8 @@ class Clock:
     notes: tuple[str, ...] = ()
 
 
-def continued(path: Path, t_ns: Array, rows: Array, *, longest_part: bool = False) -> Clock:
-    """Times in the order of rows, without wraps and damage. rows: their numbers in the file, from 0.
+def continued(path: Path, t_ns: Array, has_time: Array, *, longest_part: bool = False) -> Clock:
+    """Times in the order of rows, without wraps and damage. has_time: (rows of the file,) which of them these are.
 
     longest_part: where the clock was set back, the longest part is good and the rest is not, as nobody can cut a log.
 
@@ -70,6 +70,7 @@ def continued(path: Path, t_ns: Array, rows: Array, *, longest_part: bool = Fals
     t_ns, notes = _unwrapped(t_ns)
     if not goes_back(t_ns):
         return Clock(t_ns, is_good, tuple(notes))
+    rows = np.flatnonzero(has_time)
     damaged = _damaged(t_ns)
     if len(damaged):
         is_good[damaged] = False

@@ -1,65 +1,31 @@
 """Measured tables: a text file with columns, as a logger wrote it, to samples with strictly increasing times.
 
-How a file holds its table is found in `layout`, numbers in `numbers`, times in `times`; rows out of order, repeated
-times and empty cells are handled here. Every change to the data is counted (`Repairs`).
-
-pandas would replace only the reading of cells, and every installation would need it.
+Rows out of order, repeated times and empty cells are handled here, for tables and logs. Every change to the data is
+counted (`Repairs`). How a file is read: `table_file`.
 """
 
 from __future__ import annotations
 
-import re
-import shlex
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import astuple, dataclass, field, replace
-from itertools import islice
 from pathlib import Path
 
 import numpy as np
 
 from fantwin.pipeline.errors import UsageError, UserError
-from fantwin.pipeline.sources.tables.clocks import continued, goes_back, time_in_words
-from fantwin.pipeline.sources.tables.fan_columns import FanColumns, fan_columns
-from fantwin.pipeline.sources.tables.layout import Layout, find_layout, rows_of
-from fantwin.pipeline.sources.tables.numbers import NumberColumn, OtherMarkError
-from fantwin.pipeline.sources.tables.profiles import profile_of
-from fantwin.pipeline.sources.tables.times import TimeColumn, time_names, usual_time
+from fantwin.pipeline.sources.tables.clocks import continued, goes_back
+from fantwin.pipeline.sources.tables.fan_columns import FanColumns
 from fantwin.pipeline.sources.tables.units import (
     ELECTRICAL,
     ELECTRICAL_HUNDREDS,
-    NS_PER_UNIT,
     RAD_S_PER_TABLE_UNIT,
-    SPEED_UNITS,
-    scale_of,
 )
-from fantwin.schemas.channels import BY_NAME
-from fantwin.schemas.messages import FURTHEST_T_NS, LARGEST_PERIOD_NS, Array
+from fantwin.schemas.messages import Array
 from fantwin.schemas.units import NS_PER_S
 
 GAP_IN_MEDIAN_PERIODS = 5.0
 
-_ROWS_IN_PART = 4096
 NO_COLUMNS: Mapping[str, Sequence[str]] = {}
-
-
-@dataclass(frozen=True)
-class Reading:
-    """What a user says of a file that does not show it; empty: it is found.
-
-    Attributes:
-        dates: order of the parts of a date, dmy, mdy or ymd.
-        zone: time zone of dates without one.
-        decimal: decimal mark of the numbers.
-        poles: magnetic poles of the motors, for electrical speeds.
-    """
-
-    dates: str = ""
-    zone: str = ""
-    decimal: str = ""
-    poles: int | None = None
-
-
-AS_FOUND = Reading()
 
 
 @dataclass(frozen=True)
@@ -150,105 +116,6 @@ class Table:
         return tuple(notes)
 
 
-def read_table(
-    path: Path,
-    time: str | None,
-    command: Sequence[str],
-    speed: Sequence[str],
-    *,
-    period: str | None = None,
-    auxiliary: Mapping[str, Sequence[str]] = NO_COLUMNS,
-    reading: Reading = AS_FOUND,
-    layout: Layout | None = None,
-) -> Table:
-    """Read a measured table.
-
-    time: `COLUMN`, `COLUMN:UNIT` with unit s, ms, us, ns or iso (dates), or `DATE+TIME`, two columns; see `TimeColumn`.
-    None: the one that the names and cells show, or with `period`, for example `10ms`, none. command, speed, auxiliary:
-    as for `fan_columns`; the unit of speeds is the one that is given, else the one in the file, else rad/s. layout: of
-    the file, if it was found before.
-
-    Raises:
-        UserError: the file, a column or a unit cannot be used.
-    """
-    if time and period:
-        raise UsageError("--period is for tables without a time column: leave out --time or --period")
-    if reading.decimal not in ("", ".", ","):
-        raise UsageError(f"--decimal {reading.decimal}: give . or ,")
-    layout = layout or find_layout(path)
-    profile = profile_of(layout)
-    chosen = fan_columns(path, layout.all_names, command, speed, auxiliary, SPEED_UNITS)
-    time = time or (not period and ((profile and profile.time_in(layout)) or usual_time(layout))) or None
-    if not (time or period):
-        raise UsageError("a table needs --time COLUMN[:UNIT], or --period 10ms if it has no time column")
-    dates = reading.dates or (profile.dates if profile else "")
-    times, columns, count = _columns(layout, time, chosen, replace(reading, dates=dates))
-    t_ns, has_time = times.values() if times else _counted_times(count, period or "")
-    values = {name: column.values(may_be_empty=chosen.is_pattern) for name, column in columns.items()}
-    chosen, left_out = used_fans(path, chosen, values)
-    remarks = [*_twice(layout, chosen), *chosen.notes, *left_out]
-    if times:
-        words = (times.format,) if times.is_notable else ()
-        remarks = [*(f"times of {times.name!r}: {each}" for each in words), *times.notes, *remarks]
-    remarks += [f"{column.name!r}: {texts}" for column in columns.values() if (texts := column.texts(has_time))]
-    for channel, names in chosen.others.items():
-        for name in filter(None, dict.fromkeys(names)):
-            remarks += _in_unit_of(channel, name, layout.unit(name) or columns[name].unit, values)
-    unit = chosen.unit or _unit_in_file(
-        chosen, {name: layout.unit(name) or columns[name].unit for name in chosen.speed}
-    )
-    if profile:
-        unit, words = profile.unit_of(chosen.speed, unit)
-        remarks += words
-    table = table_of(path, chosen, values, t_ns, has_time, *rad_s_per(unit or "rad/s", reading.poles))
-    return replace(
-        table,
-        assumed=_assumed(times, replace(chosen, assumed="" if unit else chosen.assumed)),
-        remarks=(*remarks, *table.remarks),
-        has_dates=bool(times and times.has_dates),
-    )
-
-
-def read_columns(
-    layout: Layout, time: str | None, reading: Reading
-) -> tuple[dict[str, NumberColumn], list[str], list[str]]:
-    """All columns of a table that have numbers, the times in words, and what cannot be told of them."""
-    profile = profile_of(layout)
-    time = time or (profile and profile.time_in(layout)) or usual_time(layout)
-    reading = replace(reading, dates=reading.dates or (profile.dates if profile else ""))
-    of_time = time_names(layout, time)[0] if time else []
-    numbers = [name for name, kind in zip(layout.names, layout.kinds, strict=True) if kind == "number"]
-    names = tuple(name for name in numbers if name and name not in of_time)
-    chosen = FanColumns(names, (), {}, "", "", ())
-    notes: list[str] = []
-    try:
-        times, columns, count = _columns(layout, time, chosen, reading)
-    except UserError as error:
-        notes.append(str(error))
-        times, columns, count = _columns(layout, None, chosen, reading)
-    words: list[str] = [] if time else ["no column of times: give --period 1s, the time between rows"]
-    if times:
-        try:
-            t_ns, known = times.values()
-            words = [f"times: {times.name}, {times.format}, {_range_of_times(t_ns[known])}", *times.notes]
-        except UserError as error:
-            notes.append(str(error))
-    for name in list(columns):
-        try:
-            columns[name].check()
-        except UserError as error:
-            notes.append(str(error))
-            del columns[name]
-    return columns, [*words, f"{count} rows"], notes
-
-
-def _range_of_times(t_ns: Array) -> str:
-    steps = np.diff(t_ns)
-    usual = float(np.median(steps)) / NS_PER_S if len(steps) else 0.0
-    ends = f"from {time_in_words(int(t_ns.min()))} to {time_in_words(int(t_ns.max()))}"
-    return f"{period_in_words(usual)} apart (median), {ends}"
-
-
 def period_in_words(seconds: float) -> str:
     """A time between samples to three digits: 2 s, 12.5 ms."""
     for unit, size in (("s", 1.0), ("ms", 1e-3)):
@@ -256,69 +123,6 @@ def period_in_words(seconds: float) -> str:
             value = seconds / size
             return f"{value:.0f} {unit}" if value >= 100 else f"{value:.3g} {unit}"
     return f"{seconds * 1e6:.3g} us"
-
-
-def _columns(
-    layout: Layout, time: str | None, chosen: FanColumns, reading: Reading
-) -> tuple[TimeColumn | None, dict[str, NumberColumn], int]:
-    """The columns with their cells, and the number of rows."""
-    shown: dict[str, str] = {}
-    of_times = ""
-    while True:
-        times = TimeColumn(layout, time, reading.dates, reading.zone, reading.decimal or of_times) if time else None
-        columns = {
-            name: NumberColumn(
-                layout.path,
-                name,
-                layout.index(name),
-                reading.decimal or shown.get(name) or layout.decimal_of(name),
-                is_final=bool(reading.decimal) or name in shown,
-            )
-            for name in chosen.names
-        }
-        count = 0
-        try:
-            for part in _parts(rows_of(layout)):
-                for column in (*filter(None, [times]), *columns.values()):
-                    column.add(part)
-                count += len(part)
-        except OtherMarkError as found:
-            if times and found.name == times.name:
-                of_times = found.decimal
-            else:
-                shown[found.name] = found.decimal
-        else:
-            return times, columns, count
-
-
-def _twice(layout: Layout, chosen: FanColumns) -> list[str]:
-    """Notes on columns that were asked for by a name that several have."""
-    asked = [name for name in chosen.names if f"{name} [2]" in layout.names]
-    return [f"several columns are called {name!r}: the first is read; the next is {f'{name} [2]'!r}" for name in asked]
-
-
-def _unit_in_file(chosen: FanColumns, units: Mapping[str, str]) -> str:
-    """The unit of speeds that the file shows; empty: none."""
-    found = list(dict.fromkeys(unit if unit in SPEED_UNITS else "" for unit in units.values()))
-    if len(found) > 1:
-        raise UsageError(
-            f"speeds in {', '.join(unit or 'no unit' for unit in found)}, as the file says: give one unit, as in "
-            f"--speed {shlex.quote(f'{chosen.speed[0]}:rpm')}, or import them apart"
-        )
-    return found[0]
-
-
-def _in_unit_of(channel: str, name: str, unit: str, values: Mapping[str, Array]) -> list[str]:
-    """Convert a column to the unit of its channel, in place; a note where its unit is another kind of unit."""
-    if not unit:
-        return []
-    scale = scale_of(channel, unit)
-    if scale is None:
-        return [f"{name!r} is in {unit}, and is taken as {channel}, in {BY_NAME[channel].unit}"]
-    if scale.factor != 1.0 or scale.offset:
-        values[name][:] = values[name] * scale.factor + scale.offset
-        return [f"{name!r} converted from {unit} to {BY_NAME[channel].unit}"]
-    return []
 
 
 def rad_s_per(unit: str, poles: int | None) -> tuple[float, str]:
@@ -385,34 +189,6 @@ def table_of(
     return replace(table, speed_rad_s=of_speed, auxiliary=dict(zip(chosen.others, measured, strict=True)))
 
 
-def _parts(rows: Iterator[list[str]]) -> Iterator[list[list[str]]]:
-    """The rows, some thousand at a time."""
-    while part := list(islice(rows, _ROWS_IN_PART)):
-        yield part
-
-
-def _assumed(times: TimeColumn | None, chosen: FanColumns) -> str:
-    """Line on the units that were assumed."""
-    found = [
-        each for each in (times.assumed if times else None, ("speeds in rad/s", chosen.assumed)) if each and each[1]
-    ]
-    if not found:
-        return ""
-    assumed, options = (" and ".join(words) for words in zip(*found, strict=True))
-    return f"no unit given, {assumed} assumed; if that is wrong, use for example {options}"
-
-
-def _counted_times(rows: int, period: str) -> tuple[Array, Array]:
-    """Times of a table without a time column: rows `period` apart, from 0; all are known."""
-    match = re.fullmatch(r"(\d{1,9}\.?\d*|\.\d+)\s*(s|ms|us|ns)", period.strip())
-    period_ns = round(float(match[1]) * NS_PER_UNIT[match[2]]) if match else 0
-    if not 0 < period_ns <= LARGEST_PERIOD_NS:
-        raise UsageError(f"--period {period}: give the time between samples with its unit, for example 10ms")
-    if rows * period_ns >= FURTHEST_T_NS:
-        raise UsageError(f"--period {period}: the table would end beyond the year 2116; give a shorter period")
-    return np.arange(rows, dtype=np.int64) * period_ns, np.ones(rows, dtype=np.bool_)
-
-
 def clean_samples(
     path: Path,
     t_ns: Array,
@@ -431,7 +207,7 @@ def clean_samples(
     rows = len(t_ns)
     if not has_time.all():
         t_ns, command, speed_rad_s = t_ns[has_time], command[has_time], speed_rad_s[has_time]
-    clock = continued(path, t_ns, np.flatnonzero(has_time), longest_part=longest_part)
+    clock = continued(path, t_ns, has_time, longest_part=longest_part)
     t_ns = clock.t_ns
     if not clock.is_good.all():
         t_ns, command, speed_rad_s = t_ns[clock.is_good], command[clock.is_good], speed_rad_s[clock.is_good]

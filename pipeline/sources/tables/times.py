@@ -150,7 +150,7 @@ class TimeColumn:
             )
         self._numbers.check()
         t_ns = np.asarray(self._t_ns)
-        since = " since 1970" if np.median(t_ns[known]) > _YEAR_2000_NS else ""
+        since = " since 1970" if t_ns[np.argmax(known)] > _YEAR_2000_NS else ""
         self.has_dates = bool(since)
         self.format = f"numbers in {self._unit}{since}"
         return t_ns, known

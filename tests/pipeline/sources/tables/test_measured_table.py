@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from fantwin.pipeline.errors import UserError
-from fantwin.pipeline.sources.tables import measured_table
-from fantwin.pipeline.sources.tables.measured_table import Table, read_table
+from fantwin.pipeline.sources.tables import table_file
+from fantwin.pipeline.sources.tables.measured_table import Table
+from fantwin.pipeline.sources.tables.table_file import read_table
 
 RPM = 2 * np.pi / 60
 UNITS = {"rad/s": 1.0, "rpm": RPM, "hz": 2 * np.pi, "deg/s": np.pi / 180}
@@ -145,7 +146,7 @@ def test_times_read_in_too_large_a_unit_are_an_error_that_names_the_unit_to_try(
 )
 def test_row_17_a_table_read_in_parts_is_the_same(tmp_path, monkeypatch, text):
     whole = table(tmp_path, text)
-    monkeypatch.setattr(measured_table, "_ROWS_IN_PART", 1)
+    monkeypatch.setattr(table_file, "_ROWS_IN_PART", 1)
     pieces = table(tmp_path, text)
     for name in ("t_ns", "command", "speed_rad_s"):
         np.testing.assert_array_equal(getattr(pieces, name), getattr(whole, name))
@@ -168,6 +169,6 @@ def test_row_17_a_table_needs_little_more_memory_than_its_file(tmp_path):
 
 @pytest.mark.parametrize("period", ["2d", "90000s", "99999999999999999999s", "86400s"])
 def test_row_15_a_period_without_measure_is_refused(tmp_path, monkeypatch, period):
-    monkeypatch.setattr(measured_table, "FURTHEST_T_NS", 100_000 * 10**9)
+    monkeypatch.setattr(table_file, "FURTHEST_T_NS", 100_000 * 10**9)
     with pytest.raises(UserError, match=f"--period {period}: "):
         table(tmp_path, "u,y\n" + 5 * "1,2\n", time=None, period=period)
