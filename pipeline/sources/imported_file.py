@@ -12,6 +12,7 @@ import numpy as np
 
 from fantwin.pipeline.errors import UsageError, UserError
 from fantwin.pipeline.sources.logs.formats import log_format, open_log
+from fantwin.pipeline.sources.logs.log_file import Series
 from fantwin.pipeline.sources.logs.preview import preview_of_log
 from fantwin.pipeline.sources.logs.samples_of_log import read_samples
 from fantwin.pipeline.sources.preview import Preview, ProposedFan, column_of
@@ -24,7 +25,7 @@ from fantwin.pipeline.sources.tables.fan_columns import FAN_NUMBER, with_unit
 from fantwin.pipeline.sources.tables.layout import Layout, find_layout
 from fantwin.pipeline.sources.tables.measured_table import Table
 from fantwin.pipeline.sources.tables.profiles import Profile, profile_of
-from fantwin.pipeline.sources.tables.table_file import AS_FOUND, Reading, read_columns, read_table
+from fantwin.pipeline.sources.tables.table_file import AS_FOUND, Reading, read_columns, read_table, series_in
 from fantwin.pipeline.sources.tables.units import ELECTRICAL, ELECTRICAL_HUNDREDS, SPEED_UNITS
 from fantwin.schemas.units import NS_PER_S
 
@@ -232,6 +233,40 @@ def _require_series(path: Path, series: SeriesFile, wanted: Wanted) -> None:
             f"{path}: no series {unknown[0]!r}: each row is a value of one series, and they are {shown}{more}: name "
             f"them as columns, such as {example}"
         )
+
+
+def read_files(paths: Sequence[Path], wanted: Wanted) -> Imported:
+    """The samples of several files: parts of one run, or tables that have commands and speeds apart.
+
+    Raises:
+        UserError: one cannot be read, or they do not go together.
+    """
+    if len(paths) > 1 and (joined := _joined(paths, wanted)):
+        return _of_series(paths[0], joined, replace(wanted, time=None))
+    return in_one(paths, [read_file(path, wanted) for path in paths])
+
+
+def _joined(paths: Sequence[Path], wanted: Wanted) -> SeriesFile | None:
+    """The series of tables of which none has all that is wanted; None: one has, or they are no tables."""
+    if any(log_format(path) or _series_of(path) for path in paths):
+        return None
+    layouts = [find_layout(path) for path in paths]
+    if len({layout.names for layout in layouts}) == 1 or any(map(is_annotated, layouts)):
+        return None
+    names = [name for layout in layouts for name in layout.all_names]
+    asked = [*wanted.command, *(with_unit(each, names, SPEED_UNITS)[0] for each in wanted.speed)]
+    if any(all(each in layout.all_names for each in asked) for layout in layouts if asked):
+        return None
+    series: dict[str, Series] = {}
+    for layout in layouts:
+        long = long_table(layout, wanted.time, wanted.reading)
+        apart = series_in(layout, wanted.time, wanted.reading) if long is None else {}
+        of_file = long.series if long else {name: Series(*each) for name, each in apart.items()}
+        series = {**of_file, **series}
+    found = SeriesFile(f"columns of {len(paths)} files by their times, {len(series)} series", series)
+    profile = profile_of(found)
+    is_known = bool(profile and profile.fans_in(found.names, {}))
+    return found if (asked and any(each in series for each in asked)) or (not asked and is_known) else None
 
 
 def _require_no_times(wanted: Wanted, what: str) -> None:

@@ -17,12 +17,13 @@ from fantwin.pipeline.cli.recordings.import_preview import show_previews
 from fantwin.pipeline.config.settings import NAME_PATTERN
 from fantwin.pipeline.errors import UsageError, UserError
 from fantwin.pipeline.recordings.raw_recordings import write_table
-from fantwin.pipeline.sources.imported_file import Wanted, in_one, preview_of, read_file
+from fantwin.pipeline.sources.imported_file import Wanted, preview_of, read_files
 from fantwin.pipeline.sources.tables.measured_table import Table, period_in_words
 from fantwin.pipeline.sources.tables.table_file import Reading
 from fantwin.pipeline.sources.tables.tachos import parse_tachos
 from fantwin.pipeline.sources.tacho_evidence import tacho_hints
 from fantwin.schemas.channels import CHANNELS
+from fantwin.schemas.fan_names import FanNames, is_fan_name
 from fantwin.schemas.topics import RESERVED_TRAY_NAMES
 from fantwin.schemas.units import NS_PER_S
 
@@ -129,12 +130,13 @@ def import_table(
         raise UsageError(f"--tray {tray}: use letters, digits, - and _, but not {' or '.join(RESERVED_TRAY_NAMES)}")
     if output.exists() and not force:
         raise UserError(f"{output}: exists; name another file with -o, or replace it with --force")
-    imported = in_one(paths, [read_file(path, wanted) for path in paths])
+    imported = read_files(paths, wanted)
     table = imported.table
     tachos = parse_tachos(tacho or (), table.fans)
     notes = list(filter(None, (table.assumed, *imported.notes)))
-    write_table(table, output, tray, tachos)
-    hints = tacho_hints(table.t_ns / NS_PER_S, table.speed_rad_s, tachos, range(table.fans))
+    names = FanNames(tuple(label if is_fan_name(label) else "" for label in imported.labels))
+    write_table(table, output, tray, tachos, names)
+    hints = tacho_hints(table.t_ns / NS_PER_S, table.speed_rad_s, tachos, range(table.fans), names)
     fans = "1 fan" if table.fans == 1 else f"{table.fans} fans"
     period_text = f"{period_in_words(table.median_period_s)} apart (median)"
     line = f"{output}: {len(table.t_ns)} samples of {fans} over {table.duration_s:.1f} s, {period_text}"

@@ -37,7 +37,10 @@ def discover_logs(folder: Path) -> list[FoundLogs]:
         raise UserError(f"{folder}: no ULog, ROS 2 bag or table ({', '.join(_TABLES)}) in it")
     titles = dict.fromkeys(title for title, _ in found)
     grouped = {title: [path for each, path in found if each == title] for title in titles}
-    return [FoundLogs(title, tuple(map(str, paths)), _import_of(title, paths[0])) for title, paths in grouped.items()]
+    return [
+        FoundLogs(title, tuple(map(str, paths)), f"fantwin import {shlex.quote(str(paths[0]))} --preview")
+        for title, paths in grouped.items()
+    ]
 
 
 def _formats(folder: Path) -> Iterator[tuple[str, Path]]:
@@ -49,8 +52,3 @@ def _formats(folder: Path) -> Iterator[tuple[str, Path]]:
             continue
         if kind or path.suffix.lower() in _TABLES:
             yield kind.title if kind else "table", path
-
-
-def _import_of(title: str, path: Path) -> str:
-    named = f"fantwin import {shlex.quote(str(path))}"
-    return f"{named} --time t:s --command u --speed y:rpm -o REC.mcap" if title == "table" else f"{named} --preview"

@@ -146,18 +146,45 @@ def find_layout(path: Path) -> Layout:
 def rows_of(layout: Layout) -> Iterator[list[str]]:
     """The rows of a table, without those that are empty or repeat its names, each at least as wide as its names.
 
+    A row with more cells than there are names may be shifted, so it is left out as a row without cells.
+
     Raises:
-        UserError: it cannot be read.
+        UserError: it cannot be read, names other columns further down, or most rows have more cells than names.
     """
+    rows = wider = 0
     width, names, first = len(layout.names), list(layout.written), layout.written[0]
     try:
         for row in islice(_cells(layout), layout.first_row - 1, None):
             if len(row) < width:
                 row.extend([""] * (width - len(row)))
-            if any(row) and not (row[0] == first and [cell.strip() for cell in row] == names):
+            if len(row) > width and any(row[width:]):
+                wider += 1
+                yield [""] * width
+            elif first and row[0] == first and not any(map(is_number, row)):
+                _require_same_names(layout, names, row)
+            elif any(row):
+                rows += 1
                 yield row
     except csv.Error as error:
         raise UserError(f"{layout.path}: not a text file with columns: {error}") from error
+    if wider > rows:
+        raise UserError(
+            f"{layout.path}: rows have more cells than the {width} names of line {layout.head}: if numbers have "
+            "decimal commas, export the table with another delimiter, such as ;"
+        )
+
+
+def _require_same_names(layout: Layout, names: Sequence[str], row: Sequence[str]) -> None:
+    """Raise UserError where a line of names within the rows names other columns."""
+    again = [cell.strip("# \t") for cell in row]
+    while len(again) > len(names) and not again[-1]:
+        again.pop()
+    if again != list(names):
+        other = next((name for name in again if name not in names), "none")
+        raise UserError(
+            f"{layout.path}: the columns change in a further line of names, which has {other!r}: cut the file there "
+            "and import the parts"
+        )
 
 
 def all_rows_of(layout: Layout) -> Iterator[list[str]]:

@@ -78,7 +78,8 @@ class Profile:
         for fan, speed in speeds.items():
             command = commands.get(fan) or (shared if len(commands) == 1 else None)
             if command:
-                fans.append(ProposedFan(labels.get(speed) or labels.get(command) or speed, command, speed))
+                label = labels.get(speed) or labels.get(command) or _UNIT.sub("", speed)
+                fans.append(ProposedFan(label, command, speed))
         return tuple(fans)
 
     def unit_of(self, speeds: Sequence[str], given: str) -> tuple[str, list[str]]:
@@ -99,6 +100,7 @@ class Profile:
         return {channel: name for channel, name in found.items() if name}
 
 
+_UNIT = re.compile(r"\s*[\[(](?:RPM|rpm)[\])]$")
 _MOTORS = (r"motor\[(?P<fan>\d+)\]",)
 _BLACKBOX_CHANNELS = {
     "supply_voltage_v": (r"vbatLatest \(V\)", r"vbatLatest"),
@@ -110,8 +112,8 @@ PROFILES = (
         "HWiNFO",
         head=("Date", "Time", r".+\[(RPM|°C|V|W|MHz|%)\]"),
         time=("Date", "Time"),
-        command=(r"(?P<fan>.+?)(?: Fan)?(?: PWM| Duty| Control| Speed)? \[%\]",),
-        speed=(r"(?P<fan>.+?)(?: Fan)?(?: Speed)? \[RPM\]",),
+        command=(r"(?P<fan>.*Fan ?\d*) \[%\]", r"(?P<fan>.+?)(?: Fan)? (?:PWM|Duty|Control) \[%\]"),
+        speed=(r"(?P<fan>.+) \[RPM\]",),
         unit="rpm",
     ),
     Profile(
@@ -185,13 +187,25 @@ PROFILES = (
         channels={"supply_voltage_v": (r"Voltage \(V\)",), "current_a": (r"Current \(A\)",)},
     ),
     Profile(
-        "ArduPilot (mavlogdump)",
-        head=(r"(ESC\.)?RPM.*|ESC\d?\.RPM.*", r"(RCOU\.)?C1.*|RCOU\.C1.*"),
-        time=("timestamp",),
-        command=(r"RCOU\.C(?P<fan>\d+)",),
-        speed=(r"ESC(?P<fan>\d+)\.RPM",),
+        "PX4 (ulog2csv)",
+        head=(r"output\[0\]|control\[0\]", r"esc\[0\]\.esc_rpm"),
+        command=(r"(?:output|control)\[(?P<fan>\d+)\]",),
+        speed=(r"esc\[(?P<fan>\d+)\]\.esc_rpm",),
         unit="rpm",
-        note="ESC instances are counted from 0 and outputs from 1, and SERVOn_FUNCTION may order them otherwise",
+    ),
+    Profile(
+        "ArduPilot (mavlogdump)",
+        head=(r"RPM(\{\d+\})?", r"C1"),
+        unit="rpm",
+        speed=(r"RPM(?:\{\d+\})?",),
+        note="name them: ESC 0 is RPM{0}, output 1 is C1, and SERVOn_FUNCTION says which output drives which motor",
+    ),
+    Profile(
+        "PX4 (ulog2csv), one topic",
+        head=("timestamp", r"output\[0\]|control\[0\]|esc\[0\]\.esc_rpm"),
+        time=("timestamp",),
+        time_unit="us",
+        note="commands and speeds are in two files: name both",
     ),
     Profile(
         "fan2go",

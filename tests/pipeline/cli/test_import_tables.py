@@ -14,7 +14,8 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from tests.support.fantwin_command import fantwin
+from fantwin.pipeline.recordings.training_runs import read_runs
+from tests.support.fantwin_command import error_of, fantwin
 from tests.support.written_recordings import raw_columns
 
 RPM = 2 * np.pi / 60
@@ -171,7 +172,7 @@ TABLES = {
         ).encode("cp1252"),
         (),
         EPOCH_S,
-        ("columns of HWiNFO: Fan1 [RPM]", "dates as day, month, year", "1 rows dropped: their time cannot be read"),
+        ("columns of HWiNFO: Fan1:", "dates as day, month, year", "1 rows dropped: their time cannot be read"),
     ),
     "a line sep=": Table(lines(ISO, SPEED, COMMAND, by="|", before="sep=|", head='"Time"|"fan1"|"pwm1"'), t_s=EPOCH_S),
     "comments": Table(
@@ -318,7 +319,7 @@ TABLES = {
         ),
         ("--poles", "14"),
         0.002 * SECONDS,
-        ("columns of Betaflight blackbox: eRPM[0]",),
+        ("columns of Betaflight blackbox: eRPM[0]:",),
     ),
     "blackbox_decode of builds that say (/100)": Table(
         lines(
@@ -357,7 +358,6 @@ TABLES = {
         (),
         SECONDS / 40,
     ),
-    "mavlogdump": Table(lines(EPOCH_S, COMMAND, SPEED, head="timestamp,RCOU.C1,ESC1.RPM"), (), EPOCH_S),
     # slots without a fan
     "slots that nothing is connected to": Table(
         lines(SECONDS, SPEED, COMMAND, [0] * N, COMMAND, [""] * N, COMMAND, head="t,fan1,pwm1,fan2,pwm2,fan3,pwm3"),
@@ -384,3 +384,188 @@ def test_a_table_becomes_a_recording_of_its_numbers_and_times(name: str, tmp_pat
     for note in table.notes:
         assert note in result.stdout
     assert "speeds in rad/s assumed" not in result.stdout
+
+
+DAMAGED = SECONDS.astype(float)
+DAMAGED[30] += 2.0**20 / 100
+
+
+class Cut(NamedTuple):
+    """A table of which some rows cannot be read, which cost themselves. kept: rows that are."""
+
+    content: str
+    kept: np.ndarray
+    note: str
+    options: tuple[str, ...] = COLUMNS
+
+
+WITHOUT_30 = np.delete(SECONDS, 30)
+CUTS = {
+    "a damaged time far ahead": Cut(
+        lines(DAMAGED, SPEED, COMMAND, head="t,fan1,pwm1"),
+        WITHOUT_30,
+        "1 row dropped: the time contradicts the rows around (row 31)",
+    ),
+    "a damaged time far behind": Cut(
+        lines(np.where(SECONDS == 30, 3, SECONDS), SPEED, COMMAND, head="t,fan1,pwm1"),
+        WITHOUT_30,
+        "1 row dropped: the time contradicts",
+    ),
+    "a damaged time beyond all dates": Cut(
+        lines(np.where(SECONDS == 30, 10**18, SECONDS), SPEED, COMMAND, head="t,fan1,pwm1"),
+        WITHOUT_30,
+        "1 rows dropped: their time cannot",
+    ),
+    "a damaged frame a tenth of a second ahead, of a log of 2 ms": Cut(
+        lines(np.where(SECONDS == 30, 160_000, SECONDS * 2000), SPEED, COMMAND, head="t (us),fan1,pwm1"),
+        WITHOUT_30,
+        "1 row dropped: the time contradicts",
+    ),
+    "a row with cells of its own": Cut(
+        lines(SECONDS, SPEED, [f"{c},7" if k == 30 else c for k, c in enumerate(COMMAND)], head="t,fan1,pwm1"),
+        WITHOUT_30,
+        "1 rows dropped",
+    ),
+    "a cell with text": Cut(
+        lines(SECONDS, [f"{s}" if k != 30 else "fast" for k, s in enumerate(SPEED)], COMMAND, head="t,fan1,pwm1"),
+        SECONDS,
+        "'fan1': 1 cell with text that is no number, first 'fast' in row 31",
+    ),
+    "a cell of thousands in another unit": Cut(
+        lines(
+            SECONDS, [f"{s} rpm" if k != 30 else "1.74 krpm" for k, s in enumerate(SPEED)], COMMAND, head="t,fan1,pwm1"
+        ),
+        SECONDS,
+        "1 cell with text that is no number, first '1.74 krpm'",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", CUTS)
+def test_a_damaged_row_costs_itself_and_is_counted(name: str, tmp_path: Path) -> None:
+    cut = CUTS[name]
+    path, recording = tmp_path / "table.csv", tmp_path / "r.mcap"
+    path.write_text(cut.content, encoding="utf-8")
+    result = fantwin("import", path, *cut.options, "-o", recording)
+    assert result.exit_code == 0, result.output
+    assert cut.note in result.stdout
+    t_ns, _, speed_rad_s = raw_columns(recording)
+    scale = 0.002 if "us" in cut.content[:10] else 1.0
+    np.testing.assert_allclose(t_ns / 1e9, cut.kept * scale, atol=1e-9)
+    known = np.isfinite(speed_rad_s[:, 0])
+    assert known.sum() == N - 1
+    np.testing.assert_allclose(speed_rad_s[known, 0] / RPM, SPEED[cut.kept][known], rtol=1e-9)
+
+
+REFUSED = {
+    "three digits behind any mark, between semicolons": (
+        lines(SECONDS, [f"{s / 10:.3f}" for s in SPEED], COMMAND, by=";", head="t;fan1;pwm1"),
+        "column 'fan1': '102.000' is 102000 or 102: give the decimal mark of the file, --decimal . or --decimal ,",
+    ),
+    "both marks as decimal marks, and a cell that could have either": (
+        lines(
+            SECONDS,
+            ["1,016" if k == 50 else "12,5" if k % 2 else "12.5" for k in SECONDS],
+            COMMAND,
+            by=";",
+            head="t;fan1;pwm1",
+        ),
+        "'1,016' is 1016 or 1.016, and '12.5' and '12,5' differ: give the decimal mark",
+    ),
+    "decimal commas between commas": (
+        lines(SECONDS, [f"{s},5" for s in SPEED], COMMAND, head="t,fan1,pwm1"),
+        "rows have more cells than the 3 names of line 1: if numbers have decimal commas",
+    ),
+    "other columns after a restart": (
+        lines(SECONDS, SPEED, COMMAND, head="t,fan1,pwm1") + lines(SECONDS, COMMAND, SPEED, head="t,pwm1,fan1"),
+        "the columns change in a further line of names, which has 'none': cut the file there",
+    ),
+    "a date with two readings": (
+        lines([f"06/09/2026 21:59:{k:02}" for k in SECONDS], SPEED, COMMAND, head="Time,fan1,pwm1"),
+        "06/09/2026 can be read in 2 ways, and no row tells: give --dates dmy (day, month, year) or --dates mdy",
+    ),
+    "a clock that was set back": (
+        lines(np.concatenate([SECONDS[:40], SECONDS[:20] + 20]), SPEED, COMMAND, head="t,fan1,pwm1"),
+        "time goes back by 19.000 s at row 41, from 39.000 s to 20.000 s: the clock was set, or a second run begins",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_cannot_be_told_is_refused_with_the_cell_and_the_option(name: str, tmp_path: Path) -> None:
+    content, expected = REFUSED[name]
+    path = tmp_path / "table.csv"
+    path.write_text(content, encoding="utf-8")
+    assert expected in error_of("import", path, *COLUMNS, "-o", tmp_path / "r.mcap")
+    assert not (tmp_path / "r.mcap").exists()
+
+
+def test_marks_that_only_later_rows_show_are_those_of_the_whole_column(tmp_path: Path) -> None:
+    path, recording = tmp_path / "table.csv", tmp_path / "r.mcap"
+    rows = [f"{k};1.01{6 + k % 3};40" for k in range(1000)]
+    path.write_text("\n".join(["t;fan1;pwm1", *rows, "1000;1.016,5;40"]) + "\n", encoding="utf-8")
+    assert fantwin("import", path, *COLUMNS, "-o", recording).exit_code == 0
+    speed = raw_columns(recording)[2][:, 0] / RPM
+    np.testing.assert_allclose(speed, [*(1016 + np.arange(1000) % 3), 1016.5])
+
+
+def test_several_files_and_patterns_become_one_recording_in_the_order_of_time(tmp_path: Path) -> None:
+    whole = lines(ISO, SPEED, COMMAND, head="Time,fan1,pwm1").splitlines()
+    for name, rows in (("log-2.csv", whole[31:]), ("log-1.csv", whole[1:36])):
+        (tmp_path / name).write_text("\n".join([whole[0], *rows]) + "\n", encoding="utf-8")
+    recording = tmp_path / "r.mcap"
+    result = fantwin("import", tmp_path / "log-*.csv", *COLUMNS, "-o", recording)
+    assert "2 files in the order of time" in result.stdout
+    assert "5 rows of files that overlap, 5 of them twice" in result.stdout
+    t_ns, command, speed = raw_columns(recording)
+    np.testing.assert_allclose(t_ns / 1e9, EPOCH_S, atol=1e-6)
+    np.testing.assert_array_equal(command[:, 0], COMMAND)
+    np.testing.assert_allclose(speed[:, 0] / RPM, SPEED)
+    other = whole[31:36] = [line.replace(",1", ",2", 1) for line in whole[31:36]]
+    (tmp_path / "log-2.csv").write_text("\n".join([whole[0], *other]) + "\n", encoding="utf-8")
+    words = ("import", tmp_path / "log-1.csv", tmp_path / "log-2.csv", *COLUMNS, "-o", tmp_path / "s.mcap")
+    assert "have other speeds at the same time" in error_of(*words)
+
+
+def test_commands_and_speeds_in_two_tables_are_joined_by_their_times(tmp_path: Path) -> None:
+    outputs, escs = tmp_path / "flight_actuator_outputs_0.csv", tmp_path / "flight_esc_status_0.csv"
+    us = 10_000_000 + SECONDS * 100_000
+    outputs.write_text(lines(us - 500, [4] * N, COMMAND, head="timestamp,noutputs,output[0]"), encoding="utf-8")
+    escs.write_text(lines(us, [1] * N, SPEED, head="timestamp,esc_count,esc[0].esc_rpm"), encoding="utf-8")
+    result = fantwin("import", outputs, escs, "-o", tmp_path / "r.mcap")
+    assert "columns of 2 files by their times" in result.stdout
+    assert "columns of PX4 (ulog2csv): esc[0].esc_rpm: command 'output[0]'" in result.stdout
+    t_ns, command, speed = raw_columns(tmp_path / "r.mcap")
+    np.testing.assert_allclose(t_ns / 1e9, us / 1e6)
+    np.testing.assert_array_equal(command[:, 0], COMMAND)
+    np.testing.assert_allclose(speed[:, 0] / RPM, SPEED)
+
+
+def test_a_preview_shows_what_was_understood_and_its_command_line_imports_the_table(tmp_path: Path) -> None:
+    path, recording = tmp_path / "HWiNFO log.CSV", tmp_path / "r.mcap"
+    table = TABLES["HWiNFO: Latin-1, date and time, names again at the end"]
+    path.write_bytes(bytes(table.content))  # type: ignore[arg-type]
+    before = set(tmp_path.iterdir())
+    shown = fantwin("import", path, "--preview").stdout
+    for expected in (
+        "HWiNFO: Windows-1252, columns separated by ',', names in line 1",
+        "times: Date+Time, dates as day, month, year, 1 s apart (median), from 2026-06-09 21:59:50 to 2026-06-09 22:00",
+        "840 to 1748 rpm",
+        "Fan1: command Fan1 PWM [%], speed Fan1 [RPM]",
+    ):
+        assert expected in shown
+    assert set(tmp_path.iterdir()) == before
+    (found,) = json.loads(fantwin("import", path, "--preview", "--json").stdout)["files"]
+    words = [*found["options"], "-o", recording]
+    assert found["command_line"].startswith(
+        f"fantwin import '{path}' --command 'Fan1 PWM [%]' --speed 'Fan1 [RPM]:rpm'"
+    )
+    assert fantwin("import", path, *words).exit_code == 0
+    np.testing.assert_allclose(raw_columns(recording)[2][:, 0] / RPM, SPEED)
+
+
+def test_fans_are_called_as_the_program_calls_them(tmp_path: Path) -> None:
+    path, recording = tmp_path / "table.csv", tmp_path / "r.mcap"
+    path.write_text(lines(US, SPEED, SPEED // 2, COMMAND, COMMAND, head=LHM_HEAD), encoding="utf-8")
+    assert fantwin("import", path, "-o", recording).exit_code == 0
+    assert read_runs(recording).names.names == ("Fan #1", "Fan #2")
