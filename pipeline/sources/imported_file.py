@@ -113,11 +113,10 @@ def preview_of(path: Path, wanted: Wanted) -> Preview:
     series = _series_of(path)
     if series is None:
         layout = find_layout(path)
-        if any(kind == "text" for kind in layout.kinds) or is_annotated(layout) or len(set(layout.kinds)) > 1:
-            try:
-                series = long_table(layout, wanted.time, wanted.reading)
-            except UserError:
-                series = None
+        try:
+            series = long_table(layout, wanted.time, wanted.reading)
+        except UserError:
+            series = None  # the preview of the table says why
         if series is None:
             return _preview_of_table(path, layout, wanted)
     profile = profile_of(series)

@@ -29,6 +29,7 @@ _LEAST_VALUES = 2
 _ROWS_IN_PART = 4096
 _TOO_MANY_BACK = 0.1
 """steps back within series, as a share of those from row to row"""
+_MOSTLY = 0.5
 _ANNOTATION = "#"
 _FIELD, _VALUE, _TIME = "_field", "_value", "_time"
 _NOT_TAGS = {"", "result", "table", "_start", "_stop", _TIME, _VALUE, _FIELD}
@@ -137,6 +138,10 @@ def _is_long(t_ns: Array, series: Array, count: int) -> bool:
     """Whether times go on within series, and not from row to row."""
     if count < 2 or len(t_ns) < _LEAST_VALUES * count:
         return False
+    counts = np.bincount(series)
+    changes = np.count_nonzero(np.diff(series))
+    if changes > _MOSTLY * len(series) and counts.max() <= 2 * counts.min():
+        return True  # one after the other, each at its own times
     back = int(np.count_nonzero(np.diff(t_ns) <= 0))
     order = np.argsort(series, kind="stable")
     within = np.diff(t_ns[order])[np.diff(series[order]) == 0]

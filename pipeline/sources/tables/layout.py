@@ -29,7 +29,7 @@ _DELIMITERS = {",": "','", ";": "';'", "\t": "tabs", "|": "'|'", BLANKS: "blanks
 _SAMPLE_BYTES = 1 << 18
 _SAMPLE_LINES = 400
 _LEAST_ALIKE = 0.6
-"""share of the cells of a row that are of the kind that its column has"""
+"""share of the cells of a row that are of the kind that its column has; a row has more"""
 _LONGEST_SENTENCE = 6
 """words of a cell; a longer one is a sentence, not a name"""
 _RULER = re.compile(r"[-=+:|\s,;]*[-=][-=+:|\s,;]*")
@@ -143,23 +143,23 @@ def find_layout(path: Path) -> Layout:
     return _layout(path, encoding, title, delimiter, [(number, row) for number, row in rows if any(row)])
 
 
-def rows_of(layout: Layout) -> Iterator[list[str]]:
+def rows_of(layout: Layout, wider: list[str] | None = None) -> Iterator[list[str]]:
     """The rows of a table, without those that are empty or repeat its names, each at least as wide as its names.
 
-    A row with more cells than there are names may be shifted, so it is left out as a row without cells.
+    wider: gets what is beyond the last name in rows that have more cells: they may be shifted, and are left out.
 
     Raises:
         UserError: it cannot be read, names other columns further down, or most rows have more cells than names.
     """
-    rows = wider = 0
+    rows = 0
+    wider = [] if wider is None else wider
     width, names, first = len(layout.names), list(layout.written), layout.written[0]
     try:
         for row in islice(_cells(layout), layout.first_row - 1, None):
             if len(row) < width:
                 row.extend([""] * (width - len(row)))
             if len(row) > width and any(row[width:]):
-                wider += 1
-                yield [""] * width
+                wider.append(",".join(row[width:]))
             elif first and row[0] == first and not any(map(is_number, row)):
                 _require_same_names(layout, names, row)
             elif any(row):
@@ -167,7 +167,7 @@ def rows_of(layout: Layout) -> Iterator[list[str]]:
                 yield row
     except csv.Error as error:
         raise UserError(f"{layout.path}: not a text file with columns: {error}") from error
-    if wider > rows:
+    if len(wider) > rows:
         raise UserError(
             f"{layout.path}: rows have more cells than the {width} names of line {layout.head}: if numbers have "
             "decimal commas, export the table with another delimiter, such as ;"
@@ -320,6 +320,8 @@ def _head(
         units = [cell.strip("[]() ") for cell in rest.pop()[1]]
     if not rest:
         return 0, [], [], units, {}
+    as_wide = [k for k, (_, row) in enumerate(rest) if width <= len(row) <= width + 1]
+    rest = rest[: as_wide[-1] + 1] if as_wide else rest  # what is between the names and the rows is narrower
     head, cells = rest.pop()
     if len(cells) > width and not cells[0].strip("# \t"):
         cells = cells[1:]  # the mark of a comment
@@ -347,10 +349,11 @@ def _held(cells: Sequence[str]) -> list[str]:
 
 def _is_row(row: Sequence[str], kinds: Sequence[str]) -> bool:
     """Whether a line is alike what repeats: its cells are of the kinds that the columns have."""
-    pairs = [(_kind(cell), kind) for cell, kind in zip(row, kinds, strict=False) if cell and kind]
-    alike = sum(cell == kind and kind != "text" for cell, kind in pairs)
-    wanted = sum(kind != "text" for _, kind in pairs)
-    return len(row) * 2 > len(kinds) and wanted > 0 and alike >= _LEAST_ALIKE * wanted
+    pairs = [(_kind(cell), kind) for cell, kind in zip(row, kinds, strict=False) if kind in ("number", "time")]
+    alike = sum(cell in (kind, "") for cell, kind in pairs)
+    is_filled = any(cell == kind for cell, kind in pairs)
+    wanted = sum(kind in ("number", "time") for kind in kinds)
+    return is_filled and alike > _LEAST_ALIKE * wanted
 
 
 def _is_ruler(row: Sequence[str]) -> bool:

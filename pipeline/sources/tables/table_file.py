@@ -90,11 +90,13 @@ def read_table(
     if not (time or period):
         raise UsageError("a table needs --time COLUMN[:UNIT], or --period 10ms if it has no time column")
     dates = reading.dates or (profile.dates if profile else "")
-    times, columns, count = columns_of(layout, time, chosen, replace(reading, dates=dates))
+    times, columns, count, wider = columns_of(layout, time, chosen, replace(reading, dates=dates))
     t_ns, has_time = times.values() if times else _counted_times(count, period or "")
     values = {name: column.values(may_be_empty=chosen.is_pattern) for name, column in columns.items()}
     chosen, left_out = used_fans(path, chosen, values)
     remarks = [*_twice(layout, chosen), *chosen.notes, *left_out]
+    if wider:
+        remarks.append(f"{len(wider)} rows left out: more cells than the {len(layout.names)} names, first {wider[0]!r}")
     if times:
         words = (times.format,) if times.is_notable else ()
         remarks = [*(f"times of {times.name!r}: {each}" for each in words), *times.notes, *remarks]
@@ -124,10 +126,10 @@ def read_columns(
     time, reading, chosen = _all_numbers(layout, time, reading)
     notes: list[str] = []
     try:
-        times, columns, count = columns_of(layout, time, chosen, reading)
+        times, columns, count, _ = columns_of(layout, time, chosen, reading)
     except UserError as error:
         notes.append(str(error))
-        times, columns, count = columns_of(layout, None, chosen, reading)
+        times, columns, count, _ = columns_of(layout, None, chosen, reading)
     words: list[str] = [] if time else ["no column of times: give --period 1s, the time between rows"]
     if times:
         try:
@@ -153,7 +155,7 @@ def series_in(layout: Layout, time: str | None, reading: Reading) -> dict[str, t
     time, reading, chosen = _all_numbers(layout, time, reading)
     if not time:
         raise UserError(f"{layout.path}: no column of times; name it with --time")
-    times, columns, _ = columns_of(layout, time, chosen, reading)
+    times, columns, _, _ = columns_of(layout, time, chosen, reading)
     assert times
     t_ns, known = times.values()
     found: dict[str, tuple[Array, Array]] = {}
@@ -184,8 +186,8 @@ def _range_of_times(t_ns: Array) -> str:
 
 def columns_of(
     layout: Layout, time: str | None, chosen: FanColumns, reading: Reading
-) -> tuple[TimeColumn | None, dict[str, NumberColumn], int]:
-    """The columns with their cells, and the number of rows."""
+) -> tuple[TimeColumn | None, dict[str, NumberColumn], int, list[str]]:
+    """The columns with their cells, the number of rows, and what other rows have beyond the last name."""
     shown: dict[str, str] = {}
     of_times = ""
     while True:
@@ -201,8 +203,9 @@ def columns_of(
             for name in chosen.names
         }
         count = 0
+        wider: list[str] = []
         try:
-            for part in _parts(rows_of(layout)):
+            for part in _parts(rows_of(layout, wider)):
                 for column in (*filter(None, [times]), *columns.values()):
                     column.add(part)
                 count += len(part)
@@ -212,7 +215,7 @@ def columns_of(
             else:
                 shown[found.name] = found.decimal
         else:
-            return times, columns, count
+            return times, columns, count, wider
 
 
 def _twice(layout: Layout, chosen: FanColumns) -> list[str]:

@@ -358,6 +358,19 @@ TABLES = {
         (),
         SECONDS / 40,
     ),
+    "MSI Afterburner: lines of limits between the names and the rows": Table(
+        lines(
+            ["80"] * N,
+            [f"{each:%d-%m-%Y %H:%M:%S}" for each in DATES],
+            [f"{c}.000" for c in COMMAND],
+            [f"{s}.000" for s in SPEED],
+            by=", ",
+            before="00, 09-06-2026 21:59:50, Hardware monitoring log v1.6\n01, 09-06-2026 21:59:50, GPU",
+            head="02, 09-06-2026 21:59:50, Fan speed  ,Fan tachometer\n03, 09-06-2026 21:59:50, Fan speed, , %, 0, 100, 10,",
+        ).encode("cp1252"),
+        ("--command", "Fan speed", "--speed", "Fan tachometer:rpm", "--dates", "dmy"),
+        EPOCH_S,
+    ),
     # slots without a fan
     "slots that nothing is connected to": Table(
         lines(SECONDS, SPEED, COMMAND, [0] * N, COMMAND, [""] * N, COMMAND, head="t,fan1,pwm1,fan2,pwm2,fan3,pwm3"),
@@ -421,10 +434,10 @@ CUTS = {
         WITHOUT_30,
         "1 row dropped: the time contradicts",
     ),
-    "a row with cells of its own": Cut(
+    "a row with a cell too many": Cut(
         lines(SECONDS, SPEED, [f"{c},7" if k == 30 else c for k, c in enumerate(COMMAND)], head="t,fan1,pwm1"),
         WITHOUT_30,
-        "1 rows dropped",
+        "1 rows left out: more cells than the 3 names, first '7'",
     ),
     "a cell with text": Cut(
         lines(SECONDS, [f"{s}" if k != 30 else "fast" for k, s in enumerate(SPEED)], COMMAND, head="t,fan1,pwm1"),
@@ -539,6 +552,28 @@ def test_commands_and_speeds_in_two_tables_are_joined_by_their_times(tmp_path: P
     np.testing.assert_allclose(t_ns / 1e9, us / 1e6)
     np.testing.assert_array_equal(command[:, 0], COMMAND)
     np.testing.assert_allclose(speed[:, 0] / RPM, SPEED)
+
+
+def test_telemetry_by_instance_is_joined_with_the_outputs_of_another_table(tmp_path: Path) -> None:
+    """mavlogdump writes one type of message a table."""
+    escs, outputs = tmp_path / "esc.csv", tmp_path / "rcou.csv"
+    rows = [
+        f"{t + 0.001 * i:.8f},{k},{i},{s * (1 + i)},15.2"
+        for k, (t, s) in enumerate(zip(EPOCH_S, SPEED, strict=True))
+        for i in range(2)
+    ]
+    escs.write_text("\n".join(["timestamp,TimeUS,Instance,RPM,Volt", *rows]), encoding="utf-8")
+    outputs.write_text(
+        lines([f"{t - 0.0005:.8f}" for t in EPOCH_S], COMMAND, COMMAND, head="timestamp,C1,C2"), encoding="utf-8"
+    )
+    words = ("--command", "C1", "--command", "C2", "--speed", "RPM{0}:rpm", "--speed", "RPM{1}:rpm")
+    result = fantwin("import", escs, outputs, *words, "-o", tmp_path / "r.mcap")
+    assert "columns of 2 files by their times" in result.stdout
+    _, command, speed = raw_columns(tmp_path / "r.mcap")
+    for fan in (0, 1):
+        known = np.isfinite(speed[:, fan])
+        np.testing.assert_allclose(speed[known, fan] / RPM, SPEED * (1 + fan))
+        np.testing.assert_array_equal(command[known, fan], COMMAND)
 
 
 def test_a_preview_shows_what_was_understood_and_its_command_line_imports_the_table(tmp_path: Path) -> None:

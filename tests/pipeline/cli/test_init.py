@@ -135,7 +135,7 @@ def test_logs_need_no_configuration_and_the_command_that_reads_them_is_said(file
     shown = fantwin("init", "--logs", logs).stdout.splitlines()
     assert shown[-2:] == [
         f"next: fantwin import {logs}/day/flight.ulg --preview",
-        f"next: fantwin import {logs}/bench.csv --time t:s --command u --speed y:rpm -o REC.mcap",
+        f"next: fantwin import {logs}/bench.csv --preview",
     ]
     assert not file.exists()
 
