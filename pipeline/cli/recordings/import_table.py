@@ -102,11 +102,8 @@ def import_table(
 ) -> None:
     """Turn measured tables or logs into a recording, the data format of training, evaluation and replay.
 
-    Encoding, delimiter, line of the names, times, units and decimal marks are found by what the file shows; --preview
-    says what was found. Irregularities (repeated times, gaps, empty cells) are counted and reported; speeds are never
+    How a file is written is found; --preview shows it, without writing. Irregularities are counted; speeds are never
     filled in. Tachos of ordinary fans count pulses: say over which time, or see the hint.
-
-    Example: fantwin import FILE.csv --preview
 
     Example: fantwin import FILE.csv --time t:s --command u --speed y:rpm --tacho count:window_s=1 -o REC.mcap
 
