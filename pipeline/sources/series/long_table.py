@@ -107,7 +107,8 @@ def _read(layout: Layout, columns: _Columns, reading: Reading, shown: dict[str, 
         return None
     t_ns, has_time = times.values()
     series = np.asarray(of_row)
-    if not is_annotated(layout) and not _is_long(t_ns[has_time], series[has_time], len(known)):
+    is_keyed = all(_LIKE_A_KEY.fullmatch(key) for key in columns.keys)
+    if not is_annotated(layout) and not _is_long(t_ns[has_time], series[has_time], len(known), is_keyed=is_keyed):
         return None
     order = np.argsort(series, kind="stable")
     starts = np.searchsorted(series[order], np.arange(len(known) + 1))
@@ -134,14 +135,14 @@ def _label(columns: _Columns, key: Sequence[str], value_column: str) -> Label:
     return Label(value_column, tuple(("", text) if len(tags) == 1 else (name, text) for name, text in tags))
 
 
-def _is_long(t_ns: Array, series: Array, count: int) -> bool:
-    """Whether times go on within series, and not from row to row."""
+def _is_long(t_ns: Array, series: Array, count: int, *, is_keyed: bool) -> bool:
+    """Whether times go on within series, and not from row to row; or series take turns, and are named as such."""
     if count < 2 or len(t_ns) < _LEAST_VALUES * count:
         return False
     counts = np.bincount(series)
     changes = np.count_nonzero(np.diff(series))
-    if changes > _MOSTLY * len(series) and counts.max() <= 2 * counts.min():
-        return True  # one after the other, each at its own times
+    if is_keyed and changes > _MOSTLY * len(series) and counts.max() <= 2 * counts.min():
+        return True
     back = int(np.count_nonzero(np.diff(t_ns) <= 0))
     order = np.argsort(series, kind="stable")
     within = np.diff(t_ns[order])[np.diff(series[order]) == 0]

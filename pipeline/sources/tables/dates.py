@@ -40,7 +40,7 @@ _DATE = r"(?P<a>\d{1,4})(?P<by>[./-])\s?(?P<b>\d{1,2}|[A-Za-z]{3,9})(?P=by)\s?(?
 _WORDY = r"(?P<month>[A-Za-z]{3,9})\.?\s+(?P<day>\d{1,2}),?\s+(?P<year>\d{4})"
 _TIME = (
     r"(?P<h>\d{1,2})[:.](?P<m>\d{2})(?:[:.](?P<s>\d{2})(?:[.,:](?P<f>\d+))?)?"
-    r"\s*(?P<half>[AaPp]\.?[Mm]\.?)?\s*(?P<zone>Z|[A-Za-z]{3,4}|(?:UTC|GMT)?[+-]\d\d:?\d\d)?"
+    r"\s*(?P<half>[AaPp]\.?[Mm]\.?)?\s*(?P<zone>Z|[A-Za-z]{3,4}|(?:UTC|GMT)?[+-]\d\d:?\d\d)?(?:\s+[A-Z]{3,4})?"
 )
 _DATED = re.compile(rf"(?:[A-Za-z]{{2,9}}\.?,?\s+)?(?:{_DATE}|{_WORDY})(?:[T,\s]\s*{_TIME})?")
 _OF_DAY = re.compile(rf"(?:(?P<days>\d+)[ d.]+)?{_TIME}")

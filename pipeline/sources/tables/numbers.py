@@ -107,6 +107,7 @@ class Marks:
         point, comma: one whose decimal mark that is.
         unsure: one that leaves it open.
         ungrouped: whether a number of four digits or more has no thousands separator.
+        small: whether a whole number below 1000 has no mark, as where marks separate thousands.
         unit: behind the numbers, as the table writes it.
     """
 
@@ -114,6 +115,7 @@ class Marks:
     comma: str = ""
     unsure: str = ""
     ungrouped: bool = False
+    small: bool = False
     unit: str = ""
 
     @classmethod
@@ -136,15 +138,22 @@ class Marks:
             self.unsure = self.unsure or text
         whole = re.split("[.,]", cell.digits)[0]
         self.ungrouped = self.ungrouped or (len(whole) > 3 and whole[0] != "0")
+        self.small = self.small or (not cell.mark and len(whole) <= 3 and whole.strip("0") != "")
 
     @property
     def decimal(self) -> str:
         """The decimal mark that the column shows; empty: none, or both."""
         if bool(self.point) != bool(self.comma):
             return "." if self.point else ","
-        if self.unsure and self.ungrouped and not self.point:
-            return "." if "." in self.unsure else ","
+        if self.unsure and self.ungrouped and not self.point and "." in self.unsure:
+            return "."
         return ""
+
+    @property
+    def is_doubtful(self) -> bool:
+        """Whether marks may separate thousands: whole numbers without a mark are below 1000, all others have three
+        digits behind it."""
+        return bool(self.unsure and self.small and not (self.point or self.comma or self.ungrouped))
 
 
 def file_decimal(marks: Sequence[Marks], delimiter: str) -> str:
@@ -152,7 +161,8 @@ def file_decimal(marks: Sequence[Marks], delimiter: str) -> str:
     shown = {found for each in marks if (found := each.decimal)}
     if len(shown) == 1:
         return shown.pop()
-    return "." if delimiter == "," and not shown else ""
+    doubtful = any(each.is_doubtful and "." in each.unsure for each in marks)
+    return "." if delimiter == "," and not shown and not doubtful else ""
 
 
 class OtherMarkError(Exception):

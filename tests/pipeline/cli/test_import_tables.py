@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
+from fantwin.pipeline.cli.simulation.scenario import FileScenario, Scenario
 from fantwin.pipeline.recordings.training_runs import read_runs
 from tests.support.fantwin_command import error_of, fantwin
 from tests.support.written_recordings import raw_columns
@@ -289,6 +290,18 @@ TABLES = {
         4294.967296 - 0.06 + 0.002 * SECONDS,
         ("wrapped once (32 bits of microseconds)",),
     ),
+    "zones after the time": Table(
+        lines([f"{each:%Y-%m-%d %H:%M:%S}.000 +0000 UTC" for each in DATES], SPEED, COMMAND, head="Time,fan1,pwm1"),
+        t_s=EPOCH_S,
+    ),
+    "a zone of several names, that the user says": Table(
+        lines([f"{each:%m/%d/%Y %I:%M:%S %p} CST" for each in DATES], SPEED, COMMAND, head="Time,fan1,pwm1"),
+        (*COLUMNS, "--zone", "America/Chicago", "--dates", "mdy"),
+        EPOCH_S + 5 * 3600,
+    ),
+    "a column of flags beside the fans": Table(
+        lines(ISO, SPEED, COMMAND, ["Yes", "No", "Yes"] * 20, head="Time,fan1,pwm1,Throttled [Yes/No]"), t_s=EPOCH_S
+    ),
     # long tables, and databases
     "Grafana: a row a value, by series": Table(long(), t_s=EPOCH_S, notes=("long table, 2 series by 'Series'",)),
     "a row a value, by time": Table(long(",", sort_by_time=True), t_s=EPOCH_S),
@@ -366,7 +379,7 @@ TABLES = {
             [f"{s}.000" for s in SPEED],
             by=", ",
             before="00, 09-06-2026 21:59:50, Hardware monitoring log v1.6\n01, 09-06-2026 21:59:50, GPU",
-            head="02, 09-06-2026 21:59:50, Fan speed  ,Fan tachometer\n03, 09-06-2026 21:59:50, Fan speed, , %, 0, 100, 10,",
+            head="02, 09-06-2026 21:59:50, Fan speed  ,Fan tachometer\n03, 09-06-2026 21:59:50, Fan speed, , %, 100",
         ).encode("cp1252"),
         ("--command", "Fan speed", "--speed", "Fan tachometer:rpm", "--dates", "dmy"),
         EPOCH_S,
@@ -474,6 +487,10 @@ REFUSED = {
     "three digits behind any mark, between semicolons": (
         lines(SECONDS, [f"{s / 10:.3f}" for s in SPEED], COMMAND, by=";", head="t;fan1;pwm1"),
         "column 'fan1': '102.000' is 102000 or 102: give the decimal mark of the file, --decimal . or --decimal ,",
+    ),
+    "points that may separate thousands, between commas": (
+        lines(SECONDS, ["890" if k % 9 == 0 else f"1.{320 + k % 5}" for k in SECONDS], COMMAND, head="t,fan1,pwm1"),
+        "column 'fan1': '1.321' is 1321 or 1.321: give the decimal mark of the file, --decimal . or --decimal ,",
     ),
     "both marks as decimal marks, and a cell that could have either": (
         lines(
@@ -597,6 +614,18 @@ def test_a_preview_shows_what_was_understood_and_its_command_line_imports_the_ta
     )
     assert fantwin("import", path, *words).exit_code == 0
     np.testing.assert_allclose(raw_columns(recording)[2][:, 0] / RPM, SPEED)
+
+
+def test_a_simulated_line_plays_such_a_table(tmp_path: Path) -> None:
+    path = tmp_path / "bench.csv"
+    path.write_text(lines(US, thousands("."), COMMAND, by=";", head="Time;fan1;pwm1"), encoding="utf-8")
+    file = FileScenario(path=path, command=("pwm1",), speed=("fan1:rpm",), dates="mdy", decimal=",")
+    device = Scenario(file=file).table()
+    assert device
+    samples = [device.take() for _ in range(N)]
+    assert device.due_s() is None
+    np.testing.assert_allclose([sample.speed_rad_s[0] / RPM for sample in samples], SPEED)
+    np.testing.assert_allclose([sample.t_s for sample in samples], SECONDS, atol=1e-9)
 
 
 def test_fans_are_called_as_the_program_calls_them(tmp_path: Path) -> None:
