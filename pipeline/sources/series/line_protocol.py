@@ -10,6 +10,7 @@ import numpy as np
 
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.sources.series.series_file import Label, SeriesFile, named
+from fantwin.schemas.messages import FURTHEST_T_NS
 from fantwin.schemas.units import NS_PER_S
 
 _NAME = r"(?:\\.|[^\\, =\n])+"
@@ -47,10 +48,11 @@ def read_line_protocol(path: Path) -> SeriesFile:
                 if not line.strip() or line.startswith("#"):
                     continue
                 found = _LINE.fullmatch(line) if len(line) < _LONGEST_LINE else None
-                if found is None or not found["time"]:
+                time = found["time"] or "" if found else ""
+                t_ns = int(time or 0) * next(ns for digits, ns in _PRECISION if len(time) >= digits)
+                if found is None or not time or abs(t_ns) >= FURTHEST_T_NS:
                     damaged.append(number)
                     continue
-                t_ns = int(found["time"]) * next(ns for digits, ns in _PRECISION if len(found["time"]) >= digits)
                 for each in _FIELDS.finditer(found["fields"]):
                     if value := _VALUE.fullmatch(each["value"]):
                         key = (found["name"], found["tags"], each["key"])

@@ -122,6 +122,8 @@ def _read(layout: Layout, columns: _Columns, reading: Reading, shown: dict[str, 
         for name, values in zip(columns.values, arrays, strict=True)
         if (is_value := has_time[rows] & np.isfinite(values[rows])).any()
     ]
+    if not found:
+        raise UserError(f"{layout.path}: a row a value, and none of the values is a number")
     return SeriesFile(f"long table, {len(found)} series by {by}", named(found), tuple(notes))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.sources.series.series_file import Label, SeriesFile, named
+from fantwin.schemas.messages import FURTHEST_T_NS
 from fantwin.schemas.units import NS_PER_S
 
 MOST_BYTES = 512 << 20
@@ -46,7 +48,7 @@ def read_prometheus_range(path: Path) -> SeriesFile:
 
 def _series(result: Any) -> tuple[Label, Any, Any]:
     labels = {str(key): str(value) for key, value in result["metric"].items()}
-    pairs = result.get("values") or [result["value"]]
-    t_ns = np.array([round(float(time) * NS_PER_S) for time, _ in pairs], np.int64)
-    values = np.array([float(value) for _, value in pairs])
+    pairs = [(float(time) * NS_PER_S, float(value)) for time, value in result.get("values") or [result["value"]]]
+    known = [(time, value) for time, value in pairs if abs(time) < FURTHEST_T_NS and math.isfinite(value)]
+    t_ns, values = np.array([round(time) for time, _ in known], np.int64), np.array([value for _, value in known])
     return Label(labels.pop("__name__", ""), tuple(sorted(labels.items()))), t_ns, values

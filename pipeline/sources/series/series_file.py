@@ -66,6 +66,7 @@ def named(found: Iterable[tuple[Label, Array, Array]]) -> dict[str, Series]:
             name = f"{label.base}{{{inside}}}" if inside else label.base
         else:
             name = " ".join(value for _, value in tags) or " ".join(value for _, value in label.tags)
+        name = " ".join(name.split())
         again = 1
         while name in series:
             again += 1

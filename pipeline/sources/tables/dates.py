@@ -51,6 +51,9 @@ _EPOCH_DAY = _UNIX_EPOCH.toordinal()
 _NS_PER_DAY = 86_400 * NS_PER_S
 _LARGER_STEPS = 10.0
 _TWO_DIGITS = 100
+_FIRST_YEAR, _LAST_YEAR = 1900, 2116
+"""of times that can be recorded"""
+_FURTHEST_NS = 1 << 62
 _ORDER_IN_WORDS = {"dmy": "day, month, year", "mdy": "month, day, year", "ymd": "year, month, day"}
 
 
@@ -108,7 +111,8 @@ class DateColumn:
                 self._other(text.strip())
 
     def _append(self, t_ns: int, *, is_zoned: bool, is_known: bool = True) -> None:
-        self._t_ns.append(t_ns)
+        is_known = is_known and abs(t_ns) < _FURTHEST_NS
+        self._t_ns.append(t_ns if is_known else 0)
         self._known.append(is_known)
         self._zoned.append(is_zoned)
 
@@ -265,6 +269,8 @@ def _day(part: _Part, order: Order) -> int | None:
     """Days since 1970; None: there is no such date."""
     by_letter = dict(zip("ymd" if part.numbers[0] >= _TWO_DIGITS else order, part.numbers, strict=True))
     year = by_letter["y"] + (2000 if by_letter["y"] < _TWO_DIGITS else 0)
+    if not _FIRST_YEAR <= year <= _LAST_YEAR:
+        return None
     try:
         return date(year, by_letter["m"], by_letter["d"]).toordinal() - _EPOCH_DAY
     except ValueError:

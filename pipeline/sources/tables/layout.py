@@ -254,6 +254,8 @@ def _score(lines: Sequence[str], delimiter: str) -> float:
     except csv.Error:
         return 0.0
     last = rows[len(rows) // 3 :]
+    if not last:
+        return 0.0
     width, count = Counter(map(len, last)).most_common(1)[0]
     if width < 2:
         return 0.0
@@ -288,7 +290,9 @@ def _layout(path: Path, encoding: str, title: str, delimiter: str, lines: Sequen
         written = [f"column {k + 1}" for k in range(width)]
     if delimiter == BLANKS and len(written) == width - 1 and kinds[:2] == ["time", "time"]:
         written = ["Date", *written]  # the blank within a date
-    names = _each_once(written)
+    if not written:
+        raise UserError(f"{path}: not a text file with columns; export it as CSV")
+    names = _each_once([" ".join(name.split()) for name in written])
     marks = tuple(Marks.of(row[k] for row in sample if k < len(row)) for k in range(len(names)))
     found_units = [units[k] if k < len(units) and units[k] else unit_in_name(name) for k, name in enumerate(written)]
     return Layout(

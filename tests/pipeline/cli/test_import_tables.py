@@ -15,7 +15,10 @@ import numpy as np
 import pytest
 
 from fantwin.pipeline.cli.simulation.scenario import FileScenario, Scenario
+from fantwin.pipeline.errors import FantwinError
 from fantwin.pipeline.recordings.training_runs import read_runs
+from fantwin.pipeline.sources.imported_file import Wanted, preview_of, read_file
+from fantwin.pipeline.sources.tables import profiles
 from tests.support.fantwin_command import error_of, fantwin
 from tests.support.written_recordings import raw_columns
 
@@ -633,3 +636,40 @@ def test_fans_are_called_as_the_program_calls_them(tmp_path: Path) -> None:
     path.write_text(lines(US, SPEED, SPEED // 2, COMMAND, COMMAND, head=LHM_HEAD), encoding="utf-8")
     assert fantwin("import", path, "-o", recording).exit_code == 0
     assert read_runs(recording).names.names == ("Fan #1", "Fan #2")
+
+
+def test_a_program_that_writes_tables_is_a_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    toy = profiles.Profile(
+        "Blower Bench",
+        head=(r"Drehzahl \w+", "Uhr"),
+        command=(r"Stellwert (?P<fan>\w+)",),
+        speed=(r"Drehzahl (?P<fan>\w+)",),
+        unit="hz",
+        time=("Uhr",),
+        time_unit="ms",
+    )
+    monkeypatch.setattr(profiles, "PROFILES", (toy, *profiles.PROFILES))
+    path, recording = tmp_path / "bench.csv", tmp_path / "r.mcap"
+    path.write_text(lines(SECONDS * 1000, SPEED / 60, COMMAND, head="Uhr,Drehzahl L,Stellwert L"), encoding="utf-8")
+    assert (
+        "columns of Blower Bench: Drehzahl L: command 'Stellwert L'" in fantwin("import", path, "-o", recording).stdout
+    )
+    t_ns, _, speed = raw_columns(recording)
+    np.testing.assert_allclose(t_ns / 1e9, SECONDS)
+    np.testing.assert_allclose(speed[:, 0] / RPM, SPEED)
+
+
+def test_damaged_bytes_cost_cells_and_rows_or_are_one_line(tmp_path: Path) -> None:
+    rng, path = np.random.default_rng(1), tmp_path / "table.csv"
+    contents = [of.content if isinstance(of.content, bytes) else of.content.encode() for of in TABLES.values()]
+    inserted = [b'"', b"\0", b"\n", b",", b"1e400", b"9" * 20, b"\xff\xfe", b'"""\n']
+    for _ in range(120):
+        content = bytearray(contents[rng.integers(len(contents))])
+        for at in rng.integers(len(content), size=3):
+            content[at : at + rng.integers(9)] = inserted[rng.integers(len(inserted))]
+        path.write_bytes(bytes(content))
+        for read in (preview_of, read_file):
+            try:
+                read(path, Wanted(("pwm1",), ("fan1:rpm",)))
+            except FantwinError as error:
+                assert "\n" not in str(error)
