@@ -143,6 +143,7 @@ class AcquisitionCore(Core):
             f"refused input: {kind} {self._counts[kind]}, the first of them: {detail}"
             for kind, detail in self._plausibility.first_refused.items()
         ]
+        found += [f"{detail} ({kind} {self._counts[kind]})" for kind, detail in self._plausibility.last_noted.items()]
         return [*found, *self._commands.notes()]
 
     def samples_in(self, item: Item) -> int:

@@ -7,7 +7,7 @@ from collections import Counter, deque
 from dataclasses import dataclass, field, replace
 
 from fantwin.pipeline.acquisition.sample_blocks import DeviceSequence
-from fantwin.pipeline.sources.source import Reading, ReadingLimits, Rejected
+from fantwin.pipeline.sources.source import Noted, Reading, ReadingLimits, Rejected
 from fantwin.schemas.channels import BY_NAME, Channel
 from fantwin.schemas.units import NS_PER_S
 
@@ -28,9 +28,15 @@ class Plausibility:
     """the channels that the source has given"""
     first_refused: dict[str, str] = field(default_factory=dict)
     """fault of the first refused input, by kind"""
+    last_noted: dict[str, str] = field(default_factory=dict)
+    """what the source has last noted of its device, by kind"""
 
-    def plausible(self, item: Reading | Rejected) -> Reading | None:
-        """The reading, without implausible speeds; None, and counted, if it cannot be used."""
+    def plausible(self, item: Reading | Rejected | Noted) -> Reading | None:
+        """The reading, without implausible speeds; None, and counted, if it cannot be used or is none."""
+        if isinstance(item, Noted):
+            self.counts[item.kind] += 1
+            self.last_noted[item.kind] = _shortened(item.detail)
+            return None
         if isinstance(item, Reading) and self._is_ordinary(item):
             self.counts["no_speed"] += 0  # shown from the first reading on
             self.quality.add_valid()
@@ -63,6 +69,8 @@ class Plausibility:
     def _with_plausible_speeds(self, reading: Reading) -> Reading:
         speed_max = self.limits.speed_max
         self.counts["no_speed"] += sum(map(math.isnan, reading.speed))
+        if unknown := sum(map(math.isnan, reading.command)):
+            self.counts["fans_without_command"] += unknown
         absurd = [speed for speed in reading.speed if abs(speed) > speed_max]
         if not absurd:
             self.quality.add_valid()

@@ -149,7 +149,8 @@ def _type_words(value: Schema) -> str:
     if choices := value.get("enum", [value["const"]] if "const" in value else []):
         return " or ".join(f"`{json.dumps(each)}`" for each in choices)
     if value["type"] == "array":
-        return f"list of {_type_words(value['items'])}"
+        items = value["items"]
+        return f"list of {' or '.join(dict.fromkeys(map(_type_words, items.get('anyOf', [items]))))}"
     if value["type"] == "object":
         return f"table of {_type_words(value['additionalProperties'])}s"
     return _TYPE_WORDS[value.get("format") or value["type"]]

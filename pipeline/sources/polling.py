@@ -26,6 +26,7 @@ from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.sources.source import (
     LinkDown,
     LinkUp,
+    Noted,
     Reading,
     ReadingBatch,
     Rejected,
@@ -126,6 +127,10 @@ class PollingSource(ABC):
     def write(self, command: tuple[float, ...]) -> None:
         """Write commands, NaN where a fan keeps its own. Only where the settings let it. Raises DeviceError."""
         raise NotImplementedError
+
+    def note(self, kind: str, detail: str) -> None:
+        """Let health say what was seen of the device, while it is read or written."""
+        self._deliver(ReadingBatch(HOST_CLOCK.now_ns(), (Noted(kind, detail),)))
 
     def check(self) -> list[str]:
         """Problems that would keep it from being read now, one line each."""

@@ -9,6 +9,7 @@ pipeline/sources/kinds.py.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -87,9 +88,11 @@ class ReadingLimits:
         if not len(reading.command) == len(reading.speed) == self.fans:
             detail = f"a reading of {len(reading.speed)} fans, this tray has {self.fans}"
             return Rejected("wrong_fan_count", detail, is_sample=True, setting=f"fans = {self.fans}")
+        # Without its actual command a fan cannot be judged, and a command must not be invented: NaN is one not known.
+        if all(map(math.isnan, reading.command)):
+            return Rejected("unknown_command", "the command of no fan is known", is_sample=True, setting="source")
         for command in reading.command:
-            # Without its actual command a sample cannot be scored, and a command must not be invented.
-            if not within(command, self.command_min, self.command_max):
+            if not (math.isnan(command) or within(command, self.command_min, self.command_max)):
                 limits = f"command_min = {self.command_min:g} to command_max = {self.command_max:g}"
                 detail = f"command {command:g} is outside {limits}"
                 return Rejected("absurd_command", detail, is_sample=True, setting="command_min and command_max")
@@ -132,7 +135,7 @@ class Reading:
     """
 
     command: tuple[float, ...]
-    """commands in the tray's command unit"""
+    """commands in the tray's command unit; NaN where it is not known"""
     speed: tuple[float, ...]
     """speeds in the tray's speed unit; NaN where there is no reading"""
     clock_us: int | None = None
@@ -158,12 +161,21 @@ class Rejected:
 
 
 @dataclass(frozen=True, slots=True)
+class Noted:
+    """What a source has seen of its device that is no input. `kind` is the name of its counter; health shows the last
+    `detail` of each kind, and how often there was one."""
+
+    kind: str
+    detail: str
+
+
+@dataclass(frozen=True, slots=True)
 class ReadingBatch:
     """Readings that arrived together. It may be empty: a source also reports input that completes no reading."""
 
     received_t_ns: int
     """host time, ns since the epoch"""
-    items: Sequence[Reading | Rejected]
+    items: Sequence[Reading | Rejected | Noted]
     byte_count: int = 0
     """bytes received, where the source counts them"""
     device_counts: Mapping[str, int] = field(default_factory=dict)

@@ -19,7 +19,7 @@ from cobs import cobs
 
 from fantwin.pipeline.config.settings import TrayConfig
 from fantwin.pipeline.sources.serial.port import ReceivedBytes
-from fantwin.pipeline.sources.source import LinkDown, LinkUp
+from fantwin.pipeline.sources.source import LinkDown, LinkUp, Noted, Reading
 from fantwin.pipeline.timebase.host_clock import HostClock
 from fantwin.schemas.codec import decode
 from fantwin.schemas.codec import encode as encode_message
@@ -97,6 +97,19 @@ def test_an_absurd_command_removes_the_sample_and_shows_as_a_loss() -> None:
     assert core.counters().get("lost_refused", 0) == 0
     why = "command 0.91 is outside command_min = 0 to command_max = 0.9"
     assert core.notes() == [f"refused input: absurd_command 1, the first of them: {why}"]
+
+
+def test_an_unknown_command_costs_its_own_fan_and_what_is_noted_is_said_with_how_often() -> None:
+    core = make_core()
+    counts, quality = core._counts, core._quality
+    plausible = core._plausibility.plausible
+    assert plausible(Reading((math.nan, 0.25), (100.0, 50.0))) == Reading((math.nan, 0.25), (100.0, 50.0))
+    assert plausible(Reading((math.nan, math.nan), (100.0, 50.0))) is None
+    assert (counts["fans_without_command"], counts["unknown_command"]) == (1, 1)
+    for mode in (5, 2):
+        assert plausible(Noted("taken_back", f"pwm1: mode {mode}")) is None
+    assert core.notes()[-1] == "pwm1: mode 2 (taken_back 2)"
+    assert quality._faulty == 1, "what is noted is no fault of the input"
 
 
 @pytest.mark.parametrize("sequences", [range(50), [None] * 50], ids=["numbered", "unnumbered"])

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from fantwin.pipeline.sources.source import LinkDown, LinkUp, Reading, ReadingBatch, Rejected, SourceEvent
+from fantwin.pipeline.sources.source import LinkDown, LinkUp, Noted, Reading, ReadingBatch, Rejected, SourceEvent
 
 
 class Delivered(list[SourceEvent]):
     """Events in their order; `append` takes the next one."""
 
     @property
-    def items(self) -> list[Reading | Rejected]:
+    def items(self) -> list[Reading | Rejected | Noted]:
         return [item for event in self if isinstance(event, ReadingBatch) for item in event.items]
 
     @property
@@ -19,6 +19,11 @@ class Delivered(list[SourceEvent]):
     @property
     def refused(self) -> list[Rejected]:
         return [item for item in self.items if isinstance(item, Rejected)]
+
+    @property
+    def noted(self) -> list[str]:
+        """Kind and words of what the source has said of its device."""
+        return [f"{item.kind}: {item.detail}" for item in self.items if isinstance(item, Noted)]
 
     @property
     def links(self) -> list[LinkUp | LinkDown]:

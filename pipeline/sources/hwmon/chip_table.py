@@ -23,6 +23,7 @@ class Chip:
         note: what else to know, for `fantwin init`.
         pwm_is_known_after_write: `pwmN` reads 0 until a program has set it.
         automatic: what is written to `pwmN_enable` to give the fan back, where that file cannot be read.
+        pwm_is_command_in: contents of `pwmN_enable` with which `pwmN` is the command in force; empty: with all.
         lowest_rpm: below it, `fanN_input` is 0.
     """
 
@@ -32,6 +33,7 @@ class Chip:
     note: str = ""
     pwm_is_known_after_write: bool = False
     automatic: int | None = None
+    pwm_is_command_in: tuple[int, ...] = ()
     lowest_rpm: int | None = None
 
 
@@ -47,13 +49,26 @@ CHIPS: tuple[Chip, ...] = (
         Tacho(kind="count", pulses=2, window_s=1.0),
         "counts pulses for one second; pulses-per-revolution of the device tree is taken as 2",
     ),
-    Chip("nct6[0-9]+", "drivers/hwmon/nct6775-core.c", _held(1.5), "the driver reads the chip every 1.5 s at most"),
     Chip(
-        "it8[0-9]+|sis950",
-        "Documentation/hwmon/it87.rst",
+        "nct668[367]",
+        "drivers/hwmon/nct6683.c",
+        _held(1.0),
+        "the driver reads the chip every second at most; over how long its firmware averages is not known",
+    ),
+    Chip("nct6[17][0-9]+", "drivers/hwmon/nct6775-core.c", _held(1.5), "the driver reads the chip every 1.5 s at most"),
+    Chip(
+        "it87|it87(05|12|16|18|20)|it878[123]|sis950",
+        "drivers/hwmon/it87.c",
         _held(1.5),
         "the driver reads the chip every 1.5 s at most; chips without 16-bit counters read no speed below about 2,600 "
-        "rpm at a divider of 2",
+        "rpm at a divider of 2; in automatic mode pwm is the last one that was set, not the one in force",
+        pwm_is_command_in=(0, 1),
+    ),
+    Chip(
+        "it8[0-9]+",
+        "Documentation/hwmon/it87.rst",
+        _held(1.5),
+        "the driver reads the chip every 1.5 s at most",
     ),
     Chip(
         "emc230[1235]",
@@ -96,10 +111,17 @@ CHIPS: tuple[Chip, ...] = (
     Chip(
         "thinkpad",
         "Documentation/admin-guide/laptops/thinkpad-acpi.rst",
-        note="pwm has eight levels; writing needs the module parameter fan_control=1; readings may go stale for two "
-        "minutes while the fan goes to full speed",
+        note="pwm has eight levels, and is the command in manual mode only; writing needs the module parameter "
+        "fan_control=1; readings may go stale for two minutes while the fan goes to full speed",
+        pwm_is_command_in=(1,),
     ),
     Chip("amdgpu", "drivers/gpu/drm/amd/pm/amdgpu_pm.c", note="automatic mode may stop the fan"),
+    Chip(
+        "applesmc",
+        "drivers/hwmon/applesmc.c",
+        note="fanN_output is the speed that is wanted, set by the computer itself unless fanN_manual is 1; a fan that "
+        "is late to follow it is what can be found",
+    ),
 )
 
 

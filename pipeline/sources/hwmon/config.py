@@ -8,16 +8,18 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from fantwin.pipeline.sources.hwmon.chip_table import chip_of
+from fantwin.pipeline.sources.hwmon.drive import DRIVE
 from fantwin.pipeline.sources.polling import PolledConfig
 from fantwin.schemas.tacho import Tacho
 
 ROOT = Path("/sys/class/hwmon")
 
 Number = Annotated[int, Field(ge=0, le=99)]
+DriveName = Annotated[str, Field(pattern=f"^{DRIVE}$")]
 
 
 class HwmonConfig(PolledConfig, frozen=True):
-    """Fans of this computer, as Linux shows them. The command is pwm, 0 to 255; the speed is in rpm."""
+    """Fans of this computer, as Linux shows them. The command is pwm, 0 to 255, or a speed in rpm."""
 
     kind: Literal["hwmon"] = "hwmon"
     chip: str = Field(
@@ -29,8 +31,15 @@ class HwmonConfig(PolledConfig, frozen=True):
         default=(),
         description="N of fanN_input, in the order of the tray; without it 1, 2, ... up to the number of fans",
     )
-    pwms: tuple[Number, ...] = Field(
-        default=(), description="N of pwmN that drives each fan, or one for all; without it the numbers of the fans"
+    pwms: tuple[Number | DriveName, ...] = Field(
+        default=(),
+        description="what drives each fan, or one for all: N of pwmN; nct6798/pwm2 of another chip; fan1_output or "
+        "fan1_target, a speed in rpm. Without it, pwmN with the numbers of the fans",
+    )
+    speed_scales: tuple[Annotated[float, Field(gt=0, le=100)], ...] = Field(
+        default=(),
+        description="factor for fanN_input of each fan, or one for all: 0.5 where a fan gives four pulses a revolution "
+        "and the chip counts on two",
     )
     temperatures: tuple[Number, ...] = Field(
         default=(), description="N of tempN_input, the temperature of the air at each fan, or one for all"
@@ -44,7 +53,7 @@ class HwmonConfig(PolledConfig, frozen=True):
     currents: tuple[Number, ...] = Field(default=(), description="N of currN_input of each fan, or one for all")
     writable: bool = Field(
         default=False,
-        description="whether commands are written; pwmN_enable is then set to 1 (manual), and restored at the end",
+        description="whether commands are written; each makes pwmN_enable manual (1) if it is not; the end restores it",
     )
     root: Path = Field(default=ROOT, description="folder of the chips")
 

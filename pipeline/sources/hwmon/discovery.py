@@ -11,6 +11,7 @@ from fantwin.pipeline.sources.found import Found, free_name
 from fantwin.pipeline.sources.hwmon.chip_folder import ChipFolder, chip_folders, chip_words
 from fantwin.pipeline.sources.hwmon.chip_table import chip_of
 from fantwin.pipeline.sources.hwmon.config import ROOT
+from fantwin.pipeline.sources.hwmon.drive import Drive, set_point_of
 from fantwin.schemas.fan_names import is_fan_name
 
 HIGHEST_RPM = 20_000
@@ -39,22 +40,27 @@ def discover_hwmon(root: Path = ROOT, *, writable: bool = False) -> Iterator[Fou
 
 def _of_chip(chip: ChipFolder, chips: Sequence[ChipFolder], root: Path, names: set[str], *, writable: bool) -> Found:
     readings = {fan: _number(chip, f"fan{fan}_input") for fan in chip.fans}
-    with_pwm = [fan for fan in chip.fans if fan in chip.pwms]
-    turning = [fan for fan in with_pwm if readings[fan] is not None and readings[fan] != 0]
-    missing = [
-        f"fan{fan} has no pwm{fan}, so its command is not known: name the pwm that drives it in pwms"
-        for fan in chip.fans
-        if fan not in chip.pwms
-    ]
+    drives = {fan: Drive(chip, f"pwm{fan}") for fan in chip.fans if fan in chip.pwms}
+    in_rpm = not drives
+    if in_rpm:
+        drives = {fan: Drive(chip, file) for fan in chip.fans if (file := set_point_of(chip, fan))}
+    turning = [fan for fan in drives if readings[fan] is not None and readings[fan] != 0]
+    missing = _without_drive(chip, chips, [fan for fan in chip.fans if fan not in drives])
     missing += [f"fan{fan} cannot be read" for fan, rpm in readings.items() if rpm is None]
-    standing = [fan for fan in with_pwm if readings[fan] == 0]
-    stopped = [fan for fan in standing if _number(chip, f"pwm{fan}") == 0]
+    missing += [
+        f"fan{fan}_input is {rpm}, which is no measurement: its speed is missing until there is one"
+        for fan, rpm in readings.items()
+        if rpm is not None and rpm > HIGHEST_RPM
+    ]
+    standing = [fan for fan in drives if readings[fan] == 0]
+    stopped = [fan for fan in standing if _number(chip, drives[fan].file) == 0]
     if turning and (unconnected := [fan for fan in standing if fan not in stopped]):
         numbers = ", ".join(f"fan{fan}" for fan in unconnected)
         missing.append(f"{numbers} at 0 rpm although commanded to turn, left out: not connected?")
     fans = sorted([*turning, *stopped]) if turning else standing
-    if fans and (closed := [fan for fan in fans if not os.access(chip.path / f"pwm{fan}", os.W_OK)]):
-        numbers = ", ".join(f"pwm{fan}" for fan in closed)
+    missing += filter(None, (drives[fan].why_no_command() for fan in fans))
+    if fans and (closed := [fan for fan in fans if not os.access(chip.path / drives[fan].file, os.W_OK)]):
+        numbers = ", ".join(drives[fan].file for fan in closed)
         missing.append(f"this user may not write {numbers}, which only commands need: run as root, or add a udev rule")
     row = chip_of(chip.name)
     notes = [
@@ -67,6 +73,11 @@ def _of_chip(chip: ChipFolder, chips: Sequence[ChipFolder], root: Path, names: s
         notes.append(row.note)
     source: dict[str, Any] = {"kind": "hwmon", "chip": chip_words(chip, chips)}
     source["fans"] = fans
+    command_max = 255
+    if in_rpm:
+        source["pwms"] = [drives[fan].file for fan in fans]
+        command_max = max([HIGHEST_RPM, *(_number(chip, f"fan{fan}_max") or 0 for fan in fans)])
+        notes.append("the command is the speed that is wanted, in rpm")
     if writable:
         source["writable"] = True
     if root != ROOT:
@@ -76,11 +87,27 @@ def _of_chip(chip: ChipFolder, chips: Sequence[ChipFolder], root: Path, names: s
         "fans": _names(chip, fans),
         "speed_unit": "rpm",
         "speed_max": HIGHEST_RPM,
-        "command_max": 255,
+        "command_max": command_max,
         "source": source,
     }
     title = f"{chip.name} ({chip.path.name}{', ' + chip.device.rsplit('/', 1)[-1] if chip.device else ''})"
     return Found("hwmon", title, keys if fans else {}, tuple(notes), tuple(missing))
+
+
+def _without_drive(chip: ChipFolder, chips: Sequence[ChipFolder], fans: Sequence[int]) -> list[str]:
+    """A line for fans whose command is not known, with what could be named."""
+    if not fans:
+        return []
+    lacks = "no pwm and no set-point" if len(fans) == len(chip.fans) else ", ".join(f"no pwm{fan}" for fan in fans)
+    others = [f'"{chip_words(each, chips)}/pwm{n}"' for each in chips if each is not chip for n in each.pwms]
+    there = [*map(str, chip.pwms), *others]
+    named = (
+        f"if one of these drives them, name it in pwms: {', '.join(there)}"
+        if there
+        else "no chip has a pwm; a program that knows their command can push it (source push)"
+    )
+    which = "its fans" if len(fans) == len(chip.fans) else ", ".join(f"fan{fan}" for fan in fans)
+    return [f"{chip.name} has {lacks}, so the command of {which} is not known and they cannot be watched; {named}"]
 
 
 def _unknown(name: str) -> str:

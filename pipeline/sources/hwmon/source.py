@@ -3,16 +3,19 @@
 The chip is found by its name and its device, each time it is connected: hwmonN changes from boot to boot, and when a
 driver is loaded again. A file that cannot be read is NaN; a chip that goes away is a LinkDown.
 
-How a pwm was found is kept in a file before it is written for the first time, until it has been given back: after a
+How a drive was found is kept in a file before it is written for the first time, until it has been given back: after a
 process that was killed, the next one finds it manual and would otherwise leave it so.
+
+Firmware and other programs take fans back, for example when the computer wakes up. The mode is checked at each poll,
+which only says so, as the firmware may have done it against heat; and at each command, which makes it manual again.
 """
 
 from __future__ import annotations
 
-import errno
 import math
 import os
 from collections.abc import Sequence
+from typing import TypeVar
 
 from pydantic import BaseModel, ValidationError
 
@@ -21,32 +24,52 @@ from fantwin.pipeline.files import replace_file
 from fantwin.pipeline.sources.hwmon.chip_folder import ChipFolder, chip_folders, chip_words
 from fantwin.pipeline.sources.hwmon.chip_table import chip_of
 from fantwin.pipeline.sources.hwmon.config import HwmonConfig
+from fantwin.pipeline.sources.hwmon.drive import HIGHEST_PWM, MANUAL, MAY_WRITE, Drive, drive_of, lacking, write_number
 from fantwin.pipeline.sources.polling import DeviceError, PollingSource
 from fantwin.pipeline.sources.source import Reading, Rejected, SourceContext
 from fantwin.schemas.channels import CURRENT, SUPPLY_VOLTAGE, TEMPERATURE
 
+_Each = TypeVar("_Each")
 
-class FoundPwm(BaseModel, frozen=True):
-    """mode: pwmN_enable, None if there is none. pwm: 0 to 255, None if it could not be read."""
 
+class FoundDrive(BaseModel, frozen=True):
+    """How a drive was found. mode: None if it has none. value: None if it could not be read."""
+
+    chip: str
+    device: str
+    file: str
     mode: int | None
-    pwm: int | None
+    value: int | None
+
+    def is_of(self, drive: Drive) -> bool:
+        """Whether it is of this drive."""
+        return (self.chip, self.device, self.file) == (drive.chip.name, drive.chip.device, drive.file)
 
 
-class FoundModes(BaseModel, frozen=True):
-    """Modes of the pwms of a chip before fantwin wrote them, as a file keeps them for a later process.
+class FoundDrives(BaseModel, frozen=True):
+    """Drives before fantwin wrote them, as a file keeps them for a later process.
 
     The file is there as long as something has to be given back.
     """
 
-    chip: str
-    device: str
-    pwms: dict[int, FoundPwm]
+    drives: tuple[FoundDrive, ...]
 
 
-MANUAL = 1
-"""value of pwmN_enable for commands by a program"""
-HIGHEST_PWM = 255
+class _Commanded:
+    """What was written to a drive, and what it has shown since."""
+
+    def __init__(self, value: int) -> None:
+        self.value = value
+        self.settled: int | None = None
+        """what two polls have shown one after the other"""
+        self.last: int | None = None
+        self.is_taken_back = False
+
+
+NO_MEASUREMENT_RPM = 0xFFFF
+"""all bits of a register: drivers pass it on where the chip has not measured (thinkpad)"""
+LARGEST_ROUNDING = 43
+"""of a pwm, by a chip with four levels"""
 HOTTEST_C = 127
 """a sensor that is not connected reads more (Documentation/hwmon/dell-smm-hwmon.rst)"""
 
@@ -65,15 +88,18 @@ class HwmonSource(PollingSource):
         if len(fans) != context.fans:
             raise UserError(f"fans = {context.fans}, and source.fans names {len(fans)}: give the same number")
         self._fans = fans
-        self._pwms = _of_each_fan("pwms", config.pwms, fans) or fans
+        pwms = _of_each_fan("pwms", config.pwms, fans) or fans
+        self._drive_names = tuple(f"pwm{each}" if isinstance(each, int) else each for each in pwms)
+        self._drives: tuple[Drive, ...] = ()
+        self._scales = _of_each_fan("speed_scales", config.speed_scales, fans) or (1.0,) * len(fans)
         self._temperatures = _of_each_fan("temperatures", config.temperatures, fans)
         self._voltages = _of_each_fan("voltages", config.voltages, fans)
         self._currents = _of_each_fan("currents", config.currents, fans)
         self._chip: ChipFolder | None = None
-        self._modes_file = context.run_folder / f"hwmon-{context.tray}.json" if context.run_folder else None
-        self._before: dict[int, FoundPwm] = {}
-        """mode of each pwm before it was written, also by a process that was killed"""
-        self._written = False
+        self._drives_file = context.run_folder / f"hwmon-{context.tray}.json" if context.run_folder else None
+        self._before: dict[Drive, FoundDrive] = {}
+        """each drive before it was written, also by a process that was killed"""
+        self._commanded: dict[Drive, _Commanded] = {}
 
     @property
     def name(self) -> str:
@@ -86,26 +112,33 @@ class HwmonSource(PollingSource):
         return f"chip = {self._config.chip!r}"
 
     def connect(self) -> None:
-        """Find the chip."""
-        self._chip = chip = self._find()
+        """Find the chip, and the drives of its fans."""
+        self._chip, self._drives = self._find()
         # What is not manual any more has been given back, or the driver was loaded again.
-        kept = self._kept_modes(chip).items()
-        self._before = {number: found for number, found in kept if self._mode(chip, number) in (None, MANUAL)}
+        kept = self._kept_drives()
+        self._before = {
+            drive: found
+            for drive in dict.fromkeys(self._drives)
+            for found in kept
+            if found.is_of(drive) and drive.mode() in (None, MANUAL)
+        }
+        self._commanded = {}
 
     def read(self) -> Reading | Rejected:
-        """Speeds, pwm values and what else is asked for."""
+        """Speeds, commands and what else is asked for."""
         chip = self._connected()
-        pwm = {number: self._pwm(chip, number) for number in dict.fromkeys(self._pwms)}
-        speed = tuple(self._speed(chip, number) for number in self._fans)
-        if self._quirks and self._quirks.pwm_is_known_after_write and not self._written and not any(pwm.values()):
-            return Rejected(
-                "unknown_command",
-                f"pwm of {chip.name} reads 0 until a program has set it: set it once",
-                is_sample=True,
-                setting="writable",
-            )
+        speed = tuple(self._speed(chip, fan, scale) for fan, scale in zip(self._fans, self._scales, strict=True))
+        whys: list[str] = []
+        values = {drive: self._command(drive, whys) for drive in dict.fromkeys(self._drives)}
+        if self._quirks and self._quirks.pwm_is_known_after_write and not self._commanded and not any(values.values()):
+            whys = [f"pwm of {chip.name} reads 0 until a program has set it: set it once"]
+            values = dict.fromkeys(values, math.nan)
+        if whys and all(map(math.isnan, values.values())):
+            return Rejected("unknown_command", whys[0], is_sample=True, setting="source.pwms and writable")
+        for why in whys:
+            self.note("unknown_drives", why)
         return Reading(
-            command=tuple(float(pwm[number]) for number in self._pwms),
+            command=tuple(values[drive] for drive in self._drives),
             speed=speed,
             measured={name: values for name, values in self._measured(chip).items() if values},
         )
@@ -120,66 +153,71 @@ class HwmonSource(PollingSource):
         }
 
     def write(self, command: tuple[float, ...]) -> None:
-        """Set pwm values, after `pwmN_enable` is manual."""
-        chip = self._connected()
-        wanted: dict[int, int] = {}
-        for number, value in zip(self._pwms, command, strict=True):
+        """Command drives, each after it is manual."""
+        self._connected()
+        wanted: dict[Drive, int] = {}
+        for drive, value in zip(self._drives, command, strict=True):
             if math.isnan(value):
                 continue
-            pwm = min(max(round(value), 0), HIGHEST_PWM)
-            if wanted.setdefault(number, pwm) != pwm:
+            rounded = round(value)
+            if wanted.setdefault(drive, rounded) != rounded:
                 raise DeviceError(
-                    f"pwm{number} moves several fans: give them one command, not {wanted[number]} and {pwm}"
+                    f"{drive.file} moves several fans: give them one command, not {wanted[drive]} and {rounded}"
                 )
-        for number, pwm in wanted.items():
-            self._take_over(chip, number)
-            _write(chip, f"pwm{number}", pwm)
-            self._written = True
+        for drive, value in wanted.items():
+            self._take_over(drive)
+            drive.write(value)
+            self._commanded[drive] = _Commanded(value)
 
     def disconnect(self) -> None:
         """Give the fans that were commanded back to whatever drove them."""
-        chip, before = self._chip, self._before
-        self._chip, self._before = None, {}
+        before, self._before, self._chip, self._commanded = self._before, {}, None, {}
         failures = []
-        for number, found in before.items():
-            assert chip is not None
+        for drive, found in before.items():
             try:
-                if found.mode == MANUAL or found.mode is None:
-                    _write(chip, f"pwm{number}", HIGHEST_PWM if found.pwm is None else found.pwm)
-                if found.mode not in (None, MANUAL):
-                    _write(chip, f"pwm{number}_enable", found.mode)
+                if found.mode not in (MANUAL, None):
+                    write_number(drive.chip, drive.mode_file, found.mode)
+                elif found.value is not None or drive.is_pwm:
+                    drive.write(HIGHEST_PWM if found.value is None else found.value)
             except DeviceError as error:
                 failures.append(str(error))
         if failures:
             raise DeviceError("; ".join(failures))
-        if before and self._modes_file:  # kept until all of it was given back
-            self._modes_file.unlink(missing_ok=True)
+        if before and self._drives_file:  # kept until all of it was given back
+            self._drives_file.unlink(missing_ok=True)
 
     def check(self) -> list[str]:
         """Problems before the start: what is not there, or may not be read or written."""
         try:
-            chip = self._find()
+            chip, drives = self._find()
         except DeviceError as error:
             return [str(error)]
         found: list[str] = []
         for kind, suffix, numbers in self._files():
-            lacking = [number for number in dict.fromkeys(numbers) if number not in chip.numbers(kind, suffix)]
-            found += [f"{chip.name} has no {kind}{number}{suffix}: correct {_SETTING[kind]}" for number in lacking]
-        for number in dict.fromkeys(self._pwms) if self._config.writable else ():
-            if not os.access(chip.path / f"pwm{number}", os.W_OK):
-                found.append(f"{chip.path / f'pwm{number}'}: this user may not write it; {_MAY_WRITE}")
+            there = chip.numbers(kind, suffix)
+            found += [
+                f"{chip.name} has no {kind}{number}{suffix}: correct {_SETTING[kind]}"
+                for number in dict.fromkeys(numbers)
+                if number not in there
+            ]
+        for drive in dict.fromkeys(drives):
+            path = drive.chip.path / drive.file
+            if not path.exists():
+                found.append(lacking(drive))
+            elif self._config.writable and not os.access(path, os.W_OK):
+                found.append(f"{path}: this user may not write it; {MAY_WRITE}")
         return found
 
     def _files(self) -> tuple[tuple[str, str, Sequence[int]], ...]:
         return (
             ("fan", "_input", self._fans),
-            ("pwm", "", self._pwms),
             ("temp", "_input", self._temperatures),
             ("in", "_input", self._voltages),
             ("curr", "_input", self._currents),
         )
 
-    def _find(self) -> ChipFolder:
+    def _find(self) -> tuple[ChipFolder, tuple[Drive, ...]]:
+        """The chip, and the drive of each fan, which may not be there."""
         config = self._config
         try:
             chips = chip_folders(self._root)
@@ -195,81 +233,110 @@ class HwmonSource(PollingSource):
                 f"no chip is called {config.chip} in {self._root}; there are: {there}; load its driver, or "
                 "see `fantwin init --hwmon -c NEW.toml`"
             )
-        return found[0]
+        return found[0], tuple(drive_of(name, found[0], chips) for name in self._drive_names)
 
     def _connected(self) -> ChipFolder:
-        """The chip, if its folder is still that of this chip: a driver that is loaded again may take another number."""
+        """The chip, if the folders are still those of these chips: a driver that is loaded again may take another
+        number."""
         chip = self._chip
         assert chip is not None
-        try:
-            name = (chip.path / "name").read_text(encoding="utf-8", errors="replace").strip()
-        except OSError as error:
-            raise DeviceError(f"{chip.name} has gone ({error.strerror}); waiting for it", is_lost=True) from error
-        if name != chip.name:
-            raise DeviceError(f"{chip.path.name} is {name} now, no longer {chip.name}", is_lost=True)
+        for each in dict.fromkeys((chip, *(drive.chip for drive in self._drives))):
+            try:
+                name = (each.path / "name").read_text(encoding="utf-8", errors="replace").strip()
+            except OSError as error:
+                raise DeviceError(f"{each.name} has gone ({error.strerror}); waiting for it", is_lost=True) from error
+            if name != each.name:
+                raise DeviceError(f"{each.path.name} is {name} now, no longer {each.name}", is_lost=True)
         return chip
 
-    def _pwm(self, chip: ChipFolder, number: int) -> int:
-        """Read a command, without which a reading is of no use."""
+    def _command(self, drive: Drive, whys: list[str]) -> float:
+        """The command in force; NaN where it is not known, for the reason that is added to whys."""
         try:
-            return chip.number(f"pwm{number}")
+            value = drive.value()
         except FileNotFoundError as error:
-            raise DeviceError(f"{chip.name} has no pwm{number}: correct pwms", is_lost=True) from error
+            raise DeviceError(lacking(drive), is_lost=True) from error
         except OSError as error:
-            raise DeviceError(f"pwm{number} of {chip.name} cannot be read: {error.strerror}") from error
+            whys.append(f"{drive.name} cannot be read: {error.strerror}")
+            return math.nan
+        self._follow(drive, value)
+        if why := drive.why_no_command():
+            whys.append(why)
+            return math.nan
+        return float(value)
 
-    def _speed(self, chip: ChipFolder, number: int) -> float:
+    def _follow(self, drive: Drive, value: int) -> None:
+        """Say what something else has done to a drive since its last command."""
+        commanded = self._commanded.get(drive)
+        if commanded is None:
+            return
+        if (mode := drive.mode()) not in (None, MANUAL):
+            if not commanded.is_taken_back:
+                self.note(
+                    "taken_back", f"{drive.name}: mode {mode} instead of manual, which the next command sets again"
+                )
+            commanded.is_taken_back = True
+        elif value == commanded.last and value != commanded.settled:  # a chip may need a poll to show what it was told
+            was = commanded.value if commanded.settled is None else commanded.settled
+            if commanded.settled is not None or (drive.is_pwm and abs(value - was) > LARGEST_ROUNDING):
+                self.note("changed_by_others", f"{drive.name} shows {value} after the command {commanded.value}")
+            commanded.settled = value
+        commanded.last = value
+
+    def _speed(self, chip: ChipFolder, number: int, scale: float) -> float:
         rpm = _value(chip, f"fan{number}_input", 1.0)
+        if rpm >= NO_MEASUREMENT_RPM:
+            self.note("no_measurement", f"fan{number}_input is {rpm:.0f}, which is no measurement")
+            return math.nan
         # What the chip itself calls faulty is no measurement, but a fan that stands may well be a fault.
         if rpm > 0.0 and _value(chip, f"fan{number}_fault", 1.0) > 0.0:
             return math.nan
-        return rpm * self._units_per_rpm
+        return rpm * scale * self._units_per_rpm
 
-    def _take_over(self, chip: ChipFolder, number: int) -> None:
-        """Make a pwm manual, after it is kept how it was found."""
-        enable, mode = chip.path / f"pwm{number}_enable", self._mode(chip, number)
-        has_enable = enable.exists()
-        if number not in self._before:
+    def _take_over(self, drive: Drive) -> None:
+        """Make a drive manual, after it is kept how it was found."""
+        mode = drive.mode()
+        if drive not in self._before:
             automatic = self._quirks.automatic if self._quirks else None
             try:
-                pwm = chip.number(f"pwm{number}")
+                value = drive.value()
             except OSError:
-                pwm = None
-            found = FoundPwm(mode=automatic if has_enable and mode is None else mode, pwm=pwm)
-            self._keep_modes(chip, self._before | {number: found})
-            self._before[number] = found
-        if has_enable and mode != MANUAL:
-            _write(chip, enable.name, MANUAL)
+                value = None
+            found = FoundDrive(
+                chip=drive.chip.name,
+                device=drive.chip.device,
+                file=drive.file,
+                mode=automatic if drive.mode_file and mode is None else mode,
+                value=value,
+            )
+            self._keep_drives((*self._before.values(), found))
+            self._before[drive] = found
+        elif mode not in (None, MANUAL) and not self._is_known_to_be_taken_back(drive):
+            self.note("taken_back", f"{drive.name}: mode {mode} instead of manual, set to manual again")
+        drive.take_over()
 
-    def _kept_modes(self, chip: ChipFolder) -> dict[int, FoundPwm]:
-        """Modes that an earlier process has not given back, by the number of the pwm."""
+    def _is_known_to_be_taken_back(self, drive: Drive) -> bool:
+        commanded = self._commanded.get(drive)
+        return commanded is not None and commanded.is_taken_back
+
+    def _kept_drives(self) -> tuple[FoundDrive, ...]:
+        """Drives that an earlier process has not given back."""
         try:
-            found = FoundModes.model_validate_json(self._modes_file.read_bytes()) if self._modes_file else None
+            return FoundDrives.model_validate_json(self._drives_file.read_bytes()).drives if self._drives_file else ()
         except (OSError, ValidationError):
-            return {}
-        return found.pwms if found and (found.chip, found.device) == (chip.name, chip.device) else {}
+            return ()
 
-    def _keep_modes(self, chip: ChipFolder, pwms: dict[int, FoundPwm]) -> None:
-        if self._modes_file:
-            found = FoundModes(chip=chip.name, device=chip.device, pwms=pwms)
+    def _keep_drives(self, drives: tuple[FoundDrive, ...]) -> None:
+        if self._drives_file:
             try:
-                replace_file(self._modes_file, found.model_dump_json().encode())
+                replace_file(self._drives_file, FoundDrives(drives=drives).model_dump_json().encode())
             except OSError as error:
                 raise DeviceError(f"the modes of pwms cannot be kept in run_folder: {error.strerror}") from error
 
-    def _mode(self, chip: ChipFolder, number: int) -> int | None:
-        """Content of pwmN_enable; None if there is no such file, or it cannot be read."""
-        try:
-            return chip.number(f"pwm{number}_enable")
-        except OSError:
-            return None
+
+_SETTING = {"fan": "fans", "temp": "temperatures", "in": "voltages", "curr": "currents"}
 
 
-_SETTING = {"fan": "fans", "pwm": "pwms", "temp": "temperatures", "in": "voltages", "curr": "currents"}
-_MAY_WRITE = "run as root, or give it this group by a udev rule"
-
-
-def _of_each_fan(setting: str, numbers: Sequence[int], fans: Sequence[int]) -> tuple[int, ...]:
+def _of_each_fan(setting: str, numbers: Sequence[_Each], fans: Sequence[int]) -> tuple[_Each, ...]:
     if len(numbers) not in (0, 1, len(fans)):
         raise UserError(f"source.{setting} names {len(numbers)}: give one for all fans, or {len(fans)}")
     return tuple(numbers) * (len(fans) if len(numbers) == 1 else 1)
@@ -286,12 +353,3 @@ def _value(chip: ChipFolder, file: str, scale: float) -> float:
 def _temperature_c(chip: ChipFolder, number: int) -> float:
     value = _value(chip, f"temp{number}_input", 1e-3)
     return math.nan if value > HOTTEST_C else value
-
-
-def _write(chip: ChipFolder, file: str, value: int) -> None:
-    path = chip.path / file
-    try:
-        path.write_text(str(value), encoding="ascii")
-    except OSError as error:
-        remedy = f"; {_MAY_WRITE}" if error.errno in (errno.EACCES, errno.EPERM) else ""
-        raise DeviceError(f"{path} cannot be written: {error.strerror}{remedy}") from error

@@ -11,11 +11,13 @@ import pytest
 from fantwin.pipeline.config.loading import parse_config
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.sources.hwmon.config import HwmonConfig
+from fantwin.pipeline.sources.hwmon.drive import Drive
 from fantwin.pipeline.sources.hwmon.source import HwmonSource
 from fantwin.pipeline.sources.polling import DeviceError
 from fantwin.pipeline.sources.source import Reading, Rejected, SourceContext
 from fantwin.schemas.channels import CURRENT, SUPPLY_VOLTAGE, TEMPERATURE
 from fantwin.schemas.tacho import Tacho
+from tests.support.delivered import Delivered
 from tests.support.hwmon_trees import add_chip, board
 
 NAN = float("nan")
@@ -36,6 +38,12 @@ def reading(made: HwmonSource) -> Reading:
     found = made.read()
     assert isinstance(found, Reading)
     return found
+
+
+def listened(made: HwmonSource) -> Delivered:
+    """What it says from now on, as if it were polled."""
+    made._deliver = (delivered := Delivered()).append
+    return delivered
 
 
 @pytest.fixture
@@ -86,7 +94,7 @@ def test_two_chips_of_one_name_are_told_apart_by_their_devices(root: Path) -> No
         connected(root, chip="nct6798@1-00")
 
 
-def test_files_that_cannot_be_read_are_nan_but_without_its_command_a_reading_is_refused(root: Path) -> None:
+def test_files_that_cannot_be_read_are_nan_and_a_reading_without_any_command_is_refused(root: Path) -> None:
     folder = board(root)
     made = connected(root)
     (folder / "fan1_input").write_text("\n")  # as a driver whose measurement failed
@@ -96,9 +104,13 @@ def test_files_that_cannot_be_read_are_nan_but_without_its_command_a_reading_is_
     (folder / "fan2_input").write_text("0\n")
     assert reading(made).speed[1] == 0.0, "a fan that stands is measured"
     (folder / "pwm1").write_text("\n")
-    with pytest.raises(DeviceError, match="pwm1 of nct6798 cannot be read") as caught:
-        made.read()
-    assert not caught.value.is_lost
+    noted = listened(made)
+    found = reading(made)
+    assert math.isnan(found.command[0]) and found.command[1] == 140.0, "one command costs its own fan"
+    assert noted.noted == ["unknown_drives: nct6798/pwm1 cannot be read: holds '', no number"]
+    (folder / "pwm2").write_text("\n")
+    refused = made.read()
+    assert isinstance(refused, Rejected) and refused.kind == "unknown_command" and refused.is_sample
 
 
 def test_a_commanded_fan_is_taken_over_and_given_back(root: Path) -> None:
@@ -186,6 +198,98 @@ def test_chips_that_say_less_than_others_are_known(root: Path) -> None:
     assert reading(made).command == (0.0,), "known once it was set"
 
 
+def test_a_fan_that_firmware_or_a_program_has_taken_back_is_said_and_taken_over_at_the_next_command(root: Path) -> None:
+    folder = board(root)
+    made = connected(root, writable=True)
+    noted = listened(made)
+    made.write((200.0, 90.0))
+    reading(made)
+    (folder / "pwm1_enable").write_text("5")  # the computer wakes from suspend
+    (folder / "pwm1").write_text("118")
+    assert [reading(made).command[0] for _ in range(3)] == [118.0] * 3, "what the chip shows is the command"
+    again = "taken_back: nct6798/pwm1: mode 5 instead of manual, which the next command sets again"
+    assert noted.noted == [again], "once, however often it is polled"
+    assert (folder / "pwm1_enable").read_text() == "5", "the firmware may have done it against heat"
+    made.write((210.0, NAN))
+    assert [(folder / name).read_text() for name in ("pwm1_enable", "pwm1")] == ["1", "210"]
+    (folder / "pwm1_enable").write_text("2")  # and before the next poll
+    made.write((220.0, NAN))
+    assert noted.noted[1:] == ["taken_back: nct6798/pwm1: mode 2 instead of manual, set to manual again"]
+    made.disconnect()
+    assert (folder / "pwm1_enable").read_text() == "5", "as it was found before the first command"
+
+
+def test_a_pwm_that_another_program_sets_is_said_once_and_one_that_a_chip_rounds_is_not(root: Path) -> None:
+    folder = board(root)
+    made = connected(root, writable=True)
+    noted = listened(made)
+    made.write((200.0, 90.0))
+    (folder / "pwm1").write_text("182")  # a chip with eight levels
+    for shown in (182, 182, 182, 60, 60, 60):
+        (folder / "pwm1").write_text(str(shown))
+        reading(made)
+    assert noted.noted == ["changed_by_others: nct6798/pwm1 shows 60 after the command 200"]
+    made.write((200.0, NAN))
+    (folder / "pwm1").write_text("118")  # never what was written
+    for _ in range(3):
+        assert reading(made).command[0] == 118.0
+    assert noted.noted[1:] == ["changed_by_others: nct6798/pwm1 shows 118 after the command 200"]
+
+
+def test_firmware_that_does_not_give_a_fan_up_refuses_the_command(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    board(root)
+    made = connected(root, writable=True)
+    monkeypatch.setattr(Drive, "mode", lambda _drive: 5)
+    with pytest.raises(
+        DeviceError, match=r"nct6798/pwm1_enable remains 5 after 1 \(manual\) was written: the firmware"
+    ):
+        made.write((200.0, NAN))
+
+
+def test_a_pwm_that_is_not_in_force_is_no_command(root: Path) -> None:
+    laptop = add_chip(root, 0, "thinkpad", "x/0", {"fan1_input": 0xFFFF, "pwm1": 255, "pwm1_enable": 2})
+    made = connected(root, 1, chip="thinkpad", writable=True)
+    noted = listened(made)
+    refused = made.read()
+    assert isinstance(refused, Rejected) and refused.detail.startswith("in automatic mode (pwm1_enable is 2)")
+    assert noted.noted == ["no_measurement: fan1_input is 65535, which is no measurement"]
+    made.write((128.0,))
+    (laptop / "fan1_input").write_text("3000")
+    assert (reading(made).command, reading(made).speed) == ((128.0,), (3000.0,))
+    (laptop / "pwm1_enable").write_text("0")  # full speed, whatever pwm1 is
+    assert isinstance(made.read(), Rejected)
+
+
+def test_set_points_in_rpm_and_pwms_of_other_chips_drive_fans(root: Path) -> None:
+    files: dict[str, int | str] = {}
+    for fan, rpm in ((1, 1147), (2, 1760)):
+        files |= {f"fan{fan}_input": rpm, f"fan{fan}_output": rpm + 3, f"fan{fan}_manual": 0}
+    mac = add_chip(root, 0, "applesmc", "platform/applesmc.768", files)
+    other = board(root, 1)
+    tacho = add_chip(root, 2, "tacho", "x/0", {"fan1_input": 4000})
+
+    made = connected(root, chip="applesmc", pwms=["fan1_output", "fan2_output"], writable=True)
+    assert reading(made).command == (1150.0, 1763.0)
+    made.write((2000.0, NAN))
+    assert [(mac / f).read_text() for f in ("fan1_manual", "fan1_output", "fan2_manual")] == ["1", "2000", "0\n"]
+    made.disconnect()
+    assert (mac / "fan1_manual").read_text() == "0"
+
+    made = connected(root, 1, chip="tacho", pwms=["nct6798/pwm2"], writable=True, speed_scales=[0.5])
+    assert (reading(made).command, reading(made).speed) == ((140.0,), (2000.0,)), "four pulses a revolution"
+    made.write((90.0,))
+    assert [(other / f).read_text() for f in ("pwm2_enable", "pwm2")] == ["1", "90"]
+    made.disconnect()
+    assert (other / "pwm2_enable").read_text() == "5" and not (tacho / "pwm2_enable").exists()
+
+    assert device(root, chip="applesmc").check()[0] == (
+        "applesmc has no pwm: name its set-points in rpm, pwms = ['fan1_output', 'fan2_output']"
+    )
+    assert device(root, 1, chip="tacho").check() == ["tacho has no pwm: name what drives its fans in pwms (CHIP/pwm1)"]
+    (wrong,) = device(root, 1, chip="tacho", pwms=["it8728/pwm1"]).check()
+    assert wrong.startswith("no chips are called it8728; there are: applesmc, nct6798, tacho; correct pwms")
+
+
 def test_what_a_source_cannot_do_is_said_before_it_starts(root: Path) -> None:
     board(root)
     assert device(root).check() == []
@@ -205,6 +309,7 @@ def test_what_a_source_cannot_do_is_said_before_it_starts(root: Path) -> None:
 @pytest.mark.parametrize(
     ("chip", "tacho"),
     [
+        ("nct6687", Tacho(kind="average", window_s=0.05, update_s=1.0)),
         ("pwmfan", Tacho(kind="count", pulses=2, window_s=1.0)),
         ("nct6798", Tacho(kind="average", window_s=0.05, update_s=1.5)),
         ("max31790", Tacho(kind="average", window_s=0.05, update_s=1.0)),

@@ -38,8 +38,31 @@ def test_each_chip_with_fans_is_a_tray_that_reads_what_is_there(root: Path) -> N
     assert first.notes[:2] == ("fan 0 is fan1_input: 900 rpm", "fan 1 is fan2_input: 1200 rpm")
     assert "# fan 0 is fan1_input: 900 rpm\n" in first.toml
     assert any(note.startswith("measures average over 0.05 s") for note in first.notes)
-    assert found[2].missing[0].startswith("fan2 has no pwm2, so its command is not known")
+    assert found[2].missing[0].startswith("thinkpad has no pwm2, so the command of fan2 is not known")
+    assert "nct6798@1-002f/pwm1" in found[2].missing[0]
     assert any("not known" in note for note in found[2].notes)
+
+
+def test_a_chip_without_pwm_is_commanded_in_rpm_or_named_as_one_that_cannot_be_watched(tmp_path: Path) -> None:
+    files: dict[str, int | str] = {}
+    for fan, rpm in ((1, 1147), (2, 1760)):
+        files |= {f"fan{fan}_input": rpm, f"fan{fan}_output": rpm, f"fan{fan}_max": 21_500 + fan}
+    add_chip(tmp_path / "hwmon", 0, "applesmc", "x/0", files)
+    add_chip(tmp_path / "hwmon", 1, "asus", "x/1", {"fan1_input": 2400, "pwm1_enable": 2})
+    add_chip(tmp_path / "hwmon", 2, "thinkpad", "x/2", {"fan1_input": 0xFFFF, "pwm1": 255, "pwm1_enable": 2})
+    mac, asus, thinkpad = discover_hwmon(tmp_path / "hwmon")
+    assert mac.tray["source"]["pwms"] == ["fan1_output", "fan2_output"] and mac.tray["command_max"] == 21_502
+    (tray,) = parse_config(mac.toml, Path("fantwin.toml")).trays
+    assert build_source(tray.source, SourceContext(2, "rpm", Path())).check() == []
+    (asus_lacks,) = asus.missing
+    assert not asus.tray and asus_lacks.startswith(
+        "asus has no pwm and no set-point, so the command of its fans is not"
+    )
+    assert thinkpad.missing == (
+        "fan1_input is 65535, which is no measurement: its speed is missing until there is one",
+        "in automatic mode (pwm1_enable is 2) thinkpad/pwm1 is not the command "
+        "(Documentation/admin-guide/laptops/thinkpad-acpi.rst)",
+    )
 
 
 @pytest.mark.parametrize(("rpm", "is_said"), [(335, False), (1500, True)])
