@@ -94,7 +94,7 @@ def read_table(
     t_ns, has_time = times.values() if times else _counted_times(count, period or "")
     values = {name: column.values(may_be_empty=chosen.is_pattern) for name, column in columns.items()}
     chosen, left_out = used_fans(path, chosen, values)
-    remarks = [*_twice(layout, chosen), *chosen.notes, *left_out]
+    remarks = [*([] if layout.head == 1 else [layout.in_words]), *_twice(layout, chosen), *chosen.notes, *left_out]
     if wider:
         remarks.append(f"{len(wider)} rows left out: more cells than the {len(layout.names)} names, first {wider[0]!r}")
     if times:

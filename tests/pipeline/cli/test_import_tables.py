@@ -6,7 +6,7 @@ Each table below has 60 rows of the same fan, in the form of public files and re
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import NamedTuple
@@ -19,6 +19,7 @@ from fantwin.pipeline.errors import FantwinError
 from fantwin.pipeline.recordings.training_runs import read_runs
 from fantwin.pipeline.sources.imported_file import Wanted, preview_of, read_file
 from fantwin.pipeline.sources.tables import profiles
+from fantwin.schemas.messages import Array
 from tests.support.fantwin_command import error_of, fantwin
 from tests.support.written_recordings import raw_columns
 
@@ -38,7 +39,7 @@ OF_DAY = [f"{each:%H:%M:%S}.000" for each in DATES]
 COLUMNS = ("--command", "pwm1", "--speed", "fan1:rpm")
 
 
-def lines(*columns: Sequence[object], by: str = ",", head: str = "", before: str = "", after: str = "") -> str:
+def lines(*columns: Iterable[object], by: str = ",", head: str = "", before: str = "", after: str = "") -> str:
     """A table: rows of these columns, with a head and what stands before and after them."""
     rows = [by.join(map(str, row)) for row in zip(*columns, strict=True)]
     return "\n".join(filter(None, [before, head, *rows, after])) + "\n"
@@ -48,7 +49,7 @@ def thousands(mark: str) -> list[str]:
     return [f"{speed:,}".replace(",", mark) for speed in SPEED]
 
 
-def quoted(cells: Sequence[object]) -> list[str]:
+def quoted(cells: Iterable[object]) -> list[str]:
     return [f'"{cell}"' for cell in cells]
 
 
@@ -57,7 +58,7 @@ class Table(NamedTuple):
 
     content: str | bytes
     options: tuple[str, ...] = COLUMNS
-    t_s: np.ndarray = SECONDS
+    t_s: Array = SECONDS
     notes: tuple[str, ...] = ()
 
 
@@ -193,6 +194,7 @@ TABLES = {
         ),
         ("--time", "time:us", "--command", "motor[0]", "--speed", "rpm:rpm"),
         SECONDS / 100,
+        ("UTF-8, columns separated by ',', names in line 3",),
     ),
     "a line of units": Table(
         lines(SECONDS / 2, COMMAND, SPEED, before="Time,Duty,Speed", head="s,%,rpm"),
@@ -423,7 +425,7 @@ class Cut(NamedTuple):
     """A table of which some rows cannot be read, which cost themselves. kept: rows that are."""
 
     content: str
-    kept: np.ndarray
+    kept: Array
     note: str
     options: tuple[str, ...] = COLUMNS
 
@@ -539,7 +541,7 @@ def test_marks_that_only_later_rows_show_are_those_of_the_whole_column(tmp_path:
     path.write_text("\n".join(["t;fan1;pwm1", *rows, "1000;1.016,5;40"]) + "\n", encoding="utf-8")
     assert fantwin("import", path, *COLUMNS, "-o", recording).exit_code == 0
     speed = raw_columns(recording)[2][:, 0] / RPM
-    np.testing.assert_allclose(speed, [*(1016 + np.arange(1000) % 3), 1016.5])
+    np.testing.assert_allclose(speed, np.append(1016 + np.arange(1000) % 3, 1016.5))
 
 
 def test_several_files_and_patterns_become_one_recording_in_the_order_of_time(tmp_path: Path) -> None:
