@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from enum import StrEnum
 from pathlib import Path
@@ -46,14 +47,14 @@ class ViewLayout(StrEnum):
 
 
 def fan_numbers(text: str | None, names: Callable[[], FanNames]) -> list[int] | None:
-    """The fans of an option such as `--fans 2,5` or `--fans CPU`. names: asked for where one is not a number.
+    """The fans of an option such as `--fans 2,5`, `0-3` or `CPU`. names: asked for where one is no number.
 
     Raises:
         UsageError: it is not an ascending list of fans.
     """
     if text is None:
         return None
-    parts = text.split(",")
+    parts = [number for part in text.split(",") for number in _run_of_fans(part)]
     try:
         known = NO_NAMES if all(part.strip().removeprefix("-").isdecimal() for part in parts) else names()
         numbers = [known.number(part) for part in parts]
@@ -62,6 +63,12 @@ def fan_numbers(text: str | None, names: Callable[[], FanNames]) -> list[int] | 
     if numbers != sorted(set(numbers)):
         raise UsageError(f"--fans {text}: give each fan once, in ascending order")
     return numbers
+
+
+def _run_of_fans(part: str) -> list[str]:
+    """`0-3` as its numbers; anything else as it is."""
+    run = re.fullmatch(r"\s*(\d{1,4})\s*-\s*(\d{1,4})\s*", part)
+    return [str(fan) for fan in range(int(run[1]), int(run[2]) + 1)] or [part] if run else [part]
 
 
 def recorded_names(recordings: Sequence[Path], tray: str | None) -> Callable[[], FanNames]:

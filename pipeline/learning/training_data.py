@@ -241,14 +241,15 @@ def counting_tachos(windows_s: Sequence[float]) -> tuple[Tacho, ...]:
 
 
 @contextmanager
-def twin_errors() -> Iterator[None]:
-    """Turns errors of the twin package into a UserError of one line."""
+def twin_errors(data: TrainingData | None = None) -> Iterator[None]:
+    """Turns errors of the twin package into a UserError of one line. data: whose fans its columns are."""
     from fantwin.twin.errors import TwinError  # noqa: PLC0415
 
     try:
         yield
     except TwinError as error:
-        raise UserError(str(error)) from error
+        line = str(error)
+        raise UserError(data.with_fan_numbers([line])[-1] if data else line) from error
 
 
 def data_cards(data: TrainingData) -> list[DataCard]:

@@ -12,6 +12,7 @@ import numpy as np
 
 from fantwin.pipeline.errors import UsageError, UserError
 from fantwin.pipeline.sources.logs.formats import log_format, open_log
+from fantwin.pipeline.sources.logs.known_fields import known_columns
 from fantwin.pipeline.sources.logs.log_file import Series
 from fantwin.pipeline.sources.logs.preview import preview_of_log
 from fantwin.pipeline.sources.logs.samples_of_log import read_samples
@@ -69,12 +70,15 @@ def read_file(path: Path, wanted: Wanted) -> Imported:
     """
     if kind := log_format(path):
         _require_no_times(wanted, f"a {kind.title}")
-        if not (wanted.command and wanted.speed):
-            raise UsageError("an import needs --command and --speed; --preview shows the fields")
         log = open_log(path, kind)
-        return Imported(
-            *read_samples(path, log, wanted.command, wanted.speed, wanted.reading.poles, auxiliary=wanted.channels)
+        known = {} if wanted.command or wanted.speed else known_columns(log.names)
+        commands, speeds = (
+            [known[name]] if known else given
+            for name, given in (("--command", wanted.command), ("--speed", wanted.speed))
         )
+        if not (commands and speeds):
+            raise UsageError("an import needs --command and --speed; --preview shows the fields")
+        return Imported(*read_samples(path, log, commands, speeds, wanted.reading.poles, auxiliary=wanted.channels))
     if series := _series_of(path):
         return _of_series(path, series, wanted)
     layout = find_layout(path)

@@ -31,7 +31,7 @@ def write_ulog(path: Path, topics: Mapping[str, tuple[str, Sequence[tuple[Any, .
 
 
 def _codes(fields: str) -> str:
-    codes = {"uint64_t": "Q", "float": "f", "int32_t": "i", "esc_report": "if"}
+    codes = {"uint64_t": "Q", "float": "f", "int32_t": "i", "uint8_t": "B", "esc_report": "if"}
     found = ""
     for field in filter(None, fields.split(";")):
         kind, _ = field.split()
@@ -66,3 +66,56 @@ def write_rosbag(folder: Path, t_s: np.ndarray, command: np.ndarray, rpm: np.nda
                 effort=np.zeros(0),
             )
             writer.write(states, t_ns + 5_000_000, store.serialize_cdr(state, joints))
+
+
+FLOAT64 = ("std_msgs/msg/Float64", "float64 data\n")
+STAMPED = (
+    "fans/msg/Stamped",
+    "std_msgs/Header header\nfloat64 data\n"
+    f"{'=' * 80}\nMSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n"
+    f"{'=' * 80}\nMSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n",
+)
+_CDR = b"\0\1\0\0"
+
+
+def float64(value: float) -> bytes:
+    """A message of FLOAT64."""
+    return _CDR + struct.pack("<d", value)
+
+
+def stamped(t_ns: int, value: float) -> bytes:
+    """A message of STAMPED."""
+    return _CDR + struct.pack("<iIIb3xd", *divmod(t_ns, 10**9), 1, 0, value)
+
+
+def write_mcap(
+    path: Path, topics: Mapping[str, tuple[tuple[str, str], Sequence[tuple[int, bytes]]]], *, encoding: str = "cdr"
+) -> Path:
+    """topics: by name, its type with its definition, and its messages, each with its time of receipt."""
+    from mcap.writer import Writer  # noqa: PLC0415
+
+    with path.open("wb") as file:
+        writer = Writer(file, chunk_size=1500)
+        writer.start(profile="ros2", library="test")
+        ids: dict[str, int] = {}
+        for name, ((kind, text), _) in topics.items():
+            schema = writer.register_schema(kind, "ros2msg", text.encode())
+            ids[name] = writer.register_channel(name, encoding, schema)
+        found = [(t_ns, ids[name], data) for name, (_, messages) in topics.items() for t_ns, data in messages]
+        for t_ns, channel, data in sorted(found, key=lambda each: each[0]):
+            writer.add_message(channel, t_ns, data, t_ns)
+        writer.finish()
+    return path
+
+
+def write_bag_metadata(folder: Path, files: Sequence[str], counts: Mapping[str, int], qos: str = "") -> None:
+    """metadata.yaml of a ROS 2 bag of FLOAT64 topics."""
+    topics = "".join(
+        f"  - topic_metadata: {{name: {name}, type: std_msgs/msg/Float64, serialization_format: cdr, "
+        f'offered_qos_profiles: "{qos}"}}\n    message_count: {count}\n'
+        for name, count in counts.items()
+    )
+    folder.joinpath("metadata.yaml").write_text(
+        "rosbag2_bagfile_information:\n  version: 5\n  storage_identifier: mcap\n  topics_with_message_count:\n"
+        f"{topics}  compression_format: ''\n  compression_mode: ''\n  relative_file_paths: [{', '.join(files)}]\n"
+    )

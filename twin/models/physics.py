@@ -35,5 +35,9 @@ def acceleration_by_parameters(speed_rad_s: Array, command: Array, parameters: A
 
 
 def time_constant_s(speed_rad_s: Array, parameters: Array) -> Array:
-    """(fans,) time in which a small deviation from speed_rad_s decays by e: -1 / acceleration_by_speed."""
-    return -1.0 / acceleration_by_speed(speed_rad_s, parameters)
+    """(fans,) time in which a small deviation from speed_rad_s decays by e: -1 / acceleration_by_speed.
+
+    Infinite where it does not decay: at rest, without viscous drag.
+    """
+    rate = -acceleration_by_speed(speed_rad_s, parameters)
+    return np.divide(1.0, rate, out=np.full_like(rate, np.inf), where=rate != 0.0)

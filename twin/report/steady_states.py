@@ -79,8 +79,7 @@ def static_curve(
 
 def settling_time_constant_s(speed_rad_s: float, parameters: Array) -> float:
     """Of one fan's physics around a speed, the lag of its drive included; infinite where the physics do not settle."""
-    with np.errstate(divide="ignore"):
-        mechanical_s = float(physics.time_constant_s(np.array([speed_rad_s]), parameters[np.newaxis])[0])
+    mechanical_s = float(physics.time_constant_s(np.array([speed_rad_s]), parameters[np.newaxis])[0])
     return mechanical_s + float(parameters[physics.LAG]) if mechanical_s > 0.0 else np.inf
 
 

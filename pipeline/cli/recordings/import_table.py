@@ -33,7 +33,7 @@ def import_table(
         list[Path],
         typer.Argument(
             metavar="FILE...",
-            help="Tables, series, or logs (ULog, ROS 2 bag); several, or a pattern such as 'log-*.csv', become one "
+            help="Tables, series, or logs (ULog, ROS bag); several, or a pattern such as 'log-*.csv', become one "
             "recording.",
         ),
     ],

@@ -172,7 +172,7 @@ def show_fans(recordings: Sequence[Path], part: Part, pool: RecordingsInParallel
         report_damage(training_data.damage)
         if not json_output:
             show_hints(training_data.hints)
-        with training_progress(training_data) as start:
+        with training_progress(training_data) as start, twin_errors(training_data):
             found = identify_at_reference(training_data.runs, progress=start(""))
     result = fans_as_json(found, training_data)
     allowed = [f"allows for {result['allows_for']}"] if result["allows_for"] else []
@@ -214,7 +214,7 @@ def fans_as_json(at_reference: AtReference, training_data: TrainingData) -> dict
 
 
 def _interval(found: Identification, fan: int, index: int) -> list[float] | None:
-    """None for a parameter that was not estimated: a lag that was not found."""
+    """None for a parameter that was not estimated: a lag that was not found, or one that the fit drove to its bound."""
     return found.interval_95[fan, index].tolist() if found.covariance[fan, index, index] > 0.0 else None
 
 
@@ -224,7 +224,10 @@ def _table(result: dict[str, Any]) -> Table:
     units = "; ".join(f"{name} in {result['units'][name]}" for name in mechanical)
     columns = (*mechanical, "lag\nms", "time\nconst. s", f"rmse\n{result['speed_unit']}")
     caption = f"{units}. ± is half a 95 % interval; the time constant is that at the median speed."
+    if any(fan[f"{name}_95"] is None for fan in result["fans"] for name in mechanical):
+        caption += " -: the fit drove the value to its bound, which has no interval."
     table = table_of(["fan"], columns, pad_edge=False, caption=caption)
+    table.columns[0].no_wrap = False  # a long name must not cut the numbers
     for fan in result["fans"]:
         values = [_with_interval(fan[name], fan[f"{name}_95"]) for name in mechanical]
         figures = (f"{fan['time_constant_s']:.3g}", f"{fan['rmse']:.4g}")
@@ -239,5 +242,5 @@ def _lag(fan: dict[str, Any]) -> str:
     return _with_interval(1e3 * fan["lag_s"], [1e3 * low, 1e3 * high])
 
 
-def _with_interval(value: float, interval: list[float]) -> str:
-    return f"{value:.4g}\n± {(interval[1] - interval[0]) / 2:.1g}"
+def _with_interval(value: float, interval: list[float] | None) -> str:
+    return f"{value:.4g}\n{f'± {(interval[1] - interval[0]) / 2:.1g}' if interval else '-'}"

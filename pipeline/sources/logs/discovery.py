@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fantwin.pipeline.errors import UserError
-from fantwin.pipeline.sources.logs.formats import log_format
+from fantwin.pipeline.sources.logs.formats import LOG_FORMATS, log_format
 from fantwin.pipeline.sources.logs.log_file import LogError
 
 _TABLES = (".csv", ".tsv", ".txt")
@@ -34,7 +34,7 @@ def discover_logs(folder: Path) -> list[FoundLogs]:
     except OSError as error:
         raise UserError(f"{folder}: {error.strerror}; name a folder of logs") from error
     if not found:
-        raise UserError(f"{folder}: no ULog, ROS 2 bag or table ({', '.join(_TABLES)}) in it")
+        raise UserError(f"{folder}: no ULog, ROS bag or table ({', '.join(_TABLES)}) in it")
     titles = dict.fromkeys(title for title, _ in found)
     grouped = {title: [path for each, path in found if each == title] for title in titles}
     return [
@@ -45,10 +45,12 @@ def discover_logs(folder: Path) -> list[FoundLogs]:
 
 def _formats(folder: Path) -> Iterator[tuple[str, Path]]:
     for path in folder.iterdir():
+        if path.is_dir() and not any((path / each.marker).exists() for each in LOG_FORMATS if each.marker):
+            yield from _formats(path)
+            continue
         try:
             kind = log_format(path)
         except LogError:
-            yield from _formats(path) if path.is_dir() else ()
             continue
         if kind or path.suffix.lower() in _TABLES:
             yield kind.title if kind else "table", path

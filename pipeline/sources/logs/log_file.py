@@ -15,9 +15,17 @@ from fantwin.pipeline.errors import UserError
 from fantwin.schemas.messages import Array
 from fantwin.schemas.units import NS_PER_S
 
+_MOST_SHOWN = 120
+
 
 class LogError(UserError):
     """A log that cannot be read: one line that says why."""
+
+
+def in_one_line(error: BaseException) -> str:
+    """What a library says, in one short line; of an error without a text its name."""
+    text = " ".join(str(error).split()) or type(error).__name__
+    return text if len(text) <= _MOST_SHOWN else f"{text[:_MOST_SHOWN]}..."
 
 
 @dataclass(frozen=True, eq=False)

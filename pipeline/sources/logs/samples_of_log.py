@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from fantwin.pipeline.sources.logs.known_fields import read_measured, stops_where_nan
 from fantwin.pipeline.sources.logs.log_file import LogFile, Series
+from fantwin.pipeline.sources.tables.clocks import Clock, continued
 from fantwin.pipeline.sources.tables.fan_columns import FanColumns, fan_columns
 from fantwin.pipeline.sources.tables.measured_table import NO_COLUMNS, Table, rad_s_per, table_of, used_fans
 from fantwin.pipeline.sources.tables.units import SPEED_UNITS
@@ -33,14 +35,60 @@ def read_samples(
         UserError: the fields or units cannot be used.
     """
     chosen = fan_columns(path, log.names, command, speed, auxiliary, SPEED_UNITS)
-    series = log.read(chosen.names)
+    series, unmeasured = read_measured(log, chosen.names)
+    series, clocks = _continued(path, series)
     t_ns, speeds = _speeds([series[name] for name in chosen.speed])
     values = {name: _held(each, t_ns) for name, each in series.items()} | dict(zip(chosen.speed, speeds.T, strict=True))
     chosen, left_out = used_fans(path, chosen, values)
+    stopped = _without_stops(chosen, series, values, t_ns)
     has_time = np.ones(len(t_ns), np.bool_)
     table = table_of(path, chosen, values, t_ns, has_time, *rad_s_per(chosen.unit or "rad/s", poles))
     assumed = f"speeds in rad/s assumed; if that is wrong, use for example {chosen.assumed}" if chosen.assumed else ""
-    return replace(table, assumed=assumed), (*log.notes, *chosen.notes, *left_out, *_rates(series, chosen))
+    silent = _unmeasured_in_words({name: found for name, found in unmeasured.items() if name in chosen.names})
+    notes = (*log.notes, *chosen.notes, *left_out, *silent, *clocks, *stopped, *_rates(series, chosen))
+    return replace(table, assumed=assumed), notes
+
+
+def _unmeasured_in_words(unmeasured: Mapping[str, tuple[str, int]]) -> list[str]:
+    if not unmeasured:
+        return []
+    fields = ", ".join(dict.fromkeys(field for field, _ in unmeasured.values()))
+    count = sum(count for _, count in unmeasured.values())
+    return [f"{_with_others(unmeasured)}: {count} values left out, where the bit of the motor in {fields} is not set"]
+
+
+def _continued(path: Path, series: Mapping[str, Series]) -> tuple[dict[str, Series], list[str]]:
+    """The fields with times that go on. Those of a topic share their times, which are looked at once."""
+    found: dict[str, Series] = {}
+    notes: list[str] = []
+    t_ns, clock = np.zeros(0, np.int64), Clock(np.zeros(0, np.int64), np.zeros(0, np.bool_))
+    for name, each in series.items():
+        if not np.array_equal(each.t_ns, t_ns):
+            t_ns = each.t_ns
+            clock = continued(path, t_ns, np.ones(len(t_ns), np.bool_), longest_part=True)
+            notes += [f"{name}: {note}" for note in clock.notes]
+        found[name] = Series(clock.t_ns[clock.is_good], each.values[clock.is_good])
+    return found, notes
+
+
+def _without_stops(
+    chosen: FanColumns, series: Mapping[str, Series], values: dict[str, Array], t_ns: Array
+) -> list[str]:
+    """Take away the speeds at which a command says that its motor is stopped, as it is no number; a note on that."""
+    counts: dict[str, int] = {}
+    for command, speed in zip(chosen.command, chosen.speed, strict=True):
+        if stops_where_nan(command):
+            told = series[command]
+            at = np.searchsorted(told.t_ns, t_ns, "right") - 1
+            is_stopped = (at >= 0) & np.isnan(told.values[np.maximum(at, 0)])
+            values[speed] = np.where(is_stopped, np.nan, values[speed])
+            counts |= {speed: int(np.count_nonzero(is_stopped))} if is_stopped.any() else {}
+    why = "where their commands are NaN, as the motors were stopped"
+    return [f"{_with_others(counts)}: {sum(counts.values())} values left out, {why}"] if counts else []
+
+
+def _with_others(names: Collection[str]) -> str:
+    return f"{next(iter(names))} and {len(names) - 1} more" if len(names) > 1 else next(iter(names))
 
 
 def _rates(series: Mapping[str, Series], chosen: FanColumns) -> list[str]:

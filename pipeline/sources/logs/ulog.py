@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Mapping, Sequence
+from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from fantwin.pipeline.sources.logs.log_file import LogError, Series
+from fantwin.pipeline.sources.logs.log_file import LogError, Series, in_one_line
 
 NS_PER_US = 1000
 MOST_FIELDS = 10_000
@@ -23,10 +25,11 @@ class ULogFile:
         from pyulog import ULog  # noqa: PLC0415  an extra
 
         try:
-            _refuse_endless(ULog(str(path), parse_header_only=True).message_formats)
-            log = ULog(str(path))
+            with redirect_stdout(io.StringIO()):  # where it prints what is said below
+                _refuse_endless(ULog(str(path), parse_header_only=True).message_formats)
+                log = ULog(str(path))
         except Exception as error:
-            raise LogError(f"{path}: no ULog that can be read: {error}") from error
+            raise LogError(f"{path}: no ULog that can be read: {in_one_line(error)}") from error
         self._data = {
             data.name + (f"#{data.multi_id}" if data.multi_id else ""): data.data
             for data in log.data_list
@@ -38,8 +41,9 @@ class ULogFile:
             for field in columns
             if field != "timestamp" and columns[field].dtype.kind in "iuf"
         ]
+        lost_s = sum(each.duration for each in log.dropouts) / 1000
         self.notes: Sequence[str] = [
-            *([f"{len(log.dropouts)} dropouts of the logger"] if log.dropouts else []),
+            *([f"{len(log.dropouts)} dropouts of the logger, {lost_s:.3g} s together"] if log.dropouts else []),
             *(["the file is damaged: what could be read was read"] if log.file_corruption else []),
         ]
 

@@ -227,7 +227,7 @@ def _encoding(path: Path, start: bytes) -> str:
     found = next((encoding for bom, encoding in _BOMS.items() if start.startswith(bom)), "")
     if not found and b"\0" in start:
         if start[1::2].count(0) < 0.4 * len(start) or start[0::2].count(0):
-            raise UserError(f"{path}: not a text file with columns; export it as CSV")
+            raise UserError(f"{path}: not a text file with columns, a ULog or a ROS bag; export it as CSV")
         return "utf-16-le"
     return found or "utf-8"
 

@@ -186,7 +186,22 @@ def table_of(
         path, t_ns, has_time, command, np.column_stack([speed, *others]), unit, longest_part=longest_part
     )
     of_speed, *measured = np.split(table.speed_rad_s, len(others) + 1, axis=1)
-    return replace(table, speed_rad_s=of_speed, auxiliary=dict(zip(chosen.others, measured, strict=True)))
+    return replace(
+        table,
+        speed_rad_s=of_speed,
+        auxiliary=dict(zip(chosen.others, measured, strict=True)),
+        remarks=(*table.remarks, *_constant(chosen, table.command)),
+    )
+
+
+def _constant(chosen: FanColumns, command: Array) -> list[str]:
+    """A note on each command that never changes, from which no twin can be made."""
+    never = dict.fromkeys(
+        (name, float(command[0, fan]))
+        for fan, name in enumerate(chosen.command)
+        if not np.any(np.diff(command[:, fan]))
+    )
+    return [f"{name} is {value:g} throughout: a twin needs steps of the command" for name, value in never]
 
 
 def clean_samples(

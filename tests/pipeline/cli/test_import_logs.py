@@ -96,4 +96,84 @@ def test_a_preview_shows_the_fields_with_their_rates_and_the_command_that_import
     assert any(line.startswith(field) for line in lines)
     assert lines[-1].startswith(f"to import it: fantwin import {path} --command ")
     path.write_bytes(path.read_bytes()[:20])
-    assert "this ULog has no fields with numbers; is it damaged?" in error_of("import", path, "--preview")
+    said = error_of("import", path, "--preview")
+    assert said.endswith("no field with numbers in this ULog: it ends before its data, or has texts only")
+
+
+ONLINE = ("uint64_t timestamp;uint8_t esc_count;uint8_t esc_online_flags;esc_report[8] esc;",)
+
+
+def quad(path: Path, *, silent: int = -1, motors: bool = False) -> Path:
+    """Four motors in eight slots, 300 samples; the motor `silent` is offline in every tenth. motors: commands of newer
+    autopilots, NaN for motors that are not there and, in the last 50 samples, for those that are stopped."""
+    commands = np.array([1300.0, 1700.0, 1200.0, 1500.0])[np.arange(300) // 60 % 4]
+    escs, outputs = [], []
+    for k, command in enumerate(commands):
+        off = [m for m in range(4) if m == silent and k % 10 == 0]
+        slots = [(0, 0.0) if m >= 4 or m in off else (int(8 * command) - 8000 + m, 23.5) for m in range(8)]
+        t_us = 5_000_000 + 100_000 * k
+        escs.append((t_us, 4, 15 - sum(1 << m for m in off), *(value for slot in slots for value in slot)))
+        told = np.nan if motors and k >= 250 else command
+        outputs.append((t_us, *[told] * 4, *[np.nan if motors else 0.0] * 8))
+    name = "actuator_motors" if motors else "actuator_outputs"
+    field = "control" if motors else "output"
+    write_ulog(path, {"esc_status": (*ONLINE, escs), name: (f"uint64_t timestamp;float[12] {field};", outputs)})
+    return path
+
+
+def test_a_px4_log_gives_the_motors_that_are_there_and_no_speed_while_their_esc_is_offline(tmp_path: Path) -> None:
+    log, recording = quad(tmp_path / "quad.ulg", silent=2), tmp_path / "r.mcap"
+    (shown,) = json.loads(fantwin("import", log, "--preview", "--json").stdout)["files"]
+    known = ["--command", "actuator_outputs.output[*]", "--speed", "esc_status.esc[*].esc_rpm:rpm"]
+    assert shown["options"] == known
+    volts = ("--channel", "supply_voltage_v=esc_status.esc[*].esc_voltage")
+    result = json.loads(fantwin("import", log, *volts, "-o", recording, "--json").stdout)
+    assert (result["fans"], result["samples"], result["speeds_missing"]) == (4, 300, 30)
+    assert any(
+        note.startswith("left out, because the speed is always 0 or missing: esc_status") for note in result["notes"]
+    )
+    silent = (
+        "esc_status.esc[2].esc_rpm and 1 more: 60 values left out, where the bit of the motor in esc_status.esc_online"
+    )
+    assert any(note.startswith(silent) for note in result["notes"])
+    speeds = raw_columns(recording)[2]
+    assert np.isnan(speeds[::10, 2]).all()
+    assert np.isfinite(speeds[:, [0, 1, 3]]).all()
+    assert np.nanmin(speeds) > 1000 * RPM
+
+
+def test_a_motor_that_is_stopped_has_no_command_and_so_no_speed(tmp_path: Path) -> None:
+    log, recording = quad(tmp_path / "new.ulg", motors=True), tmp_path / "r.mcap"
+    result = json.loads(fantwin("import", log, "-o", recording, "--json").stdout)
+    assert (result["fans"], result["speeds_missing"]) == (4, 200)
+    speeds = "esc_status.esc[0].esc_rpm and 3 more: 200 values left out"
+    stopped = f"{speeds}, where their commands are NaN, as the motors were stopped"
+    assert stopped in result["notes"]
+    assert np.isnan(raw_columns(recording)[2][250:]).all()
+
+
+def test_a_damaged_log_is_read_as_far_as_possible_and_nothing_else_is_printed(tmp_path: Path) -> None:
+    log = quad(tmp_path / "quad.ulg")
+    data = bytearray(log.read_bytes())
+    data[len(data) // 2 :] = bytes(len(data) - len(data) // 2)
+    log.write_bytes(data)
+    shown = fantwin("import", log, "--preview")
+    assert shown.stdout.startswith(f"{log}: ULog, ")
+    assert "corruption" not in shown.output
+    assert "the file is damaged: what could be read was read" in shown.stdout
+
+
+def test_a_command_that_never_changes_is_named_with_its_field_and_later_with_its_fan(tmp_path: Path) -> None:
+    times_us = range(0, 3_000_000, 100_000)
+    outputs = [(t, 0.1 * (k % 7), 0.5) for k, t in enumerate(times_us)]
+    escs = [(t, 100 * (k % 7), 12.0, 3000 + k % 3, 12.0) for k, t in enumerate(times_us)]
+    topics = {
+        "actuator_outputs": ("uint64_t timestamp;float[2] output;", outputs),
+        "esc_status": ("uint64_t timestamp;esc_report[2] esc;", escs),
+    }
+    write_ulog(tmp_path / "a.ulg", topics)
+    result = json.loads(fantwin("import", tmp_path / "a.ulg", "-o", tmp_path / "r.mcap", "--json").stdout)
+    assert "actuator_outputs.output[1] is 0.5 throughout: a twin needs steps of the command" in result["remarks"]
+    for name, *words in (("report",), ("train", "-o", tmp_path / "t.onnx")):
+        said = error_of(name, *words, tmp_path / "r.mcap", "--fans", "1-1")
+        assert said.splitlines()[-1] == "fan 1: the command never changes; record steps between three levels or more"

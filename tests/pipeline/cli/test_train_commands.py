@@ -57,6 +57,26 @@ def test_identify_finds_the_published_fan(folder):
     assert [row[0] for line in shown.splitlines() if (row := line.split()) and row[0].isdigit()] == ["0", "1"]
 
 
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_a_parameter_that_the_fit_drove_to_its_bound_has_no_interval(tmp_path: Path) -> None:
+    """As in step tests of thrust stands: at rest, one step, at rest again, four samples a second."""
+    speeds = [20, 6000, 8700, *[8650, 8700] * 8, 8650, 7780, 4351, 2813, 2013, 1494, 1121, 838, 661, 518]
+    rows = [(1000, 0)] * 36 + [(1650 if k < 20 else 1000, rpm) for k, rpm in enumerate(speeds)] + [(1000, 0)] * 11
+    lines = (f"{0.25 * k:.2f},{us},{rpm}" for k, (us, rpm) in enumerate(rows))
+    table, recording = tmp_path / "rig.csv", tmp_path / "rig.mcap"
+    table.write_text("\n".join(["Time (s),us,rpm", *lines]))
+    fantwin("import", table, "--command", "us", "--speed", "rpm:rpm", "-o", recording)
+    result = fantwin("report", recording)
+    assert result.exit_code == 0, result.output
+    assert "alpha is not distinguishable from zero (the fit drove it there)" in result.stderr
+    cells = [line.split() for line in result.stdout.splitlines()]
+    (row,) = (k for k, line in enumerate(cells) if line and line[0] == "0")
+    assert re.fullmatch(r"± \S+ - ± \S+", " ".join(cells[row + 1]))
+    assert "-: the fit drove the value to its bound, which has no interval" in result.stdout
+    trained = fantwin("train", recording, "--model", "physical", "-o", tmp_path / "rig.onnx")
+    assert trained.exit_code == 0, trained.output
+
+
 def test_a_supply_voltage_that_is_ignored_is_as_if_it_were_not_there(folder, tmp_path):
     run = published_run(1)
     volts = np.full_like(run.command, 12.0)
