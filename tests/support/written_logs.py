@@ -20,8 +20,10 @@ def write_ulog(path: Path, topics: Mapping[str, tuple[str, Sequence[tuple[Any, .
     add("B", bytes(40))
     for name, (fields, _) in topics.items():
         add("F", f"{name}:{fields}".encode())
-        if name == "esc_status":
+        if "esc_report[" in fields:
             add("F", b"esc_report:int32_t esc_rpm;float esc_voltage;")
+        if "timed_report[" in fields:
+            add("F", b"timed_report:uint64_t timestamp;int32_t esc_rpm;")
     for number, name in enumerate(topics):
         add("A", struct.pack("<BH", 0, number) + name.encode())
     for number, (fields, rows) in enumerate(topics.values()):
@@ -31,7 +33,7 @@ def write_ulog(path: Path, topics: Mapping[str, tuple[str, Sequence[tuple[Any, .
 
 
 def _codes(fields: str) -> str:
-    codes = {"uint64_t": "Q", "float": "f", "int32_t": "i", "uint8_t": "B", "esc_report": "if"}
+    codes = {"uint64_t": "Q", "float": "f", "int32_t": "i", "uint8_t": "B", "esc_report": "if", "timed_report": "Qi"}
     found = ""
     for field in filter(None, fields.split(";")):
         kind, _ = field.split()

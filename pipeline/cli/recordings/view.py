@@ -35,7 +35,7 @@ def view(
     window: Annotated[float, typer.Option(min=0.1, help="Length of time shown, s.")] = 30.0,
     tray: Annotated[str | None, typer.Option(help="Plot: which tray, if there are several.")] = None,
     fans: Annotated[
-        str | None, typer.Option(help="Plot: which fans, e.g. 2,5 or 0-3. Default: with alarms, and one without.")
+        str | None, typer.Option(help="Plot: which fans, e.g. 0,2-5. Default: with alarms, and one without.")
     ] = None,
     unit: Annotated[
         str | None, typer.Option(help="Plot: unit of speed, rpm or rad/s. Default: the recording's.")

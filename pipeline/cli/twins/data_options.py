@@ -60,7 +60,7 @@ TestOption: TypeAlias = Annotated[
         help="Several models: healthy recordings that decide which is the best, and take no part in training.",
     ),
 ]
-FansOption: TypeAlias = Annotated[str | None, typer.Option(help="Only these fans, counted from 0, e.g. 0,2 or 0-3.")]
+FansOption: TypeAlias = Annotated[str | None, typer.Option(help="Only these fans, counted from 0, e.g. 0,2-5.")]
 
 TACHO_ADVICE = "see `tacho` in [[tray]], or --window for recordings that do not say"
 TACHO_CONSEQUENCE = (

@@ -26,6 +26,7 @@ MOST_ELEMENTS = 1024
 """elements of an array; a longer one is an image or a cloud and no row of fans"""
 MOST_APART_NS = NS_PER_S
 """from the stamp of a message to its receipt; where they are further apart, they are of two clocks"""
+_LONGEST_TYPE = 80
 _NO_VALUES = ("header", "layout")
 """fields with a time, or the shape of an array"""
 _UNREADABLE = (ArithmeticError, AssertionError, LookupError, MemoryError, RecursionError, TypeError, ValueError)
@@ -138,8 +139,9 @@ def _left_out(topic: Topic, why: Counter[str], seen: Counter[str]) -> str:
 
 
 def _reason(topic: Topic, error: Exception) -> str:
-    if isinstance(error, KeyError) and not topic.definition:
-        return f"the bag does not define its type {topic.type}"
+    if isinstance(error, KeyError):
+        needed = "" if str(error).strip("'") == topic.type else f", which has fields of {str(error)[:_LONGEST_TYPE]}"
+        return f"the bag does not define its type {topic.type}{needed}"
     return in_one_line(error)
 
 
@@ -161,8 +163,9 @@ def _decoder(topic: Topic) -> Callable[[bytes], Any]:
         return _refusing(
             ValueError(f"its messages are {topic.encoding or 'of no known form'}, not cdr as usual in ROS")
         )
-    # old bags in SQLite do not hold their types; those of ROS itself are then known
-    store = get_typestore(Stores.EMPTY if topic.definition else Stores.LATEST)
+    # old bags in SQLite, and some of ROS 1, do not hold their types; those of ROS itself are then known
+    usual = Stores.LATEST if topic.encoding == "cdr" else Stores.ROS1_NOETIC
+    store = get_typestore(Stores.EMPTY if topic.definition else usual)
     try:
         if topic.definition.startswith(f"{'=' * 80}\nIDL: "):
             for part in topic.definition.split(f"{'=' * 80}\n")[1:]:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fantwin.pipeline.sources.logs.known_fields import read_measured, stops_where_nan
+from fantwin.pipeline.sources.logs.known_fields import Unmeasured, read_measured, stops_where_nan
 from fantwin.pipeline.sources.logs.log_file import LogFile, Series
 from fantwin.pipeline.sources.tables.clocks import Clock, continued
 from fantwin.pipeline.sources.tables.fan_columns import FanColumns, fan_columns
@@ -44,17 +44,19 @@ def read_samples(
     has_time = np.ones(len(t_ns), np.bool_)
     table = table_of(path, chosen, values, t_ns, has_time, *rad_s_per(chosen.unit or "rad/s", poles))
     assumed = f"speeds in rad/s assumed; if that is wrong, use for example {chosen.assumed}" if chosen.assumed else ""
-    silent = _unmeasured_in_words({name: found for name, found in unmeasured.items() if name in chosen.names})
+    silent = _unmeasured_in_words([each for each in unmeasured if each.values and each.field in chosen.names])
     notes = (*log.notes, *chosen.notes, *left_out, *silent, *clocks, *stopped, *_rates(series, chosen))
     return replace(table, assumed=assumed), notes
 
 
-def _unmeasured_in_words(unmeasured: Mapping[str, tuple[str, int]]) -> list[str]:
-    if not unmeasured:
-        return []
-    fields = ", ".join(dict.fromkeys(field for field, _ in unmeasured.values()))
-    count = sum(count for _, count in unmeasured.values())
-    return [f"{_with_others(unmeasured)}: {count} values left out, where the bit of the motor in {fields} is not set"]
+def _unmeasured_in_words(unmeasured: Sequence[Unmeasured]) -> list[str]:
+    found: dict[str, dict[str, int]] = {}
+    for each in unmeasured:
+        found.setdefault(each.where, {})[each.field] = each.values
+    return [
+        f"{_with_others(counts)}: {sum(counts.values())} values left out, where {where}"
+        for where, counts in found.items()
+    ]
 
 
 def _continued(path: Path, series: Mapping[str, Series]) -> tuple[dict[str, Series], list[str]]:
@@ -78,9 +80,7 @@ def _without_stops(
     counts: dict[str, int] = {}
     for command, speed in zip(chosen.command, chosen.speed, strict=True):
         if stops_where_nan(command):
-            told = series[command]
-            at = np.searchsorted(told.t_ns, t_ns, "right") - 1
-            is_stopped = (at >= 0) & np.isnan(told.values[np.maximum(at, 0)])
+            is_stopped = np.isnan(_held(series[command], t_ns, through_nan=False)) & np.isfinite(values[command])
             values[speed] = np.where(is_stopped, np.nan, values[speed])
             counts |= {speed: int(np.count_nonzero(is_stopped))} if is_stopped.any() else {}
     why = "where their commands are NaN, as the motors were stopped"
@@ -114,9 +114,9 @@ def _speeds(series: Sequence[Series]) -> tuple[Array, Array]:
     return t_ns, speeds
 
 
-def _held(command: Series, t_ns: Array) -> Array:
-    """The command at these times: the last one that is known; NaN before the first."""
-    known = np.isfinite(command.values)
+def _held(command: Series, t_ns: Array, *, through_nan: bool = True) -> Array:
+    """The command at these times: the last one that is known; NaN before the first. through_nan: NaN tells nothing."""
+    known = np.isfinite(command.values) | (not through_nan)
     order = np.argsort(command.t_ns[known], kind="stable")
     times, values = command.t_ns[known][order], command.values[known][order]
     at = np.searchsorted(times, t_ns, "right") - 1

@@ -63,6 +63,10 @@ def a_type_that_does_not_parse(folder: Path) -> Path:
     return with_topic(folder, ("fans/msg/Odd", "float64[ rpm\n"), float64(1.0))
 
 
+def a_type_with_fields_of_no_type(folder: Path) -> Path:
+    return with_topic(folder, ("fans/msg/All", "other_msgs/Fan[] fans\n"), float64(1.0))
+
+
 def messages_shorter_than_their_type(folder: Path) -> Path:
     return with_topic(folder, FLOAT64, float64(1.0)[:7])
 
@@ -145,6 +149,11 @@ def compressed_messages(folder: Path) -> Path:
             a_type_that_does_not_parse,
             200,
             ["/other is left out: its type fans/msg/Odd has a definition that cannot be read"],
+        ),
+        (
+            a_type_with_fields_of_no_type,
+            200,
+            ["/other is left out: the bag does not define its type fans/msg/All, which has fields of 'other_msgs/"],
         ),
         (messages_shorter_than_their_type, 200, ["/other is left out: "]),
         (one_bad_message, 199, ["/fan/speed: 1 of 200 messages cannot be read: "]),

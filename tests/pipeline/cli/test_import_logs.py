@@ -10,6 +10,7 @@ import pytest
 
 from fantwin.pipeline.recordings.reading import read_recording
 from fantwin.pipeline.recordings.training_runs import read_runs
+from fantwin.pipeline.sources.logs.known_fields import known_columns
 from fantwin.schemas.messages import Raw
 from fantwin.schemas.tacho import Tacho
 from tests.support.fantwin_command import error_of, fantwin
@@ -152,6 +153,33 @@ def test_a_motor_that_is_stopped_has_no_command_and_so_no_speed(tmp_path: Path) 
     assert np.isnan(raw_columns(recording)[2][250:]).all()
 
 
+def test_readings_that_a_px4_log_repeats_are_not_taken_for_new_ones(tmp_path: Path) -> None:
+    """ESCs that answer in turn: each sample has one new reading, and the old one of the other."""
+    outputs, escs, read = [], [], [(0, 0), (0, 0)]
+    for k in range(200):
+        t_us, command = 1_000_000 + 10_000 * k, 0.2 + 0.1 * (k // 20 % 5)
+        read[k % 2] = (t_us - 500, 1000 + 10 * k)
+        outputs.append((t_us, command, command))
+        escs.append((t_us, *read[0], *read[1]))
+    escs[150] = (4_213_092_985_657_280_000, *escs[150][1:])  # a damaged time
+    topics = {
+        "actuator_outputs": ("uint64_t timestamp;float[2] output;", outputs),
+        "esc_status": ("uint64_t timestamp;timed_report[2] esc;", escs),
+    }
+    write_ulog(tmp_path / "a.ulg", topics)
+    result = json.loads(fantwin("import", tmp_path / "a.ulg", "-o", tmp_path / "r.mcap", "--json").stdout)
+    repeated = "esc_status.esc[0].esc_rpm and 1 more: 200 values left out, where readings are repeated, by their own"
+    assert any(note.startswith(repeated) for note in result["notes"])
+    assert any("1 row dropped: the time contradicts the rows around (row 151)" in note for note in result["notes"])
+    speeds = raw_columns(tmp_path / "r.mcap")[2] / RPM
+    kept = np.delete(np.arange(200), 150)
+    for fan in range(2):
+        measured = np.isfinite(speeds[:, fan])
+        expected = kept[kept % 2 == fan]
+        np.testing.assert_array_equal(kept[measured], expected)
+        np.testing.assert_allclose(speeds[measured, fan], 1000 + 10 * expected, rtol=1e-9)
+
+
 def test_a_damaged_log_is_read_as_far_as_possible_and_nothing_else_is_printed(tmp_path: Path) -> None:
     log = quad(tmp_path / "quad.ulg")
     data = bytearray(log.read_bytes())
@@ -177,3 +205,31 @@ def test_a_command_that_never_changes_is_named_with_its_field_and_later_with_its
     for name, *words in (("report",), ("train", "-o", tmp_path / "t.onnx")):
         said = error_of(name, *words, tmp_path / "r.mcap", "--fans", "1-1")
         assert said.splitlines()[-1] == "fan 1: the command never changes; record steps between three levels or more"
+
+
+@pytest.mark.parametrize(
+    ("names", "command", "speed"),
+    [
+        (
+            ["actuator_motors.control[0]", "actuator_outputs.output[0]", "esc_status.esc[0].esc_rpm"],
+            "actuator_motors.control[*]",
+            "esc_status.esc[*].esc_rpm:rpm",
+        ),
+        (
+            ["/fmu/out/esc_status.esc[0].esc_rpm", "/fmu/out/actuator_outputs.output[0]"],
+            "/fmu/out/actuator_outputs.output[*]",
+            "/fmu/out/esc_status.esc[*].esc_rpm:rpm",
+        ),
+        (
+            ["/uav1/mavros/esc_status.esc_status[0].rpm", "/uav1/mavros/rc/out.channels[0]"],
+            "/uav1/mavros/rc/out.channels[*]",
+            "/uav1/mavros/esc_status.esc_status[*].rpm:rpm",
+        ),
+        (["esc_status.esc[0].esc_rpm", "input_rc.values[0]"], None, None),
+    ],
+)
+def test_the_fields_of_motors_are_known_in_logs_and_bags(
+    names: list[str], command: str | None, speed: str | None
+) -> None:
+    known = known_columns(names)
+    assert (known.get("--command"), known.get("--speed")) == (command, speed)
