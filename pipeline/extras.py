@@ -14,7 +14,7 @@ EXTRAS: dict[str, tuple[str, ...]] = {
     "report": ("matplotlib", "jinja2"),
     "devices": ("paho", "pymodbus", "sushy"),
     "outputs": ("apprise", "asyncua", "paho"),
-    "logs": ("pyarrow", "pyulog", "rosbags"),
+    "logs": ("pyarrow", "pyulog", "rosbags", "ruamel"),
     "remote": ("distributed", "fsspec", "s3fs"),
 }
 """extra of pyproject.toml -> those of its modules that the code imports"""

@@ -13,13 +13,17 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
+from io import BytesIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import NamedTuple
+from typing import BinaryIO, NamedTuple
 
+from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
-from mcap.records import Channel, Header, Message, Metadata, Schema
-from mcap.stream_reader import StreamReader
+from mcap.opcode import Opcode
+from mcap.reader import SeekingReader
+from mcap.records import Channel, Chunk, Header, McapRecord, Message, Metadata, Schema
+from mcap.stream_reader import StreamReader, get_chunk_data_stream
 from zstandard import ZstdDecompressor, ZstdError
 
 from fantwin.pipeline.sources.logs.log_file import LogError, in_one_line
@@ -29,6 +33,10 @@ ZSTD_START = b"\x28\xb5\x2f\xfd"
 METADATA_FILE = "metadata.yaml"
 _SUFFIXES = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
 _RECORD_LIMIT = 256 << 20
+_RECORD = struct.Struct("<BQ")
+"""before each record of a chunk: opcode, length of its content"""
+_MESSAGE = struct.Struct("<HIQQ")
+"""before the data of a message: channel, sequence, time of receipt, time of sending"""
 _DAMAGED = (McapError, ZstdError, struct.error, ValueError, EOFError, OverflowError, MemoryError, RuntimeError)
 
 
@@ -79,28 +87,33 @@ class BagFiles:
                 raise LogError(f"{path}: no ROS bag that can be read: {what}")
 
     def _of_mcap(self, path: Path, file: Path) -> Iterator[tuple[Topic, int, bytes]]:
-        schemas: dict[int, Schema] = {}
-        topics: dict[int, Topic] = {}
-        found, profile = 0, ""
+        found, lost, profile = 0, Counter[str](), ""
         with file.open("rb") as stream:
+            schemas, topics = _described_at_the_end(stream)
             try:
-                for record in StreamReader(stream, record_size_limit=_RECORD_LIMIT).records:
-                    match record:
-                        case Message(channel_id=number, log_time=t_ns, data=data) if number in topics:
-                            found += 1
-                            yield topics[number], t_ns, data
-                        case Header():
-                            profile = record.profile
-                        case Schema():
-                            schemas[record.id] = record
-                        case Channel():
-                            topics[record.id] = _topic_of(record, schemas.get(record.schema_id))
-                        case Metadata(name="fantwin") if not profile:
-                            raise LogError(f"{path}: is a recording of fantwin already; `fantwin info {path}` shows it")
-                        case _:
-                            pass
+                for record in StreamReader(stream, emit_chunks=True, record_size_limit=_RECORD_LIMIT).records:
+                    for each in _records_in(record, lost):
+                        match each:
+                            case (number, t_ns, data) if number in topics:
+                                found += 1
+                                yield topics[number], t_ns, data
+                            case tuple():
+                                lost["messages of topics that are described in these"] += 1
+                            case Header():
+                                profile = each.profile
+                            case Schema():
+                                schemas[each.id] = each
+                            case Channel():
+                                topics[each.id] = _topic_of(each, schemas.get(each.schema_id))
+                            case Metadata(name="fantwin") if not profile:
+                                raise LogError(
+                                    f"{path}: is a recording of fantwin already; `fantwin info {path}` shows it"
+                                )
+                            case _:
+                                pass
             except _DAMAGED:
                 self._cut(path, file, found, f"`fantwin info --repair {path} -o FIXED.mcap`")
+        self.notes += [f"{path.name}: {what}, left out: {count}" for what, count in lost.items()]
 
     def _of_sqlite(self, path: Path, file: Path) -> Iterator[tuple[Topic, int, bytes]]:
         found = 0
@@ -168,7 +181,7 @@ def _bag_name(path: Path) -> str:
 
 def _listed(folder: Path) -> BagFiles:
     """What metadata.yaml lists, as far as it is there."""
-    from ruamel.yaml import YAML, YAMLError  # noqa: PLC0415  needed by rosbags, an extra
+    from ruamel.yaml import YAML, YAMLError  # noqa: PLC0415  an extra
 
     try:
         found = YAML(typ="safe").load(folder / METADATA_FILE)["rosbag2_bagfile_information"]
@@ -192,6 +205,45 @@ def _listed(folder: Path) -> BagFiles:
             files.append(there)
     bag.files = files
     return bag
+
+
+def _described_at_the_end(stream: BinaryIO) -> tuple[dict[int, Schema], dict[int, Topic]]:
+    """The topics in the summary of an MCAP file, for those whose first description is damaged; none: it has no end."""
+    try:
+        summary = SeekingReader(stream, record_size_limit=_RECORD_LIMIT).get_summary()
+    except (*_DAMAGED, OSError):
+        summary = None
+    stream.seek(0)
+    if summary is None:
+        return {}, {}
+    return summary.schemas, {
+        number: _topic_of(each, summary.schemas.get(each.schema_id)) for number, each in summary.channels.items()
+    }
+
+
+def _records_in(record: McapRecord, lost: Counter[str]) -> Iterator[McapRecord | tuple[int, int, bytes]]:
+    """The records of a chunk, or the record itself; a message as its channel, time of receipt and data. lost: counts
+    damaged chunks."""
+    if isinstance(record, Message):
+        yield record.channel_id, record.log_time, record.data
+    elif not isinstance(record, Chunk):
+        yield record
+    else:
+        try:
+            data = get_chunk_data_stream(record, validate_crc=True)[0].read(record.uncompressed_size)
+        except _DAMAGED:
+            lost["damaged chunks"] += 1
+            return
+        at = 0
+        while at < len(data):
+            opcode, length = _RECORD.unpack_from(data, at)
+            at += _RECORD.size
+            if opcode == Opcode.MESSAGE:
+                number, _, t_ns, _ = _MESSAGE.unpack_from(data, at)
+                yield number, t_ns, data[at + _MESSAGE.size : at + length]
+            elif kind := {Opcode.SCHEMA: Schema, Opcode.CHANNEL: Channel}.get(opcode):
+                yield kind.read(ReadDataStream(BytesIO(data[at : at + length])))
+            at += length
 
 
 @contextmanager

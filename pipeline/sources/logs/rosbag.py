@@ -204,9 +204,14 @@ def _numbers(name: str, value: Any) -> Iterator[tuple[str, float]]:
     if isinstance(value, bool | int | float | np.number):
         yield name, float(value)
     elif is_dataclass(value):
-        for each in fields(value):
-            if each.name not in _NO_VALUES and not each.name.startswith("__"):
-                yield from _numbers(f"{name}.{each.name}", getattr(value, each.name))
+        for each in _fields_of(type(value)):
+            yield from _numbers(f"{name}.{each}", getattr(value, each))
     elif isinstance(value, np.ndarray | list | tuple) and len(value) <= MOST_ELEMENTS:
         for number, element in enumerate(value):
             yield from _numbers(f"{name}[{number}]", element)
+
+
+@cache
+def _fields_of(kind: type[Any]) -> tuple[str, ...]:
+    """The fields of a message that may have numbers."""
+    return tuple(each.name for each in fields(kind) if each.name not in _NO_VALUES and not each.name.startswith("__"))

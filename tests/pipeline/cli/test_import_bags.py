@@ -125,6 +125,15 @@ def cut(folder: Path) -> Path:
     return path
 
 
+def a_damaged_first_chunk(folder: Path) -> Path:
+    path = good(folder)
+    data = bytearray(path.read_bytes())
+    at = data.index(b"\x04\0\0\0zstd") + 60
+    data[at : at + 8] = bytes(8)
+    path.write_bytes(data)
+    return path
+
+
 def compressed(folder: Path) -> Path:
     whole = good(folder)
     (folder / "bag_0.mcap.zstd").write_bytes(zstandard.compress(whole.read_bytes()))
@@ -173,6 +182,7 @@ def compressed_messages(folder: Path) -> Path:
             138,
             ["cut.mcap is cut or damaged after 276 messages; if there are more behind, `fantwin info --repair "],
         ),
+        (a_damaged_first_chunk, 184, ["bag_0.mcap: damaged chunks, left out: 1"]),
         (compressed, 200, [NO_METADATA]),
         (compressed_messages, 200, []),
     ],
