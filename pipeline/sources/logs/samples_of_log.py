@@ -60,17 +60,23 @@ def _unmeasured_in_words(unmeasured: Sequence[Unmeasured]) -> list[str]:
 
 
 def _continued(path: Path, series: Mapping[str, Series]) -> tuple[dict[str, Series], list[str]]:
-    """The fields with times that go on. Those of a topic share their times, which are looked at once."""
+    """The fields with times that go on, from when all of them do to when one no longer does: a command that is read in
+    part must not hold for the rest. Those of a topic share their times, which are looked at once."""
     found: dict[str, Series] = {}
     notes: list[str] = []
     t_ns, clock = np.zeros(0, np.int64), Clock(np.zeros(0, np.int64), np.zeros(0, np.bool_))
+    first_ns, last_ns = -np.inf, np.inf
     for name, each in series.items():
         if not np.array_equal(each.t_ns, t_ns):
             t_ns = each.t_ns
             clock = continued(path, t_ns, np.ones(len(t_ns), np.bool_), longest_part=True)
             notes += [f"{name}: {note}" for note in clock.notes]
+            good_ns = clock.t_ns[clock.is_good]
+            first_ns = first_ns if clock.is_good[:1].all() else max(first_ns, good_ns[0])
+            last_ns = last_ns if clock.is_good[-1:].all() else min(last_ns, good_ns[-1])
         found[name] = Series(clock.t_ns[clock.is_good], each.values[clock.is_good])
-    return found, notes
+    inside = {name: (each.t_ns >= first_ns) & (each.t_ns <= last_ns) for name, each in found.items()}
+    return {name: Series(each.t_ns[inside[name]], each.values[inside[name]]) for name, each in found.items()}, notes
 
 
 def _without_stops(

@@ -257,6 +257,21 @@ def test_stamps_are_the_times_where_all_messages_have_one_of_the_same_clock_that
         np.testing.assert_array_equal(t_ns, stamps_ns[1:])  # no command was known before the first
 
 
+def test_where_the_clock_of_a_bag_was_set_back_the_longest_part_is_read_and_no_command_holds_beyond(
+    tmp_path: Path,
+) -> None:
+    columns = np.column_stack([DUTY, DUTY])
+    write_rosbag(tmp_path / "bag", T_NS / 1e9, columns, 3000 * columns, mcap=False)
+    path = tmp_path / "bag" / "bag.db3"
+    with closing(sqlite3.connect(path)) as database:  # commands have no stamp; those of the speeds go on
+        database.execute("UPDATE messages SET timestamp = timestamp - 20000000000 WHERE id > 240")
+        database.commit()
+    samples, notes = imported(path, *ROSBAG)
+    assert samples == 120
+    assert notes[0].startswith("/fans/command.data[0]: time goes back by 19.950 s at row 121, from 2026-05-28 ")
+    assert notes[0].endswith(": the longest part is read, 80 rows are left out")
+
+
 def test_a_bag_of_ros_1_is_read_with_its_types(tmp_path: Path) -> None:
     from rosbags.rosbag1 import Writer  # noqa: PLC0415
     from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415
