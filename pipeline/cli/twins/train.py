@@ -155,7 +155,7 @@ def train(
             show_hints(training_data.hints)
         settings = replace(given, model=chosen[0].name)
         named = name or output.stem
-        with training_progress(training_data) as start, pool, twin_errors(training_data):
+        with training_progress(training_data) as start, pool:
             if type_twin:
                 trained = _place(type_twin, training_data, held_out, named, start(""))
             else:
