@@ -55,7 +55,7 @@ def test_a_lane_follows_the_states_to_the_sample_and_repeats_a_steady_one_for_vi
     scores, _ = made_up_tray(seconds=4, fans=2, faulty_fan=0, fault_s=(1.0, 2.0), gap_fan=1, gap_s=(2.5, 3.0))
     play(core_of(sink, fans=2), scores)
     assert sink.lane(0) == [(0, "normal"), (1, "suspect"), (1.5, "alarm"), (2, "returning"), (2.5, "normal")]
-    assert sink.lane(1) == [(0, "normal"), (2.5, "unknown: gap"), (3, "normal")]
+    assert sink.lane(1) == [(0, "normal"), (2.5, "unknown: samples are missing"), (3, "normal")]
     sink = FakeSink()
     play(core_of(sink, fans=1), made_up_tray(seconds=16, fans=1, faulty_fan=None, gap_fan=None)[0])
     times = [t for t, _ in sink.lane(0)]

@@ -19,6 +19,7 @@ from fantwin.schemas.health import (
     NamedFan,
     Note,
     Output,
+    Sweep,
 )
 from fantwin.schemas.messages import FURTHEST_T_NS, LARGEST_PERIOD_NS, Diagnosis, Message, StatedTacho
 
@@ -76,6 +77,9 @@ def scalar(name: str, hint: Any) -> st.SearchStrategy[Any]:
         if hint == tuple[record, ...]:
             values = {name: scalar(name, hint) for name, hint in other_fields(record).items()}
             return st.lists(st.builds(record, **values), max_size=3).map(tuple)
+    if hint == Sweep | None:
+        values = {name: scalar(name, hint) for name, hint in other_fields(Sweep).items()}
+        return st.none() | st.builds(Sweep, **values)
     if name in SCALARS:
         return SCALARS[name]
     if isinstance(hint, type) and issubclass(hint, OpenEnum):

@@ -89,7 +89,10 @@ def test_stopped_killed_or_ended_with_the_site_a_sweep_gives_the_fans_their_comm
     refused = ann.ask("POST", "/api/v1/fans/tray1/0/requests", {"action": "out_of_service"})
     assert refused[0] == 409 and refused[1]["error"].startswith("tray tray1 has no twin yet (")
     assert ann.ask("DELETE", SWEEP, {})[0] == 200
-    left = f"stopped; the fans are left at these commands: CPU (fan 0) {FORMER}, rear (fan 1) {FORMER}"
+    left = (
+        f"stopped; the fans are left at the commands they had before: CPU (fan 0) {FORMER}, rear (fan 1) {FORMER}; "
+        "`fantwin command` sets others"
+    )
     eventually(lambda: sweep()["ended"] == left, "it has stopped")
     eventually(lambda: commands() == [FORMER] * 2, "the fans have their commands after a stop")
 

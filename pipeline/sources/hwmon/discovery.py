@@ -107,7 +107,7 @@ def _without_drive(chip: ChipFolder, chips: Sequence[ChipFolder], fans: Sequence
         else "no chip has a pwm; a program that knows their command can push it (source push)"
     )
     which = "its fans" if len(fans) == len(chip.fans) else ", ".join(f"fan{fan}" for fan in fans)
-    return [f"{chip.name} has {lacks}, so the command of {which} is not known and they cannot be watched; {named}"]
+    return [f"{chip.name} has {lacks}, so the command of {which} is not known, without which no fan is judged; {named}"]
 
 
 def _unknown(name: str) -> str:
