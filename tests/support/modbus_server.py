@@ -9,13 +9,14 @@ import struct
 import threading
 import time
 import tty
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Awaitable, Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
+from pymodbus import FramerType
 from pymodbus.constants import ExcCodes
-from pymodbus.server import ModbusSerialServer, ModbusTcpServer
+from pymodbus.server import ModbusSerialServer, ModbusTcpServer, ModbusUdpServer
 from pymodbus.simulator import DataType, SimData, SimDevice
 
 from fantwin.simulation.tray import SimulatedTray
@@ -23,6 +24,8 @@ from fantwin.simulation.tray import SimulatedTray
 RPM = 30.0 / np.pi
 SPEED, COMMAND, CURRENT, VOLTAGE, TEMPERATURE, WANTED, REFUSED = 10, 11, 12, 14, 16, 100, 200
 """addresses: speed u16 rpm/2, command u16 per mille, current f32 A, voltage u32 mV low word first, temperature s16"""
+
+_Server: TypeAlias = ModbusTcpServer | ModbusUdpServer | ModbusSerialServer
 
 
 class Drive:
@@ -65,21 +68,25 @@ class Drive:
         return None
 
 
-def _devices(drives: dict[int, Drive]) -> list[SimDevice]:
+def _devices(drives: Mapping[int, Any]) -> list[SimDevice]:
     return [
-        SimDevice(unit, [SimData(0, count=300, values=0, datatype=DataType.REGISTERS)], action=drive.access)
+        SimDevice(
+            unit,
+            [SimData(0, count=getattr(drive, "count", 300), values=0, datatype=DataType.REGISTERS)],
+            action=drive.access,
+        )
         for unit, drive in drives.items()
     ]
 
 
 @contextmanager
-def _serving(start: Callable[[], Awaitable[ModbusTcpServer | ModbusSerialServer]]) -> Iterator[Any]:
+def _serving(start: Callable[[], Awaitable[_Server]]) -> Iterator[Any]:
     """Run a server in a thread; gives it when it listens."""
     loop = asyncio.new_event_loop()
     thread = threading.Thread(target=loop.run_forever)
     thread.start()
 
-    async def started() -> ModbusTcpServer | ModbusSerialServer:
+    async def started() -> _Server:
         server = await start()
         await server.serve_forever(background=True)
         return server
@@ -97,14 +104,20 @@ def _serving(start: Callable[[], Awaitable[ModbusTcpServer | ModbusSerialServer]
 
 
 @contextmanager
-def modbus_server(drives: dict[int, Drive], port: int = 0) -> Iterator[int]:
-    """Serve the drives by their unit ids; gives the TCP port."""
+def modbus_server(
+    drives: Mapping[int, Any],
+    port: int = 0,
+    framer: FramerType = FramerType.SOCKET,
+    kind: type[ModbusTcpServer | ModbusUdpServer] = ModbusTcpServer,
+) -> Iterator[int]:
+    """Serve the drives by their unit ids; gives the port."""
 
-    async def start() -> ModbusTcpServer:
-        return ModbusTcpServer(_devices(drives), address=("127.0.0.1", port))
+    async def start() -> ModbusTcpServer | ModbusUdpServer:
+        return kind(_devices(drives), address=("127.0.0.1", port), framer=framer)
 
     with _serving(start) as server:
-        yield server.transport.sockets[0].getsockname()[1]
+        is_udp = kind is ModbusUdpServer
+        yield server.transport.get_extra_info("sockname")[1] if is_udp else server.transport.sockets[0].getsockname()[1]
 
 
 class SerialLine:

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from typing import Any, ClassVar, Literal, Self
 from urllib.parse import urlsplit
 
 from pydantic import BaseModel, ConfigDict, Field, create_model, field_validator, model_validator
 
+from fantwin.pipeline.sources.modbus.models import MODELS
 from fantwin.pipeline.sources.polling import PolledConfig
 from fantwin.schemas.channels import CHANNELS, Channel
 
 TCP_PORT = 502
+MOST_REGISTERS = 120
+"""registers of one request; the protocol allows 125"""
 RegisterType = Literal["u16", "s16", "u32", "s32", "f32"]
 
 
@@ -26,6 +30,13 @@ class Register(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
     word_order: Literal["big", "little"] = Field(default="big", description="which of two registers comes first")
     scale: float = Field(default=1.0, description="value of one count of the register")
     offset: float = Field(default=0.0, description="value at a register of 0")
+    times: int | None = Field(
+        default=None,
+        ge=0,
+        le=65535,
+        description="address of a holding register that all this is multiplied by, read when the device is connected: "
+        "the full speed in rpm, where the speed is a share of it",
+    )
 
     @model_validator(mode="after")
     def _scale_is_not_zero(self) -> Self:
@@ -44,11 +55,25 @@ class ModbusFan(_Channels):
     model_config: ClassVar[ConfigDict] = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     unit: int = Field(default=1, ge=0, le=255, description="unit id of the fan's device")
+    model: str = Field(
+        default="",
+        description=f"fills speed, command and others from the documents of the maker: {', '.join(MODELS)}",
+    )
     speed: Register = Field(description="speed in rpm, after scale and offset")
     command: Register = Field(description="command that acts on the fan, in the command unit of the tray")
     write: Register | None = Field(
         default=None, description="where commands are written; without it, this fan takes none"
     )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _registers_of_its_model(cls, values: Any) -> Any:
+        name = values.get("model") if isinstance(values, Mapping) else None
+        if not name:
+            return values
+        if name not in MODELS:
+            raise ValueError(f"unknown model {str(name)[:40]!r}; known: {', '.join(MODELS)}")
+        return {**MODELS[name].registers, **{key: each for key, each in values.items() if each is not None}}
 
     def channel(self, channel: Channel) -> Register | None:
         """Where a channel is; None: the device does not measure it."""
@@ -66,6 +91,19 @@ class ModbusConfig(PolledConfig, frozen=True):
     serial: str = Field(
         default="19200 8E1",
         description="of a serial port: bits a second, data bits (8), parity (N, E or O) and stop bits (1 or 2)",
+    )
+    framer: Literal["", "socket", "rtu", "ascii"] = Field(
+        default="",
+        description="form of the frames; without it rtu on a serial port and socket (Modbus TCP) on a network; rtu for "
+        "a converter that passes frames of a serial line on",
+    )
+    udp: bool = Field(default=False, description="UDP instead of TCP")
+    most_registers: int = Field(
+        default=MOST_REGISTERS, ge=1, le=125, description="most registers in a request; after exception 2 or 3 fewer"
+    )
+    write_function: Literal[0, 6, 16] = Field(
+        default=0,
+        description="function that writes commands: 6 (one register) or 16; 0: 16, and 6 after exception 1",
     )
     fan: tuple[ModbusFan, ...] = Field(min_length=1, description="one [[tray.source.fan]] for each fan, in their order")
 
@@ -91,6 +129,15 @@ class ModbusConfig(PolledConfig, frozen=True):
         if not re.fullmatch("[1-9][0-9]{1,6} 8[NEO][12]", value):
             raise ValueError("give bits a second, 8 data bits, parity N, E or O, and 1 or 2 stop bits: 19200 8E1")
         return value
+
+    @model_validator(mode="after")
+    def _functions_fit(self) -> Self:
+        too_long = [fan for fan in self.fan if fan.write is not None and fan.write.type[1:] == "32"]
+        if self.write_function == 6 and too_long:
+            raise ValueError("write_function = 6 writes one register: a write of 32 bits needs 16")
+        if self.udp and self.port:
+            raise ValueError("udp = true is for a host, not for a serial port")
+        return self
 
     @property
     def baud(self) -> int:
