@@ -20,6 +20,7 @@ from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.extras import require
 from fantwin.pipeline.sources.modbus.config import ModbusConfig, ModbusFan, Register
 from fantwin.pipeline.sources.polling import DeviceError, Doubt, PollingSource
+from fantwin.pipeline.sources.serial.same_port import SamePort, ports_there
 from fantwin.pipeline.sources.source import Reading, SourceContext
 from fantwin.schemas.channels import CHANNELS, Channel
 
@@ -94,6 +95,7 @@ class ModbusSource(PollingSource):
             )
         self._config = config
         self._port = str(context.folder / config.port) if config.port else ""
+        self._same = SamePort(self._port)
         self._units_per_rpm = context.units_per_rpm
         self._names = context.names
         self._requests = _requests(config.fan, config.most_registers)
@@ -125,6 +127,8 @@ class ModbusSource(PollingSource):
         self._client = client = self._made_client()
         if not client.connect():
             raise self._lost("cannot be opened or reached")
+        if self._port and (change := self._same.opened(str(client.comm_params.host))):
+            self.note("port_changed", change)
         for fan in self._config.fan:
             for register in (*_registers(fan), fan.write):
                 if register is not None and register.times is not None:
@@ -195,7 +199,9 @@ class ModbusSource(PollingSource):
     def check(self) -> list[str]:
         """Problems before the start: the serial port is not there. A host is not asked."""
         if self._port and not os.access(self._port, os.R_OK | os.W_OK):
-            return [f"{self._port}: no such port, or this user may not open it (group dialout); correct source.line"]
+            there = f"; {ports_there(self._port)}" if not Path(self._port).exists() else ""
+            why = f"no such port, or this user may not open it (group dialout); correct source.line{there}"
+            return [f"{self._port}: {why}"]
         return []
 
     def _made_client(self) -> ModbusBaseSyncClient:
@@ -210,7 +216,7 @@ class ModbusSource(PollingSource):
             framer = FramerType(config.framer or "socket")
             return made(host, port=port, framer=framer, timeout=TIMEOUT_S, retries=0)
         return ModbusSerialClient(
-            self._port,
+            self._same.path(),
             framer=FramerType(config.framer or "rtu"),
             baudrate=config.baud,
             parity=config.serial[-2],
@@ -298,7 +304,7 @@ class ModbusSource(PollingSource):
     def _lost(self, what: str) -> DeviceError:
         """The error of a lost line. For a port that no longer exists it says so, whatever failed."""
         if self._port and not Path(self._port).exists():
-            what = "no such port, is it unplugged?"
+            what = f"no such port, is it unplugged? {ports_there(self._port)}"
         return DeviceError(f"{what}; waiting for it", is_lost=True)
 
     def _words_of(self, unit: int, register: Register) -> list[int] | None:

@@ -16,7 +16,11 @@ class SerialConfig(SourceConfig, frozen=True):
     """A serial port and the form of the wire protocol on it (docs/reference/wire-protocol.md)."""
 
     kind: Literal["serial"] = "serial"
-    port: str = Field(default="", description="serial port, for example /dev/ttyUSB0; only acquisition needs it")
+    port: str = Field(
+        default="",
+        description="serial port, /dev/ttyUSB0, or /dev/serial/by-id/NAME, which stays the same; only acquisition "
+        "needs it",
+    )
     baud: int = Field(default=115200, gt=0, description="bits a second")
     protocol: Literal["binary", "text"] = Field(default="binary", description="form of the frames on the line")
 

@@ -9,6 +9,7 @@ from typing import TypeAlias
 
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.sources.found import Found
+from fantwin.pipeline.sources.serial.same_port import lasting_name, listed_ports
 from fantwin.schemas import wire
 from fantwin.schemas.wire.binary import decode_binary
 from fantwin.schemas.wire.text import decode_text
@@ -29,9 +30,7 @@ Heard: TypeAlias = tuple[wire.Protocol, list[wire.Sample]]
 
 def serial_ports() -> tuple[dict[str, str], list[str]]:
     """The ports with a known device, with its description, and all others."""
-    from serial.tools import list_ports  # noqa: PLC0415  slow to import, and needed here only
-
-    listed = sorted(list_ports.comports())
+    listed = listed_ports()
     known = {each.device: each.description for each in listed if (each.description, each.hwid) != (_UNKNOWN, _UNKNOWN)}
     return known, [each.device for each in listed if each.device not in known]
 
@@ -66,7 +65,7 @@ def _tray(port: str, protocol: str, fans: int, unit: str, command_max: float) ->
         "fans": fans,
         "speed_unit": unit,
         "command_max": command_max,
-        "source": {"kind": "serial", "port": port, "protocol": protocol},
+        "source": {"kind": "serial", "port": lasting_name(port), "protocol": protocol},
     }
 
 

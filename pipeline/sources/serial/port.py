@@ -16,7 +16,8 @@ from dataclasses import dataclass
 
 import serial
 
-from fantwin.pipeline.sources.source import LinkDown, LinkUp
+from fantwin.pipeline.sources.serial.same_port import SamePort, ports_there
+from fantwin.pipeline.sources.source import LinkDown, LinkUp, Noted
 from fantwin.pipeline.timebase.host_clock import HOST_CLOCK
 
 READ_TIMEOUT_S = 0.1
@@ -27,7 +28,6 @@ REOPEN_DELAY_S = 0.1  # doubles with every attempt, up to the maximum
 REOPEN_DELAY_MAX_S = 2.0
 
 _OPEN_PROBLEMS = {
-    errno.ENOENT: "no such port; waiting for it; check [[tray]] port",
     errno.EACCES: "not allowed to open it; add this user to the port's group (often dialout)",
     errno.EPERM: "not allowed to open it; add this user to the port's group (often dialout)",
     errno.EBUSY: "in use by another program; stop that one",
@@ -47,17 +47,18 @@ class ReceivedBytes:
 
 
 class SerialPort:
-    """Delivers `LinkUp`, `ReceivedBytes` and `LinkDown`, and takes bytes to write."""
+    """Delivers `LinkUp`, `ReceivedBytes`, `LinkDown` and what else is noted of the port, and takes bytes to write."""
 
     def __init__(self, port: str, baud: int) -> None:
         self._name = port
+        self._same = SamePort(port)
         self._baud = baud
         self._port: serial.Serial | None = None
         self._port_lock = threading.Lock()  # a port is not closed while it is written to
         self._stopping = threading.Event()
         self._thread: threading.Thread | None = None
 
-    def start(self, deliver: Callable[[LinkUp | LinkDown | ReceivedBytes], None]) -> None:
+    def start(self, deliver: Callable[[LinkUp | LinkDown | Noted | ReceivedBytes], None]) -> None:
         """Open and read in a thread; wait for a port that does not exist yet."""
         self._thread = threading.Thread(target=self._run, args=(deliver,), name=f"read {self._name}", daemon=True)
         self._thread.start()
@@ -78,18 +79,21 @@ class SerialPort:
             except _PORT_ERRORS:
                 return False  # the reading thread gets the same error and reports it
 
-    def _run(self, deliver: Callable[[LinkUp | LinkDown | ReceivedBytes], None]) -> None:
+    def _run(self, deliver: Callable[[LinkUp | LinkDown | Noted | ReceivedBytes], None]) -> None:
         delay_s = REOPEN_DELAY_S
         reported = ""
         while not self._stopping.is_set():
             try:
-                port = self._open()
+                path = self._same.path()
+                port = self._open(path)
             except _PORT_ERRORS as error:
-                reason = _open_problem(error)
+                reason = _open_problem(error, self._name)
             else:
                 with self._port_lock:
                     self._port = port
                 deliver(LinkUp())
+                if change := self._same.opened(path):
+                    deliver(Noted("port_changed", change))
                 if self._read_until_disconnected(port, deliver):
                     delay_s = (
                         REOPEN_DELAY_S  # it worked; only a port that opens and gives no byte is retried more slowly
@@ -106,10 +110,8 @@ class SerialPort:
             self._stopping.wait(delay_s)
             delay_s = min(2 * delay_s, REOPEN_DELAY_MAX_S)
 
-    def _open(self) -> serial.Serial:
-        return serial.Serial(
-            self._name, self._baud, timeout=READ_TIMEOUT_S, write_timeout=WRITE_TIMEOUT_S, exclusive=True
-        )
+    def _open(self, path: str) -> serial.Serial:
+        return serial.Serial(path, self._baud, timeout=READ_TIMEOUT_S, write_timeout=WRITE_TIMEOUT_S, exclusive=True)
 
     def _read_until_disconnected(self, port: serial.Serial, deliver: Callable[[ReceivedBytes], None]) -> bool:
         """Deliver until the device is disconnected or `stop` is called; returns whether any byte arrived."""
@@ -138,9 +140,11 @@ class SerialPort:
                 return any_received
 
 
-def _open_problem(error: Exception) -> str:
+def _open_problem(error: Exception, port: str) -> str:
     """Problem with the port and what to do, in one line."""
     number = error.errno if isinstance(error, OSError) else None
+    if number == errno.ENOENT:
+        return f"no such port; waiting for it; check [[tray]] port; {ports_there(port)}"
     return (
         _OPEN_PROBLEMS.get(number or 0) or f"cannot be opened ({error}); waiting for it; check [[tray]] port and baud"
     )

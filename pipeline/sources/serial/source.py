@@ -11,9 +11,11 @@ from typing import Protocol
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.sources.serial.config import SerialConfig
 from fantwin.pipeline.sources.serial.port import ReceivedBytes, SerialPort
+from fantwin.pipeline.sources.serial.same_port import ports_there
 from fantwin.pipeline.sources.source import (
     LinkDown,
     LinkUp,
+    Noted,
     Reading,
     ReadingBatch,
     Rejected,
@@ -21,6 +23,7 @@ from fantwin.pipeline.sources.source import (
     SourceEvent,
     too_many_fans,
 )
+from fantwin.pipeline.timebase.host_clock import HOST_CLOCK
 from fantwin.schemas import wire
 from fantwin.schemas.wire import DEVICE_COUNTERS, UINT16, UINT32, DeviceCounters
 
@@ -80,7 +83,7 @@ _REFUSED_SAMPLES = (wire.FaultKind.WRONG_FAN_COUNT, wire.FaultKind.BAD_COMMAND)
 class ByteLink(Protocol):
     """Carries bytes both ways and knows no protocol. `SerialPort` says what each method does."""
 
-    def start(self, deliver: Callable[[LinkUp | LinkDown | ReceivedBytes], None]) -> None: ...  # noqa: D102
+    def start(self, deliver: Callable[[LinkUp | LinkDown | Noted | ReceivedBytes], None]) -> None: ...  # noqa: D102
     def stop(self) -> None: ...  # noqa: D102
     def write(self, data: bytes) -> bool: ...  # noqa: D102
 
@@ -123,8 +126,10 @@ class SerialSource:
         """Deliver what has already arrived, then end."""
         self._link.stop()
 
-    def decode(self, item: LinkUp | LinkDown | ReceivedBytes) -> SourceEvent:
+    def decode(self, item: LinkUp | LinkDown | Noted | ReceivedBytes) -> SourceEvent:
         """Decode the readings that these bytes complete. Bytes that are not a frame are `Rejected`."""
+        if isinstance(item, Noted):
+            return ReadingBatch(HOST_CLOCK.now_ns(), (item,))
         if not isinstance(item, ReceivedBytes):
             self._decoder.reset()
             self._device_counters.connection_interrupted()
@@ -153,7 +158,8 @@ class SerialSource:
     def check(self) -> list[str]:
         """Problems before the start: the port does not exist or may not be opened."""
         if not self._path.exists():
-            return [f"{self._path}: no such port; connect the device, or correct [[tray]] port"]
+            there = ports_there(str(self._path))
+            return [f"{self._path}: no such port; connect the device, or correct [[tray]] port; {there}"]
         if not os.access(self._path, os.R_OK | os.W_OK):
             return [f"{self._path}: this user may not read and write it; join its group (often dialout)"]
         return []

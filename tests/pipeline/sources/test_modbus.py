@@ -305,5 +305,5 @@ def test_a_source_over_a_serial_port_opens_it_with_the_settings_of_the_line() ->
     line = made._made_client().comm_params
     assert (line.host, line.baudrate, line.parity, line.stopbits) == ("/dev/ttyUSB7", 9600, "O", 2)
     assert made.check()[0].startswith("/dev/ttyUSB7: no such port")
-    with pytest.raises(DeviceError, match=r"^no such port, is it unplugged\?; waiting for it$"):
+    with pytest.raises(DeviceError, match=r"^no such port, is it unplugged\? ports there: .*; waiting for it$"):
         made.connect()

@@ -6,14 +6,17 @@ import os
 import threading
 from collections.abc import Iterator
 from pathlib import Path
-from typing import cast
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 import serial
 
+from fantwin.pipeline.sources.serial import same_port
+from fantwin.pipeline.sources.serial.discovery import discover_device
 from fantwin.pipeline.sources.serial.port import ReceivedBytes, SerialPort
 from fantwin.pipeline.sources.serial.source import DeviceCounterSteps
-from fantwin.pipeline.sources.source import LinkDown, LinkUp
+from fantwin.pipeline.sources.source import LinkDown, LinkUp, Noted
 from fantwin.schemas.wire import UINT32, DeviceCounters
 from tests.support.running_chain import eventually
 from tests.support.source_worlds import SerialWorld
@@ -26,7 +29,7 @@ class Line(SerialPort):
 
     def __init__(self, path: Path) -> None:
         super().__init__(str(path), 115200)
-        self.items: list[LinkUp | LinkDown | ReceivedBytes] = []
+        self.items: list[LinkUp | LinkDown | Noted | ReceivedBytes] = []
 
     def begin(self) -> None:
         self.start(self.items.append)
@@ -69,6 +72,84 @@ def test_a_port_in_use_is_opened_when_it_is_free_and_a_file_that_is_no_port_is_r
     no_port.stop()
 
 
+class Computer:
+    """Ports of USB devices, pseudo-terminals at paths such as ttyUSB0, as the system lists them."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.worlds: dict[str, SerialWorld] = {}
+        self.serials: dict[str, str | None] = {}
+
+    def plug_in(self, name: str, serial_number: str | None) -> Path:
+        world = self.worlds[name] = SerialWorld(self.folder)
+        world.path = self.folder / name
+        world.plug_in()
+        self.serials[name] = serial_number
+        return world.path
+
+    def unplug(self, name: str) -> None:
+        self.worlds.pop(name).unplug()
+
+    def listed(self) -> list[Any]:
+        return [
+            SimpleNamespace(
+                device=os.path.realpath(world.path), vid=1, pid=2, serial_number=self.serials[name], location="1-1"
+            )
+            for name, world in self.worlds.items()
+        ]
+
+
+@pytest.fixture
+def computer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Computer]:
+    computer = Computer(tmp_path)
+    monkeypatch.setattr(same_port, "listed_ports", computer.listed)
+    yield computer
+    for name in list(computer.worlds):
+        computer.unplug(name)
+
+
+@pytest.mark.parametrize("serial_number", ["A50285BI", None], ids=["by its number", "by its socket"])
+def test_a_board_that_comes_back_as_another_port_is_found_again(computer: Computer, serial_number: str | None) -> None:
+    line = Line(computer.plug_in("ttyUSB0", serial_number))
+    line.begin()
+    computer.unplug("ttyUSB0")
+    eventually(lambda: isinstance(line.items[-1], LinkDown), "it is gone")
+    computer.plug_in("ttyUSB1", serial_number)
+    eventually(lambda: isinstance(line.items[-1], Noted), "it is back")
+    line.stop()
+    first, second = computer.folder / "ttyUSB0", os.path.realpath(computer.folder / "ttyUSB1")
+    assert line.items[-2:] == [
+        LinkUp(),
+        Noted("port_changed", f'{first} is {second} since it was plugged in again: write port = "{second}"'),
+    ]
+
+
+def test_another_board_is_not_taken_for_the_one_that_is_gone_but_named(computer: Computer) -> None:
+    line = Line(computer.plug_in("ttyUSB0", "A"))
+    line.begin()
+    computer.unplug("ttyUSB0")
+    other = computer.plug_in("ttyUSB1", "B")
+    eventually(lambda: "ports there" in getattr(line.items[-1], "reason", ""), "it is looked for")
+    (reason,) = {item.reason for item in line.items if isinstance(item, LinkDown) and "ports there" in item.reason}
+    assert (
+        reason.startswith("no such port; waiting for it; check [[tray]] port; ports there: ") and str(other) in reason
+    )
+    computer.plug_in("ttyUSB0", "C")
+    eventually(lambda: isinstance(line.items[-1], Noted), "a board is there")
+    line.stop()
+    assert line.items[-1] == Noted("port_changed", f"another device than before is at {line._name}")
+
+
+def test_the_name_that_lasts_is_written(computer: Computer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    port = computer.plug_in("ttyUSB0", "A")
+    monkeypatch.setattr(same_port, "BY_ID", tmp_path / "by-id")
+    assert same_port.lasting_name(str(port)) == str(port)
+    (tmp_path / "by-id").mkdir()
+    (link := tmp_path / "by-id" / "usb-FTDI_A-if00-port0").symlink_to(os.path.realpath(port))
+    found = discover_device(str(port), listen_s=0.05)
+    assert found.tray["source"]["port"] == str(link) and f'port = "{link}"' in found.toml
+
+
 def test_stop_delivers_the_bytes_that_had_arrived_and_no_more(
     device: SerialWorld, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -77,7 +158,7 @@ def test_stop_delivers_the_bytes_that_had_arrived_and_no_more(
     stopper = threading.Thread(target=line.stop)
     data = bytes(range(256)) * 12
 
-    def deliver(item: LinkUp | LinkDown | ReceivedBytes) -> None:
+    def deliver(item: LinkUp | LinkDown | Noted | ReceivedBytes) -> None:
         line.items.append(item)
         if isinstance(item, ReceivedBytes) and not stopper.ident:  # as a stage that is behind when it is stopped
             os.write(device.far, data)
@@ -97,7 +178,7 @@ def test_stop_delivers_the_bytes_that_had_arrived_and_no_more(
 def test_stop_ends_although_the_device_never_pauses(device: SerialWorld) -> None:
     line = Line(device.path)
 
-    def deliver(item: LinkUp | LinkDown | ReceivedBytes) -> None:
+    def deliver(item: LinkUp | LinkDown | Noted | ReceivedBytes) -> None:
         line.items.append(item)
         os.write(device.far, b"and on")
 
