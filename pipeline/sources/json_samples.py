@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
+from fantwin.pipeline.sources.own_json import OwnJson, number_of, of_fan, value_at
 from fantwin.pipeline.sources.source import Reading, ReadingBatch, Rejected
 from fantwin.pipeline.timebase.device_clock import NS_PER_US, UINT32
 from fantwin.pipeline.timebase.receipt_times import ReceiptTimes
@@ -44,24 +45,44 @@ def parse_samples(text: bytes) -> list[TimedReading | Rejected]:
     Raises:
         JsonSamplesError: it is no JSON, too long, or neither a sample nor a list of samples.
     """
+    return _timed(_listed(text), _timed_reading)
+
+
+def parse_own_samples(
+    text: bytes, own: OwnJson, time_key: str, fans: int, speed_unit: str
+) -> list[TimedReading | Rejected]:
+    """Parse samples in a form that is the device's own: where the values of its fans are says `own`.
+
+    Raises:
+        JsonSamplesError: it is no JSON, or too long.
+    """
+    return _timed(_listed(text), lambda sample: _own_reading(sample, own, time_key, fans, speed_unit))
+
+
+def _listed(text: bytes) -> list[Any]:
+    """The samples of a text: one, a list, or an object with nothing but a list."""
     if len(text) > LARGEST_BYTES:
         raise JsonSamplesError(f"{len(text)} bytes: at most {LARGEST_BYTES} are accepted at once")
     try:
         value = json.loads(text)
     except (ValueError, RecursionError) as error:
         raise JsonSamplesError(f"no JSON: {str(error) or 'nested too deeply'}") from error
-    if isinstance(value, dict) and set(value) == {"samples"}:
-        value = value["samples"]
+    if isinstance(value, dict) and set(value) in ({"samples"}, {"metrics"}):
+        (value,) = value.values()
     samples = value if isinstance(value, list) else [value]
     if len(samples) > MOST_SAMPLES:
         raise JsonSamplesError(f"{len(samples)} samples: at most {MOST_SAMPLES} are accepted at once")
+    return samples
+
+
+def _timed(samples: list[Any], reading_of: Callable[[Any], TimedReading]) -> list[TimedReading | Rejected]:
     found: list[TimedReading | Rejected] = []
     newest_t_ns: int | None = None
     for sample in samples:
         if not isinstance(sample, dict):
             raise JsonSamplesError('a sample is {"t": ..., "command": [...], "speed": [...]}, or a list of such')
         try:
-            timed = _timed_reading(sample)
+            timed = reading_of(sample)
         except ValueError as error:
             found.append(Rejected("malformed", str(error), is_sample=True))
             continue
@@ -107,6 +128,22 @@ def _timed_reading(sample: Mapping[str, Any]) -> TimedReading:
         columns.pop("command"), columns.pop("speed"), clock_us, _sequence(sample.get("sequence")), measured=columns
     )
     return TimedReading(reading, t_ns)
+
+
+def _own_reading(sample: Mapping[str, Any], own: OwnJson, time_key: str, fans: int, speed_unit: str) -> TimedReading:
+    def values(key: str, **how: Any) -> tuple[float, ...]:
+        found: list[float] = []
+        for fan in range(fans):
+            pointer = of_fan(key, fan)
+            value = value_at(sample, pointer)
+            if (number := number_of(value, **how)) is None:
+                raise ValueError(f"{pointer} has {str(value)[:40]!r}, which is no number")
+            found.append(number)
+        return tuple(found)
+
+    t_ns = _time_ns(value_at(sample, time_key)) if time_key else None
+    clock_us = None if t_ns is None else (t_ns + NS_PER_US // 2) // NS_PER_US % UINT32
+    return TimedReading(Reading(values(own.command_key), values(own.speed_key, speed_unit=speed_unit), clock_us), t_ns)
 
 
 def _by_column(sample: Mapping[str, Any]) -> dict[str, list[Any]]:

@@ -11,14 +11,24 @@ import json
 import math
 from collections import deque
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.extras import require
 from fantwin.pipeline.sources.json_samples import JsonSamplesError, batches_of, parse_samples
 from fantwin.pipeline.sources.mqtt.client import NOT_REACHED, connection_problems, new_client, refusal
-from fantwin.pipeline.sources.mqtt.config import MqttConfig, is_of_each_fan, of_fan
+from fantwin.pipeline.sources.mqtt.config import MqttConfig, are_of_each_fan, topic_of
 from fantwin.pipeline.sources.mqtt.connection import KEEPALIVE_S
+from fantwin.pipeline.sources.mqtt.fan_values import FanValues
+from fantwin.pipeline.sources.own_json import (
+    LONGEST_NUMBER,
+    OwnJson,
+    is_of_each_fan,
+    is_switched_on,
+    number_of,
+    of_fan,
+    value_at,
+)
 from fantwin.pipeline.sources.source import (
     LinkDown,
     LinkUp,
@@ -35,52 +45,18 @@ if TYPE_CHECKING:
     from paho.mqtt.client import Client, MQTTMessage
 
 
-class FanValues:
-    """Single numbers of a tray's fans that arrive one by one, put together to readings of the tray.
+class _Place(NamedTuple):
+    """What a topic has of a fan: speed, command or switch, at a pointer of the device's own JSON or alone."""
 
-    A command is held until the next one. A reading is complete when each fan has a new speed; if a fan gives the next
-    one before all others have theirs, the reading ends without these: they have none in it. So a fan that is silent
-    does not keep the others.
-    """
-
-    def __init__(self, fans: int) -> None:
-        self._command = [math.nan] * fans
-        self._speed: list[float | None] = [None] * fans
-        """speeds of the reading that is not complete; None: no new one yet"""
-
-    @property
-    def lacks_commands(self) -> bool:
-        """Return whether the command of a fan is not known yet: then there are no readings."""
-        return any(map(math.isnan, self._command))
-
-    def set_command(self, fan: int, command: float) -> Reading | None:
-        """The command of a fan from now on; the reading that this ends, if speeds of before wait."""
-        if command == self._command[fan]:
-            return None
-        ended = self._end() if any(speed is not None for speed in self._speed) else None
-        self._command[fan] = command
-        return ended
-
-    def set_speed(self, fan: int, speed: float) -> list[Reading]:
-        """The next speed of a fan; the readings that it ends or completes."""
-        readings = [self._end()] if self._speed[fan] is not None else []
-        self._speed[fan] = speed
-        if all(speed is not None for speed in self._speed):
-            readings.append(self._end())
-        return [reading for reading in readings if reading is not None]
-
-    def _end(self) -> Reading | None:
-        speeds = tuple(math.nan if speed is None else speed for speed in self._speed)
-        self._speed = [None] * len(self._speed)
-        return None if self.lacks_commands else Reading(tuple(self._command), speeds)
+    what: str
+    fan: int
+    pointer: str
 
 
 MOST_RECENT = 64
 """messages by which one that the broker sends again is recognised"""
 QOS = 1
 """of subscriptions and commands: the broker keeps what comes while this client is away, and sends it again"""
-LONGEST_NUMBER = 40
-"""characters"""
 
 
 class MqttSource:
@@ -96,15 +72,13 @@ class MqttSource:
         self._config = config
         self._deliver: Callable[[SourceEvent], None] = lambda _event: None
         self._receipts = ReceiptTimes()
-        self._values = FanValues(context.fans)
-        self._topics = {
-            of_fan(pattern, fan): (fan, pattern == config.topic)
-            for pattern in config.patterns
-            for fan in range(context.fans if config.has_values else 1)
-        }
-        """subscribed topics; of numbers, with the fan of the topic, and whether it is its speed"""
-        if config.has_values and len(self._topics) < 2 * context.fans:
-            raise UserError("source mqtt: topic and command_topic of two fans are the same topic")
+        self._values = FanValues(context.fans, has_switch="switch" in config.places)
+        self._speed_unit = context.speed_unit
+        self._command_of_on = context.limits.command_max if context.limits else 1.0
+        self._topics: dict[str, list[_Place]] = {config.patterns[0]: []}
+        """subscribed topics, and what they have of fans"""
+        if config.has_values:
+            self._topics = _topics(config, context.fans)
         self._recent: deque[tuple[str, bytes]] = deque(maxlen=MOST_RECENT)
         self._is_up = False
         self._is_refused = False
@@ -126,8 +100,8 @@ class MqttSource:
     @property
     def settings_to_check(self) -> str:
         """Settings that may differ from what is published."""
-        names = ("topic", "command_topic") if self._config.has_values else ("topic",)
-        return ", ".join(f"{name} = {getattr(self._config, name)!r}" for name in names)
+        names = ("topic", *OwnJson.model_fields, "command_topic", "switch_topic", "switch_key")
+        return ", ".join(f"{name} = {value!r}" for name in names if (value := getattr(self._config, name)))
 
     def start(self, deliver: Callable[[SourceEvent], None]) -> None:
         """Connect in a thread of its own, again and again where it fails."""
@@ -149,15 +123,15 @@ class MqttSource:
             return self._config.why_no_commands
         if not self._is_up:
             return f"{self.name} is not connected"
-        if not is_of_each_fan(topic):
+        if not are_of_each_fan(topic):
             given = {"command": command, "set_point": set_point}
             values = {name: [None if math.isnan(x) else x for x in each] for name, each in given.items() if each}
-            is_sent = self._publish(topic, json.dumps(values))
+            is_sent = self._publish(str(topic), json.dumps(values))
         elif not all(map(math.isnan, set_point)):
             return f"{topic} takes commands, no set-points"
         else:
             is_sent = all(
-                self._publish(of_fan(topic, fan), f"{value:.9g}")
+                self._publish(topic_of(topic, fan), f"{value:.9g}")
                 for fan, value in enumerate(command)
                 if not math.isnan(value)
             )
@@ -241,19 +215,80 @@ class MqttSource:
         return batches_of(found, received_t_ns, self._receipts, len(payload))
 
     def _items_of_value(self, topic: str, payload: bytes, is_retained: bool) -> list[Reading | Rejected]:
-        value = _number(payload)
-        if value is None:
-            return [Rejected("malformed", f"{topic} has {payload[:LONGEST_NUMBER]!r}, which is no number")]
-        fan, is_speed = self._topics[topic]
-        if not is_speed:
-            ended = self._values.set_command(fan, value)
-            return [ended] if ended else []
+        """What the values of a message end or complete: those of commands first, as they hold for its speeds."""
+        found: list[tuple[_Place, Any]] = []
+        failures: list[str] = []
+        for place in self._topics[topic]:
+            try:
+                found.append((place, value_at(_json(payload), place.pointer) if place.pointer else _text(payload)))
+            except ValueError as error:
+                failures.append(str(error))
+        items: list[Reading | Rejected] = []
+        if not found:  # a device may leave out what has not changed
+            items.append(Rejected("malformed", f"{topic} has {failures[0]}"))
+        for place, value in found:
+            items += self._items_of(topic, place, value, is_retained)
+        return items
+
+    def _items_of(self, topic: str, place: _Place, value: Any, is_retained: bool) -> list[Reading | Rejected]:
+        at = f" at {place.pointer}" if place.pointer else ""
+        no_number = Rejected("malformed", f"{topic} has {value!r:.40}{at}, which is no {_KIND[place.what]}")
+        if place.what == "switch":
+            is_on = is_switched_on(value)
+            ended = None if is_on is None else self._values.set_switch(place.fan, is_on)
+            return [no_number] if is_on is None else [ended] if ended else []
+        if place.what == "command":
+            command = number_of(value, on=self._command_of_on)
+            ended = None if command is None else self._values.set_command(place.fan, command)
+            return [no_number] if command is None else [ended] if ended else []
+        speed = number_of(value, speed_unit=self._speed_unit)
+        if speed is None:
+            return [no_number]
         if is_retained:
             return [Rejected("retained", "a speed of before", harmless=True)]
-        readings = self._values.set_speed(fan, value)
+        readings = self._values.set_speed(place.fan, speed)
         if not readings and self._values.lacks_commands:
             return [Rejected("no_command", "the command of a fan is not known yet", harmless=True)]
         return list(readings)
+
+
+_KIND = {"speed": "speed", "command": "number", "switch": "ON or OFF"}
+
+
+def _topics(config: MqttConfig, fans: int) -> dict[str, list[_Place]]:
+    """What each topic has, commands before speeds. Raises UserError where the topics are not those of so many fans."""
+    found: dict[str, list[_Place]] = {}
+    for what in ("switch", "command", "speed"):
+        if what not in config.places:
+            continue
+        topics, key = config.places[what]
+        if not isinstance(topics, str) and len(topics) != fans:
+            raise UserError(f"fans = {fans}, and the list of topics of the {what} names {len(topics)}")
+        if what == "speed" and fans > 1 and not (are_of_each_fan(topics) or is_of_each_fan(key)):
+            raise UserError(
+                f"topic has one speed for {fans} fans: number them in braces, as in plant/fan{{1}}/rpm, or list topics"
+            )
+        for fan in range(fans):
+            found.setdefault(topic_of(topics, fan), []).append(_Place(what, fan, of_fan(key, fan)))
+    for topic, places in found.items():
+        speeds = [place.pointer for place in places if place.what == "speed"]
+        commands = {place.pointer for place in places if place.what == "command"}
+        if len(set(speeds)) < len(speeds) or commands & set(speeds):
+            raise UserError(
+                f"source mqtt: {topic} would be the speed of two fans, or speed and command: give each a place"
+            )
+    return found
+
+
+def _json(payload: bytes) -> Any:
+    try:
+        return json.loads(payload)
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"no JSON ({str(error) or 'nested too deeply'}): {payload[:LONGEST_NUMBER]!r}") from error
+
+
+def _text(payload: bytes) -> str:
+    return payload[: LONGEST_NUMBER + 1].decode(errors="replace")
 
 
 def _unshared(pattern: str) -> str:
@@ -263,16 +298,3 @@ def _unshared(pattern: str) -> str:
 
 def _refused(received_t_ns: int, payload: bytes, rejected: Rejected) -> ReadingBatch:
     return ReadingBatch(received_t_ns, (rejected,), len(payload))
-
-
-def _number(payload: bytes) -> float | None:
-    """The number that a payload has; NaN where it says that there is none, None where it is no number."""
-    text = payload[: LONGEST_NUMBER + 1].decode(errors="replace").strip()
-    if len(text) > LONGEST_NUMBER:
-        return None
-    if text.lower() in ("", "null", "nan", "none"):
-        return math.nan
-    try:
-        return float(text)
-    except ValueError:
-        return None

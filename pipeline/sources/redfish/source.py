@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from fantwin.pipeline.errors import refusals
 from fantwin.pipeline.extras import require
+from fantwin.pipeline.sources.own_json import NothingThereError, value_at
 from fantwin.pipeline.sources.polling import DeviceError, PollingSource
 from fantwin.pipeline.sources.redfish.config import RedfishConfig
 from fantwin.pipeline.sources.source import Reading, Rejected, SourceContext
@@ -230,8 +231,10 @@ def _place(fan: Json) -> str:
 
 def _number(value: Any, pointer: str) -> float:
     """The number at a JSON pointer; NaN if there is none."""
-    for part in pointer.strip("/").split("/"):
-        value = value.get(part.replace("~1", "/").replace("~0", "~")) if isinstance(value, Mapping) else None
+    try:
+        value = value_at(value, pointer)
+    except NothingThereError:
+        return math.nan
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
     return float(value) if is_number else math.nan
 

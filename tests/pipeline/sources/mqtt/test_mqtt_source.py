@@ -15,10 +15,14 @@ import paho.mqtt.client as paho
 import pytest
 from paho.mqtt.enums import CallbackAPIVersion
 
+from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.sources.mqtt.config import MqttConfig
-from fantwin.pipeline.sources.mqtt.source import FanValues, MqttSource
+from fantwin.pipeline.sources.mqtt.fan_values import FanValues
+from fantwin.pipeline.sources.mqtt.source import MqttSource
 from fantwin.pipeline.sources.source import (
     LinkUp,
+    Reading,
+    ReadingLimits,
     Rejected,
     SourceContext,
 )
@@ -121,6 +125,150 @@ def test_numbers_of_single_fans_become_readings_of_the_tray(broker: MqttBroker, 
     assert kinds == ["retained", "no_command", "malformed"]
     publish("plant/fan1/pwm", "", retain=True)
     publish("plant/fan2/rpm", "", retain=True)
+
+
+ITHO = b'{"temp":21.2,"Fan setpoint (rpm)":1221,"Fan speed (rpm)":1218,"Ventilation setpoint (%)":42}'
+SENSOR = b'{"Time":"2026-06-09T00:10:36","COUNTER":{"C1":2412},"RPM":1206}'
+STATE = b'{"Time":"2026-06-09T00:10:36","POWER1":"%s","FanSpeed":3}'
+NAN = math.nan
+
+
+@pytest.mark.parametrize(
+    ("fans", "settings", "messages", "expected"),
+    [
+        pytest.param(
+            1,
+            {"topic": "v", "speed_key": "/Fan speed (rpm)", "command_key": "/Ventilation setpoint (%)"},
+            [("v", ITHO), ("v", ITHO.replace(b"42", b"50"))],
+            [((42.0,), (1218.0,)), ((50.0,), (1218.0,))],
+            id="one JSON with both (ithowifi)",
+        ),
+        pytest.param(
+            1,
+            {
+                "topic": "tele/fan/SENSOR",
+                "speed_key": "/RPM",
+                "command_topic": "tele/fan/STATE",
+                "command_key": "/FanSpeed",
+                "switch_key": "/POWER1",
+            },
+            [
+                ("tele/fan/SENSOR", SENSOR),
+                ("tele/fan/STATE", STATE % b"OFF"),
+                ("tele/fan/SENSOR", SENSOR),
+                ("tele/fan/STATE", STATE % b"ON"),
+                ("tele/fan/SENSOR", SENSOR),
+            ],
+            ["no_command", ((0.0,), (1206.0,)), ((3.0,), (1206.0,))],
+            id="a fan that is off although its level is 3 (Tasmota)",
+        ),
+        pytest.param(
+            1,
+            {
+                "topic": "room/sensor/fan_speed/state",
+                "command_topic": "room/fan/supply/speed_level/state",
+                "switch_topic": "room/fan/supply/state",
+            },
+            [("room/fan/supply/state", b"ON"), ("room/fan/supply/speed_level/state", b"40")]
+            + [("room/sensor/fan_speed/state", payload) for payload in (b"1206.00", b"nan", b"fast")],
+            [((40.0,), (1206.0,)), ((40.0,), (NAN,)), "malformed"],
+            id="topics with names (ESPHome)",
+        ),
+        pytest.param(
+            1,
+            {"topic": "rpm", "command_topic": "z2m/fan", "command_key": "/speed", "switch_key": "/state"},
+            [
+                ("z2m/fan", b'{"state":"ON","speed":254}'),
+                ("rpm", b"1200"),
+                ("z2m/fan", b'{"state":"OFF"}'),
+                ("rpm", b"9"),
+            ],
+            [((254.0,), (1200.0,)), ((0.0,), (9.0,))],
+            id="a message without what has not changed (Zigbee2MQTT)",
+        ),
+        pytest.param(
+            1,
+            {"topic": "speed", "command_topic": "power"},
+            [
+                ("power", b"on"),
+                ("speed", b"1 206"),
+                ("speed", b"1206 rpm"),
+                ("power", b"off"),
+                ("speed", b"20.1 Hz"),
+                ("power", b"unavailable"),
+                ("speed", b"unavailable"),
+                ("power", b"42 %"),
+                ("speed", b"1200 1/min"),
+            ],
+            [
+                "malformed",
+                ((100.0,), (1206.0,)),
+                "malformed",
+                "unknown_command",
+                ((42.0,), (1200.0,)),
+            ],
+            id="ON and OFF, units, unavailable",
+        ),
+        pytest.param(
+            2,
+            {"topic": "rack", "speed_key": "/fans/{0}/rpm", "command_key": "/fans/{0}/pwm"},
+            [
+                ("rack", b'{"fans":[{"rpm":"900","pwm":10},{"rpm":null,"pwm":20}]}'),
+                ("rack", b'{"fans":3}'),
+                ("rack", b"x"),
+            ],
+            [((10.0, 20.0), (900.0, NAN)), "malformed", "malformed"],
+            id="all fans in one JSON",
+        ),
+        pytest.param(
+            2,
+            {"topic": ["cpu/rpm", "rear/rpm"], "command_topic": "pwm"},
+            [("pwm", b"60"), ("cpu/rpm", b"900"), ("rear/rpm", b"1100")],
+            [((60.0, 60.0), (900.0, 1100.0))],
+            id="a list of topics, one command for all",
+        ),
+    ],
+)
+def test_what_devices_publish_is_read_as_they_do(
+    fans: int, settings: dict[str, Any], messages: list[tuple[str, bytes]], expected: list[Any]
+) -> None:
+    config = MqttConfig.model_validate({"url": "mqtt://broker", **settings})
+    limits = ReadingLimits(fans, 0.0, 300.0 if "z2m" in str(settings) else 100.0, 20_000.0)
+    source = MqttSource(config, SourceContext(fans, "rpm", Path(), limits=limits))
+    items = [item for topic, text in messages for batch in source.batches(topic, text, 0) for item in batch.items]
+    found: list[Any] = []
+    for item in items:
+        assert isinstance(item, Reading | Rejected)
+        refused = item if isinstance(item, Rejected) else limits.why_refused(item)
+        found.append(refused.kind if refused else (getattr(item, "command", ()), getattr(item, "speed", ())))
+    assert str(found) == str(expected)
+
+
+def test_an_old_speed_that_the_broker_had_kept_is_left_out_and_its_command_is_taken() -> None:
+    settings = {"topic": "v", "speed_key": "/Fan speed (rpm)", "command_key": "/Ventilation setpoint (%)"}
+    config = MqttConfig.model_validate({"url": "mqtt://broker", **settings})
+    source = MqttSource(config, SourceContext(1, "rpm", Path()))
+    ((kept,),) = (batch.items for batch in source.batches("v", ITHO, 0, is_retained=True))
+    assert isinstance(kept, Rejected) and kept.kind == "retained"
+    ((partial,),) = (batch.items for batch in source.batches("v", b'{"Fan speed (rpm)": 900}', 0))
+    assert isinstance(partial, Reading) and (partial.command, partial.speed) == ((42.0,), (900.0,))
+    ((nothing,),) = (batch.items for batch in source.batches("v", b'{"temp":21.2}', 0))
+    assert (
+        isinstance(nothing, Rejected) and nothing.detail == "v has nothing at /Ventilation setpoint (%); there is: temp"
+    )
+
+
+@pytest.mark.parametrize(
+    ("fans", "settings", "line"),
+    [
+        (2, {"topic": "a", "command_topic": "b"}, "topic has one speed for 2 fans: number them in braces"),
+        (2, {"topic": ["a"], "command_topic": "b"}, "fans = 2, and the list of topics of the speed names 1"),
+        (2, {"topic": ["a", "a"], "command_topic": "b"}, "a would be the speed of two fans"),
+    ],
+)
+def test_topics_that_are_not_those_of_the_fans_are_refused(fans: int, settings: dict[str, Any], line: str) -> None:
+    with pytest.raises(UserError, match=line):
+        MqttSource(MqttConfig.model_validate({"url": "mqtt://broker", **settings}), SourceContext(fans, "rpm", Path()))
 
 
 def test_a_changed_command_ends_the_reading_that_waits() -> None:

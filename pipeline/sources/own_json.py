@@ -1,0 +1,96 @@
+"""Values in the form of the devices themselves: where in their JSON they are, and numbers as they write them."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from pydantic import BaseModel, Field
+
+from fantwin.schemas.units import RAD_S_PER_UNIT
+
+LONGEST_NUMBER = 40
+"""characters"""
+_FAN = re.compile(r"\{(\d+)\}")
+"""the place of the number of a fan in a topic or pointer, with that of the tray's first fan"""
+_NUMBER = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(1/min|\D{0,8})")
+_NONE = ("", "null", "nan", "none", "unavailable", "unknown", "offline")
+_SWITCHED = {"on": True, "true": True, "off": False, "false": False}
+_UNITS = {"rpm": "rpm", "1/min": "rpm", "r/min": "rpm", "min-1": "rpm", "u/min": "rpm", "rad/s": "rad/s"}
+MOST_KEYS_SHOWN = 8
+
+
+class OwnJson(BaseModel, frozen=True):
+    """Pointers into JSON of the device's own form, `/fans/{0}/rpm` with the number of the first fan in braces."""
+
+    speed_key: str = Field(
+        default="", pattern="^(/.*)?$", description="where the speed is in the device's own JSON (JSON pointer)"
+    )
+    command_key: str = Field(default="", pattern="^(/.*)?$", description="where its command is")
+
+
+def of_fan(text: str, fan: int) -> str:
+    """The topic or pointer of a fan of the tray, counted from 0."""
+    return _FAN.sub(lambda first: str(int(first[1]) + fan), text)
+
+
+def is_of_each_fan(text: str) -> bool:
+    """Whether each fan has one of its own."""
+    return _FAN.search(text) is not None
+
+
+def has_other_braces(text: str) -> bool:
+    """Whether braces hold anything else than a number."""
+    return bool(set("{}") & set(_FAN.sub("", text)))
+
+
+class NothingThereError(ValueError):
+    """JSON has no value at a pointer: one line with what it has."""
+
+
+def value_at(value: Any, pointer: str) -> Any:
+    """The value at a JSON pointer (RFC 6901). Raises NothingThereError."""
+    here = value
+    for part in pointer.split("/")[1:]:
+        key = part.replace("~1", "/").replace("~0", "~")
+        if isinstance(here, Mapping) and key in here:
+            here = here[key]
+        elif isinstance(here, Sequence) and not isinstance(here, str) and key.isdecimal() and int(key) < len(here):
+            here = here[int(key)]
+        else:
+            there = list(map(str, here)) if isinstance(here, Mapping) else []
+            more = ", ..." if len(there) > MOST_KEYS_SHOWN else ""
+            raise NothingThereError(f"nothing at {pointer}; there is: {', '.join(there[:MOST_KEYS_SHOWN])}{more}")
+    return here
+
+
+def number_of(value: Any, *, speed_unit: str = "", on: float = math.nan) -> float | None:
+    """The number that a device writes; NaN where it says that there is none, None where it is no number.
+
+    speed_unit: of the tray, to which a speed with its unit is converted; empty for a command, whose unit says nothing.
+    on: the command of a fan that is switched on, for values such as ON and true; NaN: they are no number.
+    """
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        return float(value)
+    text = "" if value is None else str(value).strip().lower() if isinstance(value, str | bool) else "-"
+    if text in _NONE:
+        return math.nan
+    if text in _SWITCHED and not math.isnan(on):
+        return on if _SWITCHED[text] else 0.0
+    found = _NUMBER.fullmatch(text if len(text) <= LONGEST_NUMBER else "-")
+    unit = found[2].strip() if found else "-"
+    if found is None or (speed_unit and unit and unit not in _UNITS):
+        return None
+    factor = RAD_S_PER_UNIT[_UNITS[unit]] / RAD_S_PER_UNIT[speed_unit] if unit and speed_unit else 1.0
+    return float(found[1]) * factor
+
+
+def is_switched_on(value: Any) -> bool | None:
+    """Whether a fan is on, by values such as ON, off, true and 0; None where that is not said."""
+    text = str(value).strip().lower()
+    if text in _SWITCHED:
+        return _SWITCHED[text]
+    number = number_of(value)
+    return None if number is None or math.isnan(number) else number != 0.0
