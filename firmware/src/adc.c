@@ -1,3 +1,4 @@
+#ifdef __AVR__
 #include "adc.h"
 
 #include <avr/io.h>
@@ -50,3 +51,4 @@ float adc_supply_v(void)
 {
     return supply_v;
 }
+#endif

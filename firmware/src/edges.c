@@ -1,3 +1,4 @@
+#ifdef __AVR__
 #include "edges.h"
 
 #include <avr/interrupt.h>
@@ -52,3 +53,4 @@ bool edges_take(uint32_t *at_us, uint8_t *levels)
     from = (at + 1) % SIZE;
     return true;
 }
+#endif

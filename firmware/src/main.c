@@ -1,37 +1,22 @@
 /* Four fans on an ATmega328P: takes commands and set-points, sends samples. docs/how-to/firmware.md. */
+#ifdef __AVR__ /* firmware.ino is for other boards, with the same parts without hardware */
 #include <avr/interrupt.h>
 #include <avr/io.h>
 #include <avr/sleep.h>
 #include <avr/wdt.h>
-#include <math.h>
 #include <util/atomic.h>
 
 #include "adc.h"
 #include "counters.h"
 #include "edges.h"
-#include "fan.h"
-#include "frame.h"
 #include "pwm_clock.h"
 #include "tacho.h"
+#include "tray.h"
 #include "uart.h"
 
 #define SAMPLE_MS (1000 / RATE_HZ)
-#define WINDOW_SAMPLES (WINDOW_MS / SAMPLE_MS)
 
-volatile counters_t counters;
 static tacho_t tachos[FANS];
-static fan_t fans[FANS];
-static host_t host;
-static receiver_t receiver;
-static uint32_t sequence;
-
-/* What the next sample is to apply; NaN: nothing new. A command acts from a sample on, so that the sample says exactly
- * since when. */
-static float new_duty[FANS], new_set_point[FANS];
-
-/* Where pulses are counted: at the start of the window, samples since then, and what the last window gave. */
-static uint16_t pulses_before[FANS], samples_of_window;
-static float counted_rpm[FANS];
 
 /* The watchdog stays on after its reset, with its shortest time: off before anything else. */
 static uint8_t reset_causes __attribute__((section(".noinit")));
@@ -46,12 +31,9 @@ void keep_reset_causes(void)
 static void start(void)
 {
     pwm_clock_start();
-    for (uint8_t fan = 0; fan < FANS; fan++) {
-        fan_start(&fans[fan]);
-        new_duty[fan] = new_set_point[fan] = NAN;
+    tray_start();
+    for (uint8_t fan = 0; fan < FANS; fan++)
         tacho_start(&tachos[fan], true, 0);
-        counted_rpm[fan] = NAN;
-    }
     edges_start();
     adc_start();
     uart_start();
@@ -75,75 +57,11 @@ static void take_edges(void)
     }
 }
 
-static void take_frame(const float values[FANS], float into[FANS], float instead_of[FANS])
-{
-    count(&counters.frames);
-    host_commanded(&host);
-    for (uint8_t fan = 0; fan < FANS; fan++) {
-        if (isnan(values[fan]))
-            continue;
-        into[fan] = values[fan];
-        instead_of[fan] = NAN;
-    }
-}
-
 static void take_input(void)
 {
     int16_t byte;
-    float values[FANS];
-    while ((byte = uart_receive()) >= 0) {
-        switch (receiver_take(&receiver, byte, values)) {
-        case RECEIVED_NOTHING:
-            break;
-        case RECEIVED_COMMAND:
-            take_frame(values, new_duty, new_set_point);
-            break;
-        case RECEIVED_SET_POINT:
-            take_frame(values, new_set_point, new_duty);
-            break;
-        case RECEIVED_BAD_LENGTH:
-            count(&counters.bad_length);
-            break;
-        case RECEIVED_BAD_CRC:
-            count(&counters.bad_crc);
-            break;
-        case RECEIVED_WRONG_KIND:
-            count(&counters.wrong_kind);
-            break;
-        case RECEIVED_BAD_VALUE:
-            count(&counters.bad_value);
-            break;
-        }
-    }
-}
-
-/* The duty of a fan from this sample on, 0 to 1. */
-static float drive(uint8_t fan, float speed_rpm, bool host_is_silent)
-{
-    if (host_is_silent)
-        fan_set_duty(&fans[fan], 1.0f);
-    else if (!isnan(new_duty[fan]))
-        fan_set_duty(&fans[fan], new_duty[fan]);
-    else if (!isnan(new_set_point[fan]))
-        fan_set_speed(&fans[fan], new_set_point[fan], speed_rpm);
-    new_duty[fan] = new_set_point[fan] = NAN;
-    fan_step(&fans[fan], speed_rpm);
-    uint16_t level = fan_level(&fans[fan]);
-    pwm_set(fan, level);
-    return (float)level / PWM_STEPS;
-}
-
-/* What the host is shown of the speed. */
-static float measured_rpm(uint8_t fan, uint16_t pulses, float period_rpm)
-{
-    if (!MEASURE_COUNT)
-        return period_rpm;
-    if (samples_of_window == 0) {
-        if (sequence > 0) /* a window has ended */
-            counted_rpm[fan] = tacho_count_rpm(pulses - pulses_before[fan]);
-        pulses_before[fan] = pulses;
-    }
-    return counted_rpm[fan];
+    while ((byte = uart_receive()) >= 0)
+        tray_take(byte);
 }
 
 /* Once a second: what the board has counted. If the line has no room, the next sample tries again. */
@@ -161,33 +79,29 @@ static void send_counters(void)
             counts[i] = ((const volatile uint16_t *)&counters)[i];
         }
     uint8_t line[COUNTERS_LINE_BYTES];
-    if (uart_send(line, counters_encode(sequence / RATE_HZ, counts, line)))
+    if (uart_send(line, counters_encode(tray_sequence() / RATE_HZ, counts, line)))
         samples_before = 0;
 }
 
 static void sample(void)
 {
-    sample_t sample = {.sequence = sequence, .supply_v = adc_supply_v()};
-    bool host_is_silent = host_falls_silent(&host);
-    if (host_is_silent)
-        count(&counters.host_silences);
-    uint16_t glitches = 0;
+    measured_t measured = {.supply_v = adc_supply_v()};
+    uint16_t glitches = 0, levels[FANS];
     take_edges();
-    sample.clock_us = clock_us(); /* after all edges that have been taken */
+    measured.clock_us = clock_us(); /* after all edges that have been taken */
     for (uint8_t fan = 0; fan < FANS; fan++) {
         tacho_t *tacho = &tachos[fan];
-        tacho_settle(tacho, sample.clock_us);
-        float period_rpm = tacho_period_rpm(tacho, sample.clock_us);
-        sample.speed_rpm[fan] = measured_rpm(fan, tacho->pulses, period_rpm);
-        sample.command[fan] = drive(fan, period_rpm, host_is_silent);
+        tacho_settle(tacho, measured.clock_us);
+        measured.period_rpm[fan] = tacho_period_rpm(tacho, measured.clock_us);
+        measured.pulses[fan] = tacho->pulses;
         glitches += tacho->glitches;
     }
     counters.glitches = glitches;
-    sequence++;
-    if (++samples_of_window == WINDOW_SAMPLES)
-        samples_of_window = 0;
     uint8_t line[SAMPLE_LINE_BYTES];
-    if (!uart_send(line, sample_encode(&sample, line)))
+    uint8_t length = tray_sample(&measured, levels, line);
+    for (uint8_t fan = 0; fan < FANS; fan++)
+        pwm_set(fan, levels[fan]);
+    if (!uart_send(line, length))
         count(&counters.unsent_samples);
     send_counters();
 }
@@ -213,3 +127,5 @@ int main(void)
             sleep_mode(); /* until the next interrupt, 40 us at most */
     }
 }
+
+#endif

@@ -1,3 +1,4 @@
+#ifdef __AVR__
 #include "pwm_clock.h"
 
 #include <avr/interrupt.h>
@@ -122,3 +123,4 @@ uint32_t clock_us(void)
     }
     return overflows_us + counter / CLOCK_CYCLES_PER_US;
 }
+#endif

@@ -40,7 +40,11 @@
 #define LOOP_TIME_S 0.8
 #endif
 #ifndef SUPPLY /* 1: the supply of the fans is measured */
+#if defined(ESP32) || defined(ARDUINO_ARCH_RP2040)
+#define SUPPLY 0
+#else
 #define SUPPLY 1
+#endif
 #endif
 #ifndef DIVIDER_HIGH_OHM /* from the supply to the pin */
 #define DIVIDER_HIGH_OHM 33000

@@ -1,3 +1,4 @@
+#ifdef __AVR__
 #include "uart.h"
 
 #include <avr/interrupt.h>
@@ -83,3 +84,4 @@ int16_t uart_receive(void)
     in_from = (at + 1) % IN_SIZE;
     return byte;
 }
+#endif
