@@ -32,7 +32,7 @@ class HttpConfig(SourceConfig, OwnJson, frozen=True):
     time_key: str = Field(
         default="",
         pattern="^(/.*)?$",
-        description="where the time is in the device's own JSON, s since 1970 or a date; without it, that of receipt",
+        description="where its time is, s since 1970 or a date; without it, that of receipt",
     )
 
     @property

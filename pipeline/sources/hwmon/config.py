@@ -33,13 +33,13 @@ class HwmonConfig(PolledConfig, frozen=True):
     )
     pwms: tuple[Number | DriveName, ...] = Field(
         default=(),
-        description="what drives each fan, or one for all: N of pwmN; nct6798/pwm2 of another chip; fan1_output or "
-        "fan1_target, a speed in rpm. Without it, pwmN with the numbers of the fans",
+        description="what drives each fan, or one for all: N of pwmN; nct6798/pwm2; fan1_output or fan1_target, a "
+        "speed in rpm. Without it, pwmN with the numbers of the fans",
     )
     speed_scales: tuple[Annotated[float, Field(gt=0, le=100)], ...] = Field(
         default=(),
-        description="factor for fanN_input of each fan, or one for all: 0.5 where a fan gives four pulses a revolution "
-        "and the chip counts on two",
+        description="factor for fanN_input of each fan, or one for all: 0.5 for four pulses a revolution where the "
+        "chip takes two",
     )
     temperatures: tuple[Number, ...] = Field(
         default=(), description="N of tempN_input, the temperature of the air at each fan, or one for all"

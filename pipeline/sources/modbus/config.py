@@ -34,8 +34,8 @@ class Register(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
         default=None,
         ge=0,
         le=65535,
-        description="address of a holding register that all this is multiplied by, read when the device is connected: "
-        "the full speed in rpm, where the speed is a share of it",
+        description="address of a holding register that multiplies this, read at each connection: the full speed, "
+        "where the speed is a share of it",
     )
 
     @model_validator(mode="after")
@@ -57,7 +57,7 @@ class ModbusFan(_Channels):
     unit: int = Field(default=1, ge=0, le=255, description="unit id of the fan's device")
     model: str = Field(
         default="",
-        description=f"fills speed, command and others from the documents of the maker: {', '.join(MODELS)}",
+        description="fills the registers that are not named, from documents of its maker: ebm-papst and others",
     )
     speed: Register = Field(description="speed in rpm, after scale and offset")
     command: Register = Field(description="command that acts on the fan, in the command unit of the tray")
@@ -94,8 +94,7 @@ class ModbusConfig(PolledConfig, frozen=True):
     )
     framer: Literal["", "socket", "rtu", "ascii"] = Field(
         default="",
-        description="form of the frames; without it rtu on a serial port and socket (Modbus TCP) on a network; rtu for "
-        "a converter that passes frames of a serial line on",
+        description="form of the frames; without it rtu on a serial port, socket (Modbus TCP) on a network",
     )
     udp: bool = Field(default=False, description="UDP instead of TCP")
     most_registers: int = Field(
@@ -103,7 +102,7 @@ class ModbusConfig(PolledConfig, frozen=True):
     )
     write_function: Literal[0, 6, 16] = Field(
         default=0,
-        description="function that writes commands: 6 (one register) or 16; 0: 16, and 6 after exception 1",
+        description="function that writes commands; 0: 16, and 6 after exception 1",
     )
     fan: tuple[ModbusFan, ...] = Field(min_length=1, description="one [[tray.source.fan]] for each fan, in their order")
 

@@ -31,8 +31,8 @@ class MqttConfig(SourceConfig, BrokerSettings, OwnJson, frozen=True):
     kind: Literal["mqtt"] = "mqtt"
     topic: Topics = Field(
         min_length=1,
-        description="topic of samples in JSON, which may have the wildcards + and #; or of the speed of a fan: "
-        "plant/fan{1}/rpm, with the number of the first fan in braces, or a list with a topic for each fan",
+        description="topic of samples in JSON, which may have the wildcards + and #; or of the speed of a fan, with "
+        "the number of the first one in braces: plant/fan{1}/rpm; or a list of these",
     )
     command_topic: Topics = Field(
         default="", description="topic of the command of a fan, where topic is that of its speed; or one for all fans"
@@ -43,8 +43,8 @@ class MqttConfig(SourceConfig, BrokerSettings, OwnJson, frozen=True):
     switch_key: str = Field(default="", pattern="^(/.*)?$", description="where that is in the device's own JSON")
     send_topic: Topics = Field(
         default="",
-        description="topic to which commands of `fantwin command` are sent, as JSON, or as a number for each fan if it "
-        "is of each fan; without it no commands are sent",
+        description="topic for commands of `fantwin command`, as JSON, or as a number where it is of each fan; without "
+        "it none are sent",
     )
     client_id: str = Field(
         default="",
