@@ -26,6 +26,8 @@ from fantwin.schemas.tacho import Tacho, tacho_of_each_fan
 from fantwin.schemas.topics import tray_of
 from fantwin.schemas.units import NS_PER_S
 
+LONGEST_HELD_NS = NS_PER_S // 2
+"""time for which a command that is not known is taken for the last one"""
 MERGED_MESSAGES = 1024
 """so many are decoded as one while a recording is read"""
 
@@ -226,12 +228,17 @@ def _times(messages: Iterable[Raw]) -> tuple[Array, Array]:
 
 
 def _in_order(t_ns: Array, command: Array, speed_rad_s: Array, auxiliary: Mapping[str, Array]) -> Columns:
-    """Samples by rising time from the first known command on; of samples with the same time, the first received."""
+    """Samples by rising time whose commands are known; of samples with the same time, the first received.
+
+    A command is held for LONGEST_HELD_NS: later, something that is not known drives the fan.
+    """
     if np.all(np.diff(t_ns) > 0) and not np.isnan(command).any():
         return t_ns, command, speed_rad_s, auxiliary  # as nearly all are; saves copies
     t_ns, first = np.unique(t_ns, return_index=True)
+    rows = np.where(np.isnan(command[first]), 0, np.arange(len(first))[:, np.newaxis])
+    held_ns = t_ns[:, np.newaxis] - t_ns[np.maximum.accumulate(rows, axis=0)]
     command = hold_last(command[first])
-    known = ~np.any(np.isnan(command), axis=1)
+    known = ~np.any(np.isnan(command) | (held_ns > LONGEST_HELD_NS), axis=1)
     of_known = {name: of[first][known] for name, of in auxiliary.items()}
     return t_ns[known], command[known], speed_rad_s[first][known], of_known
 

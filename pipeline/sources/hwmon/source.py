@@ -272,7 +272,7 @@ class HwmonSource(PollingSource):
         if (mode := drive.mode()) not in (None, MANUAL):
             if not commanded.is_taken_back:
                 self.note(
-                    "taken_back", f"{drive.name}: mode {mode} instead of manual, which the next command sets again"
+                    "taken_back", f"{drive.name}: mode {mode} instead of manual; the next command sets it again"
                 )
             commanded.is_taken_back = True
         elif value == commanded.last and value != commanded.settled:  # a chip may need a poll to show what it was told

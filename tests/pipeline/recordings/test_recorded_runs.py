@@ -74,6 +74,13 @@ def test_missing_speeds_stay_missing_and_missing_commands_are_held(tmp_path):
     np.testing.assert_array_equal(run.speed_rad_s[:, 0], [np.nan, 3, 4])
 
 
+def test_a_fan_that_something_else_drives_for_long_is_no_example_of_its_last_command(tmp_path):
+    times = START_NS + np.arange(8) * 250_000_000
+    command = [5.0, np.nan, np.nan, np.nan, np.nan, 7.0, 7.0, 7.0]
+    (run,) = read_runs(record(tmp_path / "r.mcap", raw(times, command=command))).runs
+    assert run.command[:, 0].tolist() == [5, 5, 5, 7, 7, 7] and np.diff(run.t_s).max() == 0.75
+
+
 def test_a_tray_is_chosen_where_there_are_several(tmp_path):
     times = START_NS + np.arange(3) * 10**7
     path = record(tmp_path / "r.mcap", raw(times, tray="a"), raw(times, tray="b", fans=2))

@@ -207,7 +207,7 @@ def test_a_fan_that_firmware_or_a_program_has_taken_back_is_said_and_taken_over_
     (folder / "pwm1_enable").write_text("5")  # the computer wakes from suspend
     (folder / "pwm1").write_text("118")
     assert [reading(made).command[0] for _ in range(3)] == [118.0] * 3, "what the chip shows is the command"
-    again = "taken_back: nct6798/pwm1: mode 5 instead of manual, which the next command sets again"
+    again = "taken_back: nct6798/pwm1: mode 5 instead of manual; the next command sets it again"
     assert noted.noted == [again], "once, however often it is polled"
     assert (folder / "pwm1_enable").read_text() == "5", "the firmware may have done it against heat"
     made.write((210.0, NAN))
