@@ -271,9 +271,7 @@ class HwmonSource(PollingSource):
             return
         if (mode := drive.mode()) not in (None, MANUAL):
             if not commanded.is_taken_back:
-                self.note(
-                    "taken_back", f"{drive.name}: mode {mode} instead of manual; the next command sets it again"
-                )
+                self.note("taken_back", f"{drive.name}: mode {mode} instead of manual; the next command sets it again")
             commanded.is_taken_back = True
         elif value == commanded.last and value != commanded.settled:  # a chip may need a poll to show what it was told
             was = commanded.value if commanded.settled is None else commanded.settled

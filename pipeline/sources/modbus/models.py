@@ -29,25 +29,29 @@ _ECBLUE = (
 _SAVE = "Systemair, SAVE Modbus variable list, revision 36, 2.3 airflow control"
 
 
-def _input(address: int, **more: Any) -> dict[str, Any]:
+def input_register(address: int, **more: Any) -> dict[str, Any]:
+    """One that is read by function 4."""
     return {"address": address, "table": "input", **more}
 
 
 MODELS: Mapping[str, Model] = {
     "ebm-papst": Model(
-        {"speed": _input(0xD010, scale=1 / 64000, times=0xD119), "command": _input(0xD019, scale=100 / 65536)},
+        {
+            "speed": input_register(0xD010, scale=1 / 64000, times=0xD119),
+            "command": input_register(0xD019, scale=100 / 65536),
+        },
         "modulation level of the motor, %, in each mode of operation",
         "ebm-papst Mulfingen, MODBUS parameter specification ACE V1.00, 2.25 and 3.8; Lite V5.01, 3.1 and 3.17",
     ),
     "ziehl-abegg-ecblue": Model(
-        {"speed": _input(14), "command": {"address": 2}, "current": _input(15, scale=0.01)},
+        {"speed": input_register(14), "command": {"address": 2}, "current": input_register(15, scale=0.01)},
         "speed reference by the bus, %; not the one of an analog input",
         f"{_ECBLUE} L-BAL-E076, 3.3",
     ),
     "systemair-save-supply": Model(
-        {"speed": _input(12400), "command": _input(14000)}, "output to the supply air fan, %", _SAVE
+        {"speed": input_register(12400), "command": input_register(14000)}, "output to the supply air fan, %", _SAVE
     ),
     "systemair-save-extract": Model(
-        {"speed": _input(12401), "command": _input(14001)}, "output to the extract air fan, %", _SAVE
+        {"speed": input_register(12401), "command": input_register(14001)}, "output to the extract air fan, %", _SAVE
     ),
 }

@@ -280,7 +280,7 @@ class ModbusSource(PollingSource):
             code = answer.exception_code
             if code != 1:
                 break
-        raise DeviceError(refusal(unit, "", register.address, code, value))
+        raise DeviceError(refusal(unit, "holding", register.address, code, value))
 
     def _answer(self, unit: int, request: Any) -> Any:
         from pymodbus.exceptions import ConnectionException, ModbusException  # noqa: PLC0415

@@ -260,6 +260,40 @@ def test_a_pwm_that_is_not_in_force_is_no_command(root: Path) -> None:
     assert isinstance(made.read(), Rejected)
 
 
+@pytest.mark.parametrize(
+    ("chip", "files", "drive", "why"),
+    [
+        ("it8720", {"pwm1": 80, "pwm1_enable": 2}, 1, "in automatic mode (pwm1_enable is 2) it8720/pwm1 is not the"),
+        ("it8720", {"pwm1": 80, "pwm1_enable": 1}, 1, ""),
+        ("it8728", {"pwm1": 80, "pwm1_enable": 2}, 1, ""),
+        ("nct6687", {"pwm1": 80, "pwm1_enable": 99}, 1, ""),
+        (
+            "amdgpu",
+            {"fan1_target": 80, "fan1_enable": 0},
+            "fan1_target",
+            "amdgpu/fan1_target is not in force: fan1_enable",
+        ),
+        ("amdgpu", {"fan1_target": 80, "fan1_enable": 1}, "fan1_target", ""),
+        ("macsmc_hwmon", {"fan1_target": 80, "fan1_manual": 0}, "fan1_target", ""),
+        ("uniwill", {"pwm1": "", "pwm1_enable": 2}, 1, "uniwill/pwm1 cannot be read"),
+        ("corsairpsu", {}, 1, "corsairpsu has no pwm: name what drives its fans in pwms"),
+    ],
+)
+def test_the_command_of_a_chip_is_the_one_in_force_or_none(
+    root: Path, chip: str, files: dict[str, int | str], drive: int | str, why: str
+) -> None:
+    add_chip(root, 0, chip, "x/0", {"fan1_input": 900, **files})
+    made = connected(root, 1, chip=chip, pwms=[drive])
+    if not files:
+        assert made.check()[0].startswith(why)
+        return
+    found = made.read()
+    if why:
+        assert isinstance(found, Rejected) and found.detail.startswith(why)
+    else:
+        assert isinstance(found, Reading) and found.command == (80.0,)
+
+
 def test_set_points_in_rpm_and_pwms_of_other_chips_drive_fans(root: Path) -> None:
     files: dict[str, int | str] = {}
     for fan, rpm in ((1, 1147), (2, 1760)):

@@ -18,8 +18,8 @@ from fantwin.pipeline.config.loading import parse_config
 from fantwin.pipeline.runtime.stage import Context
 from fantwin.pipeline.sources.found import as_toml
 from fantwin.pipeline.sources.modbus.config import ModbusConfig
-from fantwin.pipeline.sources.modbus.models import MODELS, _input
-from fantwin.pipeline.sources.modbus.source import ModbusSource
+from fantwin.pipeline.sources.modbus.models import MODELS, input_register
+from fantwin.pipeline.sources.modbus.source import ModbusSource, refusal
 from fantwin.pipeline.sources.polling import DeviceError
 from fantwin.pipeline.sources.source import SourceContext
 from fantwin.schemas import channels as of
@@ -135,6 +135,31 @@ def test_doctor_names_the_setting_of_a_speed_that_is_none_and_what_was_read() ->
     assert [(ok, line.endswith("cannot be opened or reached")) for ok, line in gone] == [(False, True)]
 
 
+@pytest.mark.parametrize(
+    ("written", "address", "code", "line"),
+    [
+        (None, 3, 1, "exception 1: it does not know this function); correct table"),
+        (None, 3, 3, "exception 3: it does not take this value, or so many registers); correct most_registers"),
+        (0.5, 3, 2, "exception 2: it has no such register); correct write"),
+        (0.5, 3, 4, "exception 4: it has failed to do it)"),
+        (None, 3, 6, "exception 6: it is busy); correct period_s"),
+        (None, 3, 11, "exception 11: the unit does not answer the gateway); correct unit"),
+        (None, 3, 99, "exception 99: see its manual)"),
+        (
+            None,
+            30_012,
+            2,
+            "exception 2: it has no such register; addresses begin at 0 and have no leading 3: 12, or 11)",
+        ),
+    ],
+)
+def test_exceptions_are_said_in_words_with_the_setting(
+    written: float | None, address: int, code: int, line: str
+) -> None:
+    what = f"holding register {address}" if written is None else f"{written} for register {address}"
+    assert refusal(7, "holding", address, code, written) == f"unit 7 refuses {what} ({line}"
+
+
 class Limited:
     """A device of one fan, like an ebm-papst of 1,500 rpm at half its speed, that knows less than others.
 
@@ -207,7 +232,11 @@ def test_a_request_that_is_too_long_is_halved_and_a_register_that_is_not_there_c
 ) -> None:
     limited = Limited(most=most)
     limited.registers |= {(4, 0xD011): 300, (4, 0xD013): 7}
-    more = {"current": _input(0xD011), "supply_voltage": _input(0xD012), "temperature": _input(0xD013)}
+    more = {
+        "current": input_register(0xD011),
+        "supply_voltage": input_register(0xD012),
+        "temperature": input_register(0xD013),
+    }
     with modbus_server({1: limited}) as port:
         made = device(port, EBM | more, **settings)
         made._deliver = (delivered := Delivered()).append
