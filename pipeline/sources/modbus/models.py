@@ -45,7 +45,7 @@ MODELS: Mapping[str, Model] = {
     ),
     "ziehl-abegg-ecblue": Model(
         {"speed": input_register(14), "command": {"address": 2}, "current": input_register(15, scale=0.01)},
-        "speed reference by the bus: rpm in control mode 1 (absolute speed, holding register 4), else %; not the one of "
+        "speed reference by the bus: rpm in control mode 1 (absolute speed, holding register 4), else %; not that of "
         "an analog input",
         f"{_ECBLUE} L-BAL-E076, 3.3, and L-BAL-E273, 6.7.3",
     ),
