@@ -12,7 +12,14 @@ from fantwin.pipeline.sources.logs.known_fields import Unmeasured, read_measured
 from fantwin.pipeline.sources.logs.log_file import LogFile, Series
 from fantwin.pipeline.sources.tables.clocks import Clock, continued
 from fantwin.pipeline.sources.tables.fan_columns import FanColumns, fan_columns
-from fantwin.pipeline.sources.tables.measured_table import NO_COLUMNS, Table, rad_s_per, table_of, used_fans
+from fantwin.pipeline.sources.tables.measured_table import (
+    NO_COLUMNS,
+    Table,
+    constant_commands,
+    rad_s_per,
+    table_of,
+    used_fans,
+)
 from fantwin.pipeline.sources.tables.units import SPEED_UNITS
 from fantwin.schemas.messages import Array
 
@@ -46,7 +53,8 @@ def read_samples(
     assumed = f"speeds in rad/s assumed; if that is wrong, use for example {chosen.assumed}" if chosen.assumed else ""
     silent = _unmeasured_in_words([each for each in unmeasured if each.values and each.field in chosen.names])
     notes = (*log.notes, *chosen.notes, *left_out, *silent, *clocks, *stopped, *_rates(series, chosen))
-    return replace(table, assumed=assumed), notes
+    remarks = (*table.remarks, *constant_commands(chosen, table.command))
+    return replace(table, assumed=assumed, remarks=remarks), notes
 
 
 def _unmeasured_in_words(unmeasured: Sequence[Unmeasured]) -> list[str]:

@@ -190,12 +190,11 @@ def table_of(
         table,
         speed_rad_s=of_speed,
         auxiliary=dict(zip(chosen.others, measured, strict=True)),
-        remarks=(*table.remarks, *_constant(chosen, table.command)),
     )
 
 
-def _constant(chosen: FanColumns, command: Array) -> list[str]:
-    """A note on each command that never changes, from which no twin can be made."""
+def constant_commands(chosen: FanColumns, command: Array) -> list[str]:
+    """A note on each command (n, fans) that never changes, from which no twin can be made."""
     never = dict.fromkeys(
         (name, float(command[0, fan]))
         for fan, name in enumerate(chosen.command)

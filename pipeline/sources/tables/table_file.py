@@ -22,6 +22,7 @@ from fantwin.pipeline.sources.tables.layout import Layout, find_layout, rows_of
 from fantwin.pipeline.sources.tables.measured_table import (
     NO_COLUMNS,
     Table,
+    constant_commands,
     period_in_words,
     rad_s_per,
     table_of,
@@ -114,7 +115,7 @@ def read_table(
     return replace(
         table,
         assumed=_assumed(times, replace(chosen, assumed="" if unit else chosen.assumed)),
-        remarks=(*remarks, *table.remarks),
+        remarks=(*remarks, *table.remarks, *constant_commands(chosen, table.command)),
         has_dates=bool(times and times.has_dates),
     )
 
