@@ -40,7 +40,7 @@ def closed_to(path: Path, uid: int) -> str:
 
 
 def user_name(uid: int) -> str:
-    """Of a user of this system; the number if he has none."""
+    """Name of a user of this system; the number of one without a name."""
     try:
         return pwd.getpwuid(uid).pw_name
     except KeyError:

@@ -72,7 +72,7 @@ def suspect_times(samples: Table, twin: TrayTwin) -> None:
 
 
 def _time_constant_s(twin: TrayTwin) -> float:
-    """Of the slowest fan at half its speed by the torque balance; infinite where that has none."""
+    """Time constant of the slowest fan at half its speed, by the torque balance; infinite where that has none."""
     balance = twin.balance
     slope = balance.viscous + balance.drag * twin.card.top_speed_rad_s
     known = (slope > 0.0) & (balance.inertia > 0.0)

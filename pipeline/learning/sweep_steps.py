@@ -49,7 +49,7 @@ def turning(tray: TrayConfig) -> tuple[float, float]:
 
 
 def range_in_words(tray: TrayConfig, lowest: float, highest: float) -> str:
-    """With the shares of the tray's range: a lowest command of 0.2 is next to nothing where commands go to 255."""
+    """Commands with their shares of the tray's range: a lowest one of 0.2 is next to nothing where they go to 255."""
     low, high = ((each - tray.command_min) / (tray.command_max - tray.command_min) for each in (lowest, highest))
     return f"commands from {lowest:g} to {highest:g}, {low:.0%} to {high:.0%} of its range"
 

@@ -38,7 +38,7 @@ _ENDLESS_NS = (1 << 63) - 1
 
 
 def _payloads(data: bytes, channels: Mapping[int, str], begin_ns: int) -> dict[str, list[bytes]]:
-    """By topic, the messages of these channels in a chunk whose newest sample is not older; nothing else is looked at.
+    """Messages of these channels in a chunk whose newest sample is not older, by topic; nothing else is looked at.
 
     channels: topics by number.
     """

@@ -105,7 +105,7 @@ def _rows(model: SiteModel) -> Mapping[str, Sequence[Row]]:
 
 
 def learning_json(model: SiteModel) -> dict[str, dict[str, Any]]:
-    """By tray, what its first twin waits for; none of a tray that has a twin, or is configured otherwise."""
+    """What the first twin of each tray waits for, by tray; none of one that has a twin or is configured otherwise."""
     of_trays = [(model.tray(name), each) for name, each in model.learning().items()]
     return {tray.name: _of_learning(each, tray) for tray, each in of_trays if tray and len(each.fans) == tray.fans}
 

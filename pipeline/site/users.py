@@ -56,7 +56,7 @@ class User:
 
 @dataclass(frozen=True)
 class Token:
-    """Of a program. expires: UTC; None: never."""
+    """Token of a program. expires: UTC; None: never."""
 
     name: str
     role: UserRole

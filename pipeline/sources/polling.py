@@ -137,7 +137,7 @@ class PollingSource(ABC):
         return []
 
     def doubts(self, fastest_rpm: float) -> Mapping[int, Doubt]:
-        """By fan, the last speeds that are none, 0, too small or too large, where the source can say why."""
+        """Last speeds that are none, 0, too small or too large, by fan, where the source can say why."""
         return {}
 
     def start(self, deliver: Callable[[SourceEvent], None]) -> None:

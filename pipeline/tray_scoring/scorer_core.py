@@ -282,7 +282,7 @@ class ScorerCore(Core):
         return [*overview, snapshot] if is_published else overview
 
     def _take_snapshot(self) -> list[Overview | ScorerSnapshot]:
-        """The state for a restart, after the overview up to now: whoever continues from it does not make that again."""
+        """The state for a restart, after the overview up to now: the next scorer does not make that again."""
         self._snapshot_t_ns, self._owes_snapshot = self._samples.last_t_ns, False
         snapshot = self._snapshot()
         if self._snapshot_store:

@@ -59,7 +59,7 @@ def quiet(work: Callable[[], Any]) -> tuple[Any, list[str]]:
 
 
 def by_name(fans: dict[str, str]) -> fantwin.Columns:
-    """Of a wide table. fans: names of the fans and of their columns."""
+    """Columns of a wide table. fans: names of the fans and of their columns."""
     return fantwin.Columns(
         time="t",
         command={name: f"pwm_{column}" for name, column in fans.items()},

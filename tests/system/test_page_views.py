@@ -340,7 +340,7 @@ def test_an_operator_moves_the_fans_of_a_tray_without_a_twin_where_its_learner_a
         return health("learner", sequence=next(sequence), learning=(replace(waits, sweep=now),))
 
     def answer(request: Request) -> list[Alarm]:
-        """As the learner: by its health."""
+        """Answer as the learner does: by its health."""
         asked.append((request.action, request.operator_name))
         now = replace(sweep, asked_t_ns=request.t_ns)
         if request.action == Action.SWEEP:

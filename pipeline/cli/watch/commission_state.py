@@ -100,7 +100,7 @@ class Unfinished:
         return tray in self._so_far.trays
 
     def forget(self, tray: str) -> None:
-        """Let the next one begin anew with a tray."""
+        """Let the next one begin with a tray again."""
         self._so_far.trays.pop(tray, None)
         self.show(self._so_far.doing)
 

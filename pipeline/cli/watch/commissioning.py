@@ -257,7 +257,7 @@ class Commissioning:
 
     @contextmanager
     def _making_use(self, work: TrayWork) -> Iterator[None]:
-        """Around a use of the recordings of a tray: what has failed with them would fail again."""
+        """Forget the recordings of a tray if what uses them fails: it would fail with them again."""
         try:
             yield
         except UserError:

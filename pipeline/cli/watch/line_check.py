@@ -238,7 +238,7 @@ def _ranges(
 
 
 def _range_of(command: Array, speed_rad_s: Array, tray: TrayConfig) -> str:
-    """Of some fans. command, speed_rad_s: (n, fans)."""
+    """Commands and speeds of some fans in words. command, speed_rad_s: (n, fans)."""
     speeds = _speeds(speed_rad_s, tray.speed_unit)
     if tray.speed_unit == "rad/s":  # numbers in rpm that are taken for rad/s are plausible, and ten times too large
         speeds += f" ({_speeds(speed_rad_s, 'rpm')})"

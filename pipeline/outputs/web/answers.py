@@ -216,10 +216,9 @@ class Extremes(BaseModel):
     max: list[float | None]
 
 
-class Mark(BaseModel):
+class Happening(BaseModel):
     """A transition of the alarm of a fan, or an act of an operator on it."""
 
-    t_s: float
     name: str
     onset_t_ns: int
     transition: str
@@ -228,6 +227,12 @@ class Mark(BaseModel):
     message: str
     operator_name: str
     comment: str
+
+
+class Mark(Happening):
+    """A happening in a range of time."""
+
+    t_s: float
 
 
 class CausesFrom(BaseModel):
@@ -276,21 +281,13 @@ class Sparks(BaseModel):
     fans: list[Spark]
 
 
-class Transition(BaseModel):
-    """A transition of an alarm. feedback: the last one on its alarm. causes: the most probable first."""
+class Transition(Happening):
+    """A happening in the history. feedback: the last one on its alarm. causes: the most probable first."""
 
     number: int
     t_ns: int
     tray: str
     fan: int
-    name: str
-    onset_t_ns: int
-    transition: str
-    severity: str
-    active: bool
-    message: str
-    operator_name: str
-    comment: str
     feedback: str
     causes: list[Cause]
 

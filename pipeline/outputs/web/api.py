@@ -330,7 +330,7 @@ class Api:
         return [(folder, clip) for folder, clip in listed if self.model.tray(clip.tray)]
 
     def _fan(self, tray: str, fan: str) -> Fan:
-        """By its number or its name."""
+        """Find a fan by its number or its name."""
         try:
             return Fan(tray, self._tray(tray).fan_called(fan))
         except UserError as error:

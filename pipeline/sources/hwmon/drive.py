@@ -39,7 +39,7 @@ class Drive:
 
     @property
     def name(self) -> str:
-        """For people and files: the chip and its file."""
+        """Name for people and files: the chip and its file."""
         return f"{self.chip.name}/{self.file}"
 
     def value(self) -> int:

@@ -65,7 +65,7 @@ class _Messages:
 
     @property
     def apart_ns(self) -> int:
-        """From the stamps to the receipt, the median."""
+        """Median time from the stamps to the receipt."""
         return int(np.median(np.array(self.received_ns, np.int64) - np.array(self.stamps_ns, np.int64)))
 
 

@@ -308,7 +308,7 @@ class ModbusSource(PollingSource):
         return DeviceError(f"{what}; waiting for it", is_lost=True)
 
     def _words_of(self, unit: int, register: Register) -> list[int] | None:
-        """As the device gave them last; None where one was refused."""
+        """Words of a register as the device gave them last; None where one was refused."""
         found = [self._words.get((unit, register.table, register.address + word)) for word in range(_size(register))]
         known = [word for word in found if word is not None]
         return known if len(known) == len(found) else None

@@ -41,7 +41,7 @@ class SeriesFile:
 
     @property
     def all_names(self) -> Sequence[str]:
-        """As `names`; for `profile_of`."""
+        """The names by which `profile_of` finds a program."""
         return self.names
 
     def read(self, names: Sequence[str]) -> Mapping[str, Series]:

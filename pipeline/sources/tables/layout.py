@@ -108,7 +108,7 @@ class Layout:
 
     @property
     def in_words(self) -> str:
-        """For people: encoding, delimiter, and where the names are."""
+        """Words for people: encoding, delimiter, and where the names are."""
         where = f"names in line {self.head}" if self.head else "no line of names"
         return f"{self.title}, columns separated by {_DELIMITERS.get(self.delimiter, repr(self.delimiter))}, {where}"
 

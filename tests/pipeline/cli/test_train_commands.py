@@ -59,7 +59,7 @@ def test_identify_finds_the_published_fan(folder):
 
 @pytest.mark.filterwarnings("error::RuntimeWarning")
 def test_a_parameter_that_the_fit_drove_to_its_bound_has_no_interval(tmp_path: Path) -> None:
-    """As in step tests of thrust stands: at rest, one step, at rest again, four samples a second."""
+    """A step test of a thrust stand: at rest, one step, at rest again, four samples a second."""
     speeds = [20, 6000, 8700, *[8650, 8700] * 8, 8650, 7780, 4351, 2813, 2013, 1494, 1121, 838, 661, 518]
     rows = [(1000, 0)] * 36 + [(1650 if k < 20 else 1000, rpm) for k, rpm in enumerate(speeds)] + [(1000, 0)] * 11
     lines = (f"{0.25 * k:.2f},{us},{rpm}" for k, (us, rpm) in enumerate(rows))

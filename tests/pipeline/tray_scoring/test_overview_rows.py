@@ -41,7 +41,7 @@ def scores(rate_hz: float, seconds: float) -> Score:
 
 
 def in_rows(score: Score) -> dict[int, Array]:
-    """By second, the values of a row, (columns, fans), computed one by one."""
+    """The values of a row by second, (columns, fans), computed one by one."""
     residual = np.where(score.valid, score.residual_rad_s, np.nan)
     half_width = np.where(score.valid, np.sqrt(score.band_variance), np.nan)
     means = (score.predicted_speed_rad_s, half_width, residual)
