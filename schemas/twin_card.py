@@ -322,6 +322,23 @@ class TwinCard:
             )
         )
 
+    def other_order(self, names: Sequence[str], rows: Sequence[int] | None = None) -> str:
+        """What is wrong with fans that the twin knows in other places, as fans are matched by number; empty: nothing.
+
+        names: of the fans, each empty where it has none. rows: the place of each in the card's lists; without it, the
+        same place.
+        """
+        own = self.training.fan_names
+        found = [
+            (name, own[row])
+            for name, row in zip(names, rows or range(len(own)), strict=False)
+            if name in own and own[row] and own[row] != name
+        ]
+        if not found:
+            return ""
+        here, there = (", ".join(each) for each in zip(*found, strict=True))
+        return f"the fans {here} are in the places of {there} in the twin: use a twin of these fans in this order"
+
     @property
     def fan_numbers(self) -> tuple[int, ...]:
         """Numbers of the fans in the recordings; counted from 0 where the card does not say."""

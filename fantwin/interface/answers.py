@@ -15,7 +15,6 @@ from fantwin.interface.decisions import DecidedTray, decided
 from fantwin.interface.suspicions import suspect_levels
 from fantwin.interface.tables import Array, FanTable, Form, data_frame
 from fantwin.interface.words import Words
-from fantwin.pipeline.errors import FantwinError
 from fantwin.pipeline.extras import is_installed
 from fantwin.pipeline.learning.evaluation import evaluated
 from fantwin.pipeline.learning.training_data import Part
@@ -78,7 +77,6 @@ def of_recording(recording: Path, twin: Path, overrides: Sequence[str], answer: 
     """The answer to a recording: its trays one after another, with a column `tray`."""
     trays = decided(recording, twin, overrides, words, scores=answer != "prediction")
     for tray in trays:
-        _require_order(tray, load_tray_twin(twin).card.training.fan_names)
         words.warn(tray.left_out)
     is_dated = any(has_date(int(tray.scores[0].t_ns[0])) for tray in trays if tray.scores)
     form = Form(_frame_or_dict, "dates" if is_dated else "seconds", unit=trays[0].speed_unit)
@@ -105,16 +103,6 @@ def _digest(samples: Table, overrides: Sequence[str]) -> str:
     }.items():
         found.update(name.encode() + np.ascontiguousarray(values).tobytes())
     return found.hexdigest()
-
-
-def _require_order(tray: DecidedTray, names: Sequence[str]) -> None:
-    """Refuse a recording that has the fans of the twin in another order: its fans are matched by number."""
-    own = tray.fan_names[: tray.fans]
-    if len(names) > 1 and sorted(own) == sorted(names) and own != tuple(names):
-        raise FantwinError(
-            f"tray {tray.name} has the fans {', '.join(own)} in this order, and the twin {', '.join(names)}: use the "
-            "twin of this tray"
-        )
 
 
 def _frame_or_dict(columns: dict[str, Array], zone: Any) -> Any:

@@ -86,14 +86,18 @@ def _known_of(path: Path, part: Part) -> tuple[TrainingData, Extent]:
 def _sums_of(path: Path, part: Part, twin: Path, extent: Extent, grids: Sequence[Grid]) -> list[Any]:
     """The RecordingSums of one recording, and its FigureSums on each of the other grids."""
     from fantwin.twin.build import evaluation_sums, runs_of_twin  # noqa: PLC0415
+    from fantwin.twin.errors import TwinError  # noqa: PLC0415
     from fantwin.twin.evaluation.resampling import on_grid  # noqa: PLC0415
     from fantwin.twin.export.onnx_twin import OnnxTwin  # noqa: PLC0415
     from fantwin.twin.report.recording_sums import recording_sums  # noqa: PLC0415
 
     with twin_errors():
-        loaded, runs = OnnxTwin(twin), read_recording_data(path, part).runs
-        on_grids = [evaluation_sums(loaded, on_grid(runs, grid), part.fans) for grid in grids]
-        return [recording_sums(runs_of_twin(loaded, runs, part.fans), extent), *on_grids]
+        loaded, data = OnnxTwin(twin), read_recording_data(path, part)
+        of_twin = runs_of_twin(loaded, data.runs, part.fans)
+        if mistake := loaded.card.other_order([data.names.name(fan) for fan in data.fans], of_twin.rows):
+            raise TwinError(f"{path}: {mistake}")
+        on_grids = [evaluation_sums(loaded, on_grid(data.runs, grid), part.fans) for grid in grids]
+        return [recording_sums(of_twin, extent), *on_grids]
 
 
 def _added(sums: list[Any], others: list[Any]) -> list[Any]:

@@ -97,10 +97,10 @@ def load_twin(context: Context) -> TwinFile:
     """The twin of a context's one tray, ready to run.
 
     Raises:
-        StageError: the tray names none, or one that cannot be used or was trained with other tachos.
+        StageError: the tray names none, or one that cannot be used or was trained with other tachos or fans.
     """
     path = twin_path(context.tray, context.folder)
-    return _with_tachos_of(context.tray, path, TwinFile.load(path, context.tray.fans))
+    return _of_tray(context.tray, path, TwinFile.load(path, context.tray.fans))
 
 
 def learned_twin(tray: TrayConfig, name: str, content: bytes) -> TwinFile:
@@ -110,11 +110,13 @@ def learned_twin(tray: TrayConfig, name: str, content: bytes) -> TwinFile:
         StageError: it cannot be used.
     """
     path = Path(name)
-    return _with_tachos_of(tray, path, TwinFile.of_content(path, content, tray.fans))
+    return _of_tray(tray, path, TwinFile.of_content(path, content, tray.fans))
 
 
-def _with_tachos_of(tray: TrayConfig, path: Path, twin: TwinFile) -> TwinFile:
-    """The same twin. Raises StageError if it was trained with other tachos than those of the tray."""
+def _of_tray(tray: TrayConfig, path: Path, twin: TwinFile) -> TwinFile:
+    """The same twin. Raises StageError if it was trained with other tachos, or on fans in another order."""
+    if mistake := twin.card.other_order(tray.names.names):
+        raise StageError(f"{path}: tray {tray.name}: {mistake}")
     of_tray = tacho_of_each_fan(tray.tachos, tray.fans)
     if twin.tachos != of_tray and any(tacho.window_s > 0.0 for tacho in twin.tachos):
         raise StageError(

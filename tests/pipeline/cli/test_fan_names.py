@@ -70,3 +70,19 @@ def test_alarms_and_wear_of_a_recording_name_the_fans(scored: Path) -> None:
 def test_fans_are_identified_by_name(raw: Path) -> None:
     (found,) = document("report", raw, "--fans", "rear top")["fans"]
     assert (found["fan"], found["name"]) == (1, "rear top")
+
+
+def test_a_twin_is_refused_for_its_own_fans_in_another_order(raw: Path, tmp_path: Path) -> None:
+    """Fans are matched by number: each would be judged by the twin of another."""
+    twin, other = tmp_path / "twin.onnx", tmp_path / "other.mcap"
+    write_run(other, published_run(2, 20.0, fans=3), **{"fan_names.tray1": json.dumps(NAMES[::-1])})
+    fantwin("train", raw, "--model", "physical", "-o", twin)
+    said = "the fans GPU, CPU are in the places of CPU, GPU in the twin: use a twin of these fans in this order"
+    rate = ("--false-alarms-per-day", 1)
+    for words in (
+        ("evaluate", twin, other),
+        ("calibrate", twin, other, *rate),
+        ("replay", "--offline", other, "--twin", twin),
+    ):
+        assert said in error_of(*words), words[0]
+    assert fantwin("evaluate", twin, raw).exit_code == 0
