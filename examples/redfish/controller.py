@@ -23,8 +23,14 @@ def link(path: str) -> dict[str, str]:
 def fan(number: int) -> dict[str, Any]:
     """A fan now: its duty follows a load that rises and falls within two minutes."""
     percent = 50 + 30 * math.sin(time.monotonic() / 20 + number / 4)
-    speed = {"Reading": round(percent), "SpeedRPM": round(random.gauss(160 * percent, 20))}
-    return {"Id": str(number), "Name": f"FAN{number}", "SpeedPercent": speed, "Status": {"State": "Enabled"}}
+    rpm = round(random.gauss(160 * percent, 20))
+    return {
+        "Id": str(number),
+        "Name": f"FAN{number}",
+        "SpeedPercent": {"Reading": round(rpm / 160), "SpeedRPM": rpm},
+        "SpeedControlPercent": {"SetPoint": round(percent)},
+        "Status": {"State": "Enabled"},
+    }
 
 
 def document(path: str) -> dict[str, Any] | None:

@@ -10,6 +10,7 @@ from typing import Any
 
 from pydantic import create_model
 
+from fantwin.pipeline.config.hosts import ABOUT
 from fantwin.pipeline.config.loading import File
 from fantwin.pipeline.config.registry import STAGES
 from fantwin.pipeline.config.settings import TrayConfig
@@ -40,8 +41,13 @@ def schema_text() -> str:
     names = {"type": "array", "minItems": 1, "items": {"type": "string"}}
     about_fans = {key: number.pop(key) for key in ("title", "description")}
     tray["properties"]["fans"] = {**about_fans, "anyOf": [number, names]}
-    tray["required"].remove("fans")
-    tray["anyOf"] = [{"required": ["fans"]}, {"required": ["fan"]}]
+    several = {"type": "array", "minItems": 1, "items": {"anyOf": [{"type": "string"}, {"type": "object"}]}}
+    tray["properties"]["hosts"] = {"description": ABOUT, **several}
+    tray["required"] = [key for key in tray["required"] if key not in ("fans", "name")]
+    tray["allOf"] = [
+        {"anyOf": [{"required": ["fans"]}, {"required": ["fan"]}]},
+        {"anyOf": [{"required": ["name"]}, {"required": ["hosts"]}]},
+    ]
     about = "The configuration of a fantwin site: docs/reference/configuration.md."
     return json.dumps({"$schema": DIALECT, **whole, "title": "fantwin.toml", "description": about}, indent=1) + "\n"
 

@@ -11,6 +11,7 @@ import json
 import os
 import re
 import tomllib
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from types import NoneType, UnionType
@@ -19,6 +20,7 @@ from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
 from pydantic import BaseModel, Field, ValidationError
 from pydantic_core import ErrorDetails
 
+from fantwin.pipeline.config.hosts import each_tray
 from fantwin.pipeline.config.registry import STAGES
 from fantwin.pipeline.config.settings import (
     BusConfig,
@@ -176,6 +178,11 @@ def _checked(
     for key in own:
         if key not in File.model_fields:
             raise ConfigError(f"{path}: unknown key {_shown(key)}{nearest(key, [*File.model_fields, *STAGES])}")
+    if "tray" in own:
+        try:
+            own["tray"] = each_tray(own["tray"])
+        except ValueError as error:
+            raise ConfigError(f"{path}: tray: {error}") from error
     file = checked_section(File, own, path, "", overrides)
     enabled = enabled_stages(file.launcher, table)
     sections = {
@@ -183,8 +190,8 @@ def _checked(
         for name in (enabled if stages is None else stages)
     }
     names = [tray.name for tray in file.tray]
-    if len(set(names)) != len(names):
-        raise ConfigError(f"{path}: two trays have the same name; names must differ: {', '.join(names)}")
+    if twice := [name for name, times in Counter(names).items() if times > 1]:
+        raise ConfigError(f"{path}: two trays have the same name; names must differ: {_shown(', '.join(twice))}")
     _require_trays_for_shards(file.launcher, len(names), path)
     folder, bus = path.parent, file.bus
     if bus.security:

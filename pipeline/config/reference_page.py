@@ -15,6 +15,7 @@ from typing import Any
 
 from pydantic import BaseModel
 
+from fantwin.pipeline.config.hosts import ABOUT
 from fantwin.pipeline.config.loading import LARGEST_FILE_BYTES, File
 from fantwin.pipeline.config.registry import STAGES
 from fantwin.pipeline.config.settings import BusConfig, FanConfig, LauncherConfig, SecurityConfig, TrayConfig
@@ -54,6 +55,7 @@ def page() -> str:
         table(File, but=tables),
         "## `[[tray]]`\n",
         "One for each tray. `port`, `baud` and `protocol` may be written in it directly, for a serial source.\n",
+        f"`hosts`, {ABOUT}.\n",
         table(TrayConfig),
         "### `[[tray.fan]]`\n",
         table(FanConfig),

@@ -98,8 +98,18 @@ def shards_of(stage: str, config: Config) -> list[Shard]:
     number = config.launcher.number_of_shards(stage)
     if number is not None:
         return [numbered_shard(stage, each, number, names) for each in range(1, number + 1)]
-    of_each = [[name] for name in names] if STAGES[stage].scope == "tray" else [names]
-    return [shard_of(stage, each, names) for each in of_each]
+    return [shard_of(stage, each, names) for each in (_by_source(config) if _has_devices(stage) else [names])]
+
+
+def _has_devices(stage: str) -> bool:
+    return STAGES[stage].scope == "tray"
+
+
+def _by_source(config: Config) -> list[list[str]]:
+    """The trays of each process that asks devices: one each, but those together whose source shares a process."""
+    shared = [tray.name for tray in config.trays if tray.source.shares_process]
+    alone = {tray.name: [tray.name] for tray in config.trays if not tray.source.shares_process}
+    return [alone.get(tray.name, shared) for tray in config.trays if tray.name in alone or tray.name == shared[0]]
 
 
 def numbered_shard(stage: str, number: int, of: int, names: Sequence[str]) -> Shard:
@@ -112,7 +122,7 @@ def numbered_shard(stage: str, number: int, of: int, names: Sequence[str]) -> Sh
 def shard_of(stage: str, trays: Sequence[str], names: Iterable[str]) -> Shard:
     """The shard with these of the trays of a site. The name of one tray names it; but of a site with one tray only that
     of a stage that has a process for each."""
-    is_named_by_tray = len(trays) == 1 and STAGES[stage].scope == "tray"
+    is_named_by_tray = len(trays) == 1 and _has_devices(stage)
     if list(trays) == list(names) and not is_named_by_tray:
         return Shard(ALL_TRAYS, tuple(trays))
     name = "+".join(trays)

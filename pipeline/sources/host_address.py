@@ -1,8 +1,12 @@
-"""Addresses to listen on."""
+"""Addresses to listen on, and ranges of hosts."""
 
 from __future__ import annotations
 
 import ipaddress
+import re
+
+MOST_HOSTS = 4096
+_RANGE = re.compile(r"\[([0-9][0-9,-]*)\]")
 
 
 def is_of_this_host_only(host: str) -> bool:
@@ -11,3 +15,27 @@ def is_of_this_host_only(host: str) -> bool:
         return ipaddress.ip_address(host.strip("[]")).is_loopback
     except ValueError:
         return host == "localhost"
+
+
+def hosts_of(text: str) -> list[str]:
+    """The hosts of a range: `bmc[01-03,7].hall` has four, and any other text one.
+
+    Raises:
+        ValueError: a range that runs backwards, or of more than MOST_HOSTS.
+    """
+    match = _RANGE.search(text)
+    if match is None:
+        return [text]
+    found: list[str] = []
+    for part in match[1].split(","):
+        first, dash, last = part.partition("-")
+        if not first.isdecimal() or (dash and not last.isdecimal()):
+            raise ValueError(f"{text}: no range; write [001-400] or [1-4,7]")
+        low, high = int(first), int(last or first)
+        if not 0 <= high - low < MOST_HOSTS:
+            raise ValueError(f"{text}: a range from low to high, of at most {MOST_HOSTS:,} hosts")
+        found += [f"{number:0{len(first)}}" for number in range(low, high + 1)]
+    rests = hosts_of(text[match.end() :])
+    if len(found) * len(rests) > MOST_HOSTS:
+        raise ValueError(f"{text}: more than {MOST_HOSTS:,} hosts")
+    return [f"{text[: match.start()]}{number}{rest}" for number in found for rest in rests]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+import sys
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -52,6 +53,33 @@ class NothingThereError(ValueError):
 
 def value_at(value: Any, pointer: str) -> Any:
     """The value at a JSON pointer (RFC 6901). Raises NothingThereError."""
+    is_there, found = _at(value, pointer)
+    if is_there:
+        return found
+    there = list(map(str, found)) if isinstance(found, Mapping) else []
+    more = ", ..." if len(there) > MOST_KEYS_SHOWN else ""
+    raise NothingThereError(f"nothing at {pointer}; there is: {', '.join(there[:MOST_KEYS_SHOWN])}{more}")
+
+
+def found_at(value: Any, pointer: str) -> Any:
+    """The value at a JSON pointer, None if there is nothing."""
+    is_there, found = _at(value, pointer)
+    return found if is_there else None
+
+
+def has(value: Any, pointer: str) -> bool:
+    """Whether there is a value at a JSON pointer, also null."""
+    return _at(value, pointer)[0]
+
+
+def number_at(value: Any, pointer: str) -> float:
+    """The finite number at a JSON pointer, which may be text; NaN if there is none, or no pointer."""
+    number = number_of(found_at(value, pointer)) if pointer else None
+    return math.nan if number is None or math.isinf(number) else number
+
+
+def _at(value: Any, pointer: str) -> tuple[bool, Any]:
+    """Whether there is a value at a pointer, and it; or the last value on the way there."""
     here = value
     for part in pointer.split("/")[1:]:
         key = part.replace("~1", "/").replace("~0", "~")
@@ -60,10 +88,8 @@ def value_at(value: Any, pointer: str) -> Any:
         elif isinstance(here, Sequence) and not isinstance(here, str) and key.isdecimal() and int(key) < len(here):
             here = here[int(key)]
         else:
-            there = list(map(str, here)) if isinstance(here, Mapping) else []
-            more = ", ..." if len(there) > MOST_KEYS_SHOWN else ""
-            raise NothingThereError(f"nothing at {pointer}; there is: {', '.join(there[:MOST_KEYS_SHOWN])}{more}")
-    return here
+            return False, here
+    return True, here
 
 
 def number_of(value: Any, *, speed_unit: str = "", on: float = math.nan) -> float | None:
@@ -73,7 +99,7 @@ def number_of(value: Any, *, speed_unit: str = "", on: float = math.nan) -> floa
     on: the command of a fan that is switched on, for values such as ON and true; NaN: they are no number.
     """
     if isinstance(value, int | float) and not isinstance(value, bool):
-        return float(value)
+        return float(value) if abs(value) <= sys.float_info.max else math.copysign(math.inf, value)
     text = "" if value is None else str(value).strip().lower() if isinstance(value, str | bool) else "-"
     if text in _NONE:
         return math.nan

@@ -29,7 +29,9 @@ class LogIn(BaseModel, frozen=True):
 
     url: str
     password_file: Path | None = Field(
-        default=None, description="file with the password in its first line; only its owner may be able to read it"
+        default=None,
+        description="file with the password in its first line; only its owner may be able to read it. Or a folder with "
+        "such a file for each host, called like it, and `default` for all others",
     )
 
     @property
@@ -79,7 +81,12 @@ class LogIn(BaseModel, frozen=True):
         Raises:
             UserError: it cannot be read.
         """
-        return read_secret(folder / self.password_file) if self.password_file else None
+        if not self.password_file:
+            return None
+        path = folder / self.password_file
+        if path.is_dir():
+            path = path / (self.host if (path / self.host).exists() else "default")
+        return read_secret(path)
 
 
 def read_secret(path: Path) -> str:

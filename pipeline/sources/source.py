@@ -35,6 +35,9 @@ class SourceConfig(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
     takes_port: ClassVar[bool] = False
     """true if the source takes something that only one process can have, so that a check fails while it runs"""
 
+    shares_process: ClassVar[bool] = False
+    """true if one process of acquisition has all such trays of a site, unless the configuration says otherwise"""
+
     kind: str
 
     @property

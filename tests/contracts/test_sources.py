@@ -13,7 +13,6 @@ from fantwin.pipeline.sources import polling
 from fantwin.pipeline.sources.http import source as http_source
 from fantwin.pipeline.sources.kinds import SOURCE_KINDS, build_source, parse_source
 from fantwin.pipeline.sources.mqtt import client as broker_client
-from fantwin.pipeline.sources.redfish import source as redfish_source
 from fantwin.pipeline.sources.serial import port as serial_port
 from fantwin.pipeline.sources.source import (
     LinkDown,
@@ -65,7 +64,6 @@ def made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[
         (polling, ("RECONNECT_DELAY_S", "RECONNECT_DELAY_MAX_S")),
         (serial_port, ("REOPEN_DELAY_S", "REOPEN_DELAY_MAX_S")),
         (http_source, ("RETRY_S",)),
-        (redfish_source, ("PERIOD_S",)),
     ):
         for name in names:
             monkeypatch.setattr(module, name, 0.02)

@@ -1,4 +1,4 @@
-"""A baseboard controller on loopback: a small HTTP server with the older and the newer schema of fans."""
+"""A baseboard controller on loopback: an HTTP server with the resources that a test gives it."""
 
 from __future__ import annotations
 
@@ -6,91 +6,158 @@ import base64
 import json
 import ssl
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from typing import Any
+from typing import Any, TypeAlias
 
 ROOT = "/redfish/v1"
+CHASSIS = f"{ROOT}/Chassis/1U"
+Answer: TypeAlias = Mapping[str, Any] | bytes | int | None
+"""an object, a body that is none, the status of a refusal; None: 404"""
 
 
-class Controller:
-    """Its fans, which a test changes while it is asked."""
+def link(path: str) -> dict[str, str]:
+    """How Redfish names another resource."""
+    return {"@odata.id": path}
 
-    def __init__(self, *, is_new: bool, user: str = "", password: str = "") -> None:
-        self.is_new, self.user, self.password = is_new, user, password
-        self.rpm = [4000, 4200]
-        self.percent: list[int | None] = [40, 42]
+
+def with_fans(fans: Mapping[str, Mapping[str, Any]], others: Mapping[str, Answer] | None = None) -> dict[str, Answer]:
+    """The documents of a controller with fans in ThermalSubsystem, by id, and others over or beside them."""
+    subsystem = f"{CHASSIS}/ThermalSubsystem"
+    return {
+        CHASSIS: {"Id": "1U", "ThermalSubsystem": link(subsystem)},
+        subsystem: {"Fans": link(f"{subsystem}/Fans")},
+        f"{subsystem}/Fans": {"Members": [link(f"{subsystem}/Fans/{name}") for name in fans]},
+        **{f"{subsystem}/Fans/{name}": {"Id": name, **fan} for name, fan in fans.items()},
+        **(others or {}),
+    }
+
+
+def with_thermal(*fans: Mapping[str, Any]) -> dict[str, Answer]:
+    """The documents of a controller with fans in Thermal."""
+    thermal = f"{CHASSIS}/Thermal"
+    return {
+        CHASSIS: {"Id": "1U", "Thermal": link(thermal)},
+        thermal: {"Fans": list(fans), "Temperatures": [{"Name": "Inlet Temp", "ReadingCelsius": 23.5}]},
+    }
+
+
+class Documents:
+    """A controller that answers with given documents; its users, what it was asked, and whether it answers now."""
+
+    def __init__(self, documents: Mapping[str, Answer], *, user: str = "", password: str = "") -> None:
+        self.documents = {
+            f"{ROOT}/Chassis": {"Members": [link(each) for each in documents if each.count("/") == 4]},
+            **documents,
+        }
+        self.user, self.password = user, password
+        self.has_sessions = False
         self.may_answer = threading.Event()
         self.may_answer.set()
         self.status = 200
         self.asked: list[str] = []
+        self.ended: list[str] = []
+        """sessions that were ended"""
 
-    def document(self, path: str) -> dict[str, Any] | None:
+    def document(self, path: str) -> Answer:
         """The resource at a path; None if there is none."""
-        chassis = f"{ROOT}/Chassis/1U"
         if path == f"{ROOT}/":
-            return {"Id": "Root", "RedfishVersion": "1.6.0", "Chassis": {"@odata.id": f"{ROOT}/Chassis"}}
-        if path == f"{ROOT}/Chassis":
-            return {"Members": [{"@odata.id": chassis}, {"@odata.id": f"{ROOT}/Chassis/Rack"}]}
-        if path == f"{ROOT}/Chassis/Rack":
-            return {"Id": "Rack"}
-        if path == chassis:
-            kind = "ThermalSubsystem" if self.is_new else "Thermal"
-            return {"Id": "1U", kind: {"@odata.id": f"{chassis}/{kind}"}}
-        return self._new(path, f"{chassis}/ThermalSubsystem") if self.is_new else self._old(path, f"{chassis}/Thermal")
+            return {"Id": "Root", "RedfishVersion": "1.6.0", "Chassis": link(f"{ROOT}/Chassis")}
+        return self.documents.get(path)
 
-    def _old(self, path: str, thermal: str) -> dict[str, Any] | None:
-        if path != thermal:
-            return None
-        fans = [
-            {"MemberId": str(n), "FanName": f"FAN{n + 1}", "Reading": rpm, "ReadingUnits": "RPM"}
-            | ({"Oem": {"Vendor": {"PWM": percent}}} if percent is not None else {})
-            for n, (rpm, percent) in enumerate(zip(self.rpm, self.percent, strict=True))
-        ]
-        return {"Fans": fans, "Temperatures": [{"Name": "Inlet Temp", "ReadingCelsius": 23.5}]}
 
-    def _new(self, path: str, subsystem: str) -> dict[str, Any] | None:
-        fan_paths = [f"{subsystem}/Fans/{n + 1}" for n in range(len(self.rpm))]
-        if path == subsystem:
-            links = {name: {"@odata.id": f"{subsystem}/{name}"} for name in ("Fans", "ThermalMetrics")}
-            return {"Id": "ThermalSubsystem", **links}
-        if path == f"{subsystem}/ThermalMetrics":
-            return {"TemperatureSummaryCelsius": {"Intake": {"Reading": 22.0}}}
-        if path == f"{subsystem}/Fans":
-            return {"Members": [{"@odata.id": each} for each in fan_paths]}
-        if path in fan_paths:
-            n = fan_paths.index(path)
-            speed = {"Reading": self.percent[n], "SpeedRPM": self.rpm[n]}
-            return {"Id": str(n + 1), "Name": f"FAN{n + 1}", "SpeedPercent": speed, "Status": {"State": "Enabled"}} | (
-                {"PhysicalContext": "Intake"} if n else {"Location": {"PartLocation": {"ServiceLabel": "Fan bay 1"}}}
+class Controller(Documents):
+    """Two fans by the older or the newer schema, which a test changes while it is asked."""
+
+    def __init__(self, *, is_new: bool, user: str = "", password: str = "") -> None:
+        super().__init__({}, user=user, password=password)
+        self.is_new = is_new
+        self.rpm = [4000, 4200]
+        self.percent: list[int | None] = [40, 42]
+
+    def document(self, path: str) -> Answer:
+        """The resource at a path; None if there is none."""
+        rack = f"{ROOT}/Chassis/Rack"
+        self.documents = {
+            f"{ROOT}/Chassis": {"Members": [link(CHASSIS), link(rack)]},
+            rack: {"Id": "Rack"},
+            **(self._new() if self.is_new else self._old()),
+        }
+        return super().document(path)
+
+    def _old(self) -> dict[str, Answer]:
+        return with_thermal(
+            *(
+                {"MemberId": str(n), "FanName": f"FAN{n + 1}", "Reading": rpm, "ReadingUnits": "RPM"}
+                | ({"Oem": {"Vendor": {"PWM": percent}}} if percent is not None else {})
+                for n, (rpm, percent) in enumerate(zip(self.rpm, self.percent, strict=True))
             )
-        return None
+        )
+
+    def _new(self) -> dict[str, Answer]:
+        subsystem = f"{CHASSIS}/ThermalSubsystem"
+        places = ({"Location": {"PartLocation": {"ServiceLabel": "Fan bay 1"}}}, {"PhysicalContext": "Intake"})
+        fans = {
+            str(n + 1): {
+                "Name": f"FAN{n + 1}",
+                "SpeedPercent": {"Reading": rpm / 100, "SpeedRPM": rpm},
+                "SpeedControlPercent": {"SetPoint": percent},
+                "Status": {"State": "Enabled"},
+                **place,
+            }
+            for n, (rpm, percent, place) in enumerate(zip(self.rpm, self.percent, places, strict=True))
+        }
+        links = {name: link(f"{subsystem}/{name}") for name in ("Fans", "ThermalMetrics")}
+        metrics = {"TemperatureSummaryCelsius": {"Intake": {"Reading": 22.0}}}
+        return with_fans(fans, {subsystem: links, f"{subsystem}/ThermalMetrics": metrics})
 
 
 @contextmanager
-def redfish_server(controller: Controller, tls: ssl.SSLContext | None = None) -> Iterator[str]:
+def redfish_server(controller: Documents, tls: ssl.SSLContext | None = None) -> Iterator[str]:
     """Serve it; gives its URL."""
+    sessions = f"{ROOT}/SessionService/Sessions"
 
     class Handler(BaseHTTPRequestHandler):
+        protocol_version = "HTTP/1.1"
+        wbufsize = -1  # an answer in one packet
+
         def do_GET(self) -> None:
             controller.asked.append(self.path)
             controller.may_answer.wait()
-            expected = base64.b64encode(f"{controller.user}:{controller.password}".encode()).decode()
-            is_let_in = not controller.user or self.headers.get("Authorization") == f"Basic {expected}"
-            document = controller.document(self.path)
-            status = controller.status if self.path != f"{ROOT}/" else 200
-            if self.path != f"{ROOT}/" and not is_let_in:
-                status = 401
-            self._answer(404 if document is None else status, document or {})
+            if self.path == f"{ROOT}/":
+                self._answer(200, controller.document(self.path))
+            elif not self._is_let_in():
+                self._answer(401, {})
+            else:
+                self._answer(controller.status, controller.document(self.path))
 
         def do_POST(self) -> None:
-            self._answer(405, {})
+            said = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
+            if not controller.has_sessions or self.path != sessions:
+                self._answer(405, {})
+            elif said != {"UserName": controller.user, "Password": controller.password}:
+                self._answer(401, {})
+            else:
+                self._answer(201, {}, {"X-Auth-Token": "token", "Location": f"{sessions}/7"})
 
-        def _answer(self, status: int, document: dict[str, Any]) -> None:
-            body = json.dumps(document).encode()
+        def do_DELETE(self) -> None:
+            controller.ended.append(self.path)
+            self._answer(204, b"")
+
+        def _is_let_in(self) -> bool:
+            if controller.has_sessions:
+                return self.headers.get("X-Auth-Token") == "token"
+            expected = base64.b64encode(f"{controller.user}:{controller.password}".encode()).decode()
+            return not controller.user or self.headers.get("Authorization") == f"Basic {expected}"
+
+        def _answer(self, status: int, document: Answer, headers: Mapping[str, str] | None = None) -> None:
+            if document is None or isinstance(document, int):
+                status, document = document or 404, {}
+            body = document if isinstance(document, bytes) else json.dumps(document).encode()
             self.send_response(status)
-            self.send_header("Content-Type", "application/json")
+            for name, value in {"Content-Type": "application/json", **(headers or {})}.items():
+                self.send_header(name, value)
             self.send_header("Content-Length", str(len(body)))
             self.end_headers()
             self.wfile.write(body)
@@ -102,7 +169,7 @@ def redfish_server(controller: Controller, tls: ssl.SSLContext | None = None) ->
     server.daemon_threads = True
     if tls:
         server.socket = tls.wrap_socket(server.socket, server_side=True)
-    thread = threading.Thread(target=server.serve_forever)
+    thread = threading.Thread(target=server.serve_forever, args=(0.02,))
     thread.start()
     try:
         yield f"{'https' if tls else 'http'}://127.0.0.1:{server.server_address[1]}"

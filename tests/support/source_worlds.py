@@ -249,7 +249,7 @@ class RedfishWorld(World):
         self.controller = Controller(is_new=True)
         self.controller.percent = [40, 40]
         self.controller.status = 503
-        self.settings = {"url": self.stack.enter_context(redfish_server(self.controller))}
+        self.settings = {"url": self.stack.enter_context(redfish_server(self.controller)), **POLLED}
 
     def plug_in(self) -> None:
         self.controller.status = 200

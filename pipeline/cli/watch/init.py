@@ -21,7 +21,7 @@ from fantwin.pipeline.sources.found import Found, free_name
 from fantwin.pipeline.sources.hwmon.config import ROOT
 from fantwin.pipeline.sources.hwmon.discovery import discover_hwmon
 from fantwin.pipeline.sources.logs.discovery import discover_logs
-from fantwin.pipeline.sources.redfish.discovery import discover_controller
+from fantwin.pipeline.sources.redfish.discovery import discover_controllers
 from fantwin.pipeline.sources.serial.discovery import discover_device, serial_ports
 
 
@@ -62,11 +62,18 @@ def init(
     redfish: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="URL", help="Watch the fans of a server by its controller: https://USER@HOST. Repeatable."
+            metavar="URL",
+            help="Watch the fans of a server by its controller: https://USER@HOST, or of a range: "
+            "https://bmc[001-400]. Repeatable.",
         ),
     ] = None,
     password_file: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="File with the password of that user in its first line.")
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="File with the password of that user in its first line; or a folder with such a file for each host, "
+            "called like it, and `default`.",
+        ),
     ] = None,
     logs: Annotated[
         Path | None, typer.Option(metavar="FOLDER", help="Say how the logs or tables in this folder are read.")
@@ -83,7 +90,7 @@ def init(
 
     Example: fantwin init --hwmon --writable
 
-    Example: fantwin init --serial /dev/ttyUSB0 --redfish https://ann@bmc1 --password-file bmc.secret
+    Example: fantwin init --redfish "https://ann@bmc[001-400].hall" --password-file bmc.secret
     """
     root = root.absolute() if root != ROOT else root
     chosen = Chosen(hwmon or writable, writable, tuple(serial or ()), tuple(redfish or ()), password_file, logs)
@@ -110,7 +117,7 @@ def init(
     lines = [
         *(f"{each.title}: {line}" for each in trays for line in (*each.notes, *each.missing)),
         *(f"left out: {line}" for line in left_out),
-        *(f"{config}: written, tray {each.tray['name']}, fans {each.fans}" for each in trays),
+        *(f"{config}: written, {_called(each)}, fans {each.fans}" for each in trays),
         *(f"{chosen.logs}: {each.format}, {len(each.files)} files" for each in found_logs),
         *(f"next: {line}" for line in following),
     ]
@@ -125,10 +132,15 @@ def _discovered(chosen: Chosen, root: Path, folder: Path) -> Iterator[Found]:
     with working("reading the devices"):
         found = [*discover_hwmon(root, writable=chosen.writable)] if chosen.hwmon else []
         found += [discover_device(port) for port in chosen.serial]
-        found += [discover_controller(url, chosen.password_file, folder) for url in chosen.redfish]
+        for url in chosen.redfish:
+            found += discover_controllers(url, chosen.password_file, folder)
     for each in found:
-        named = {**each.tray, "name": free_name(str(each.tray["name"]), names)} if each.tray else {}
-        yield replace(each, tray=named)
+        has_name = "name" in each.tray
+        yield replace(each, tray={**each.tray, "name": free_name(each.tray["name"], names)}) if has_name else each
+
+
+def _called(found: Found) -> str:
+    return f"tray {found.tray['name']}" if "name" in found.tray else f"trays of {found.title}"
 
 
 def _is_terminal() -> bool:

@@ -4,20 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import ClassVar, Literal, Self
+from typing import Annotated, ClassVar, Literal, Self
 
-from pydantic import Field, StrictBool, model_validator
+from pydantic import BeforeValidator, Field, StrictBool, field_validator, model_validator
 
+from fantwin.pipeline.sources.polling import SLOWEST_S, PolledConfig
+from fantwin.pipeline.sources.redfish.fan_objects import MEASURED_PERCENT
 from fantwin.pipeline.sources.secret_file import LogIn
-from fantwin.pipeline.sources.source import SourceConfig
 
 
-class RedfishConfig(SourceConfig, LogIn, frozen=True):
+def _several(value: object) -> object:
+    return (value,) if isinstance(value, str) and value else value or ()
+
+
+class RedfishConfig(PolledConfig, LogIn, frozen=True):
     """Fans of a server by its baseboard controller. It needs the extra `devices`."""
 
     schemes: ClassVar[Mapping[str, int]] = {"http": 80, "https": 443}
+    shares_process: ClassVar[bool] = True
 
     kind: Literal["redfish"] = "redfish"
+    period_s: float = Field(default=1.0, gt=0, le=SLOWEST_S, description="time between two readings")
     url: str = Field(
         description="address of the controller, for example https://bmc1, or https://USER@bmc1 to log in; where it has "
         "several chassis, that of the chassis: https://bmc1/redfish/v1/Chassis/Sled2"
@@ -26,24 +33,48 @@ class RedfishConfig(SourceConfig, LogIn, frozen=True):
         default=(),
         description="names or ids of the fans, in the order of the tray; without it all, in the controller's order",
     )
-    command: str = Field(
-        default="/SpeedPercent/Reading",
-        pattern="^/",
-        description="where the command is in the object of a fan (JSON pointer); its unit is the tray's",
+    command: Annotated[tuple[str, ...], BeforeValidator(_several, json_schema_input_type=str | tuple[str, ...])] = (
+        Field(
+            default=(),
+            description="where the command of each fan is, or one for all: a JSON pointer in the object of a fan "
+            "(/Oem/Vendor/PWM), the name of a sensor of the chassis (fanpwm_FAN1), or PATH#POINTER of a resource. "
+            "Without it, the set-point of the fan, or the pwm that the controller names like it",
+        )
+    )
+    speed: str = Field(
+        default="",
+        pattern="^(/.*)?$",
+        description="where the speed in rpm is, if the controller does not say so: a JSON pointer in the object of a "
+        "fan (/Reading)",
+    )
+    rated_rpm: float | None = Field(
+        default=None,
+        gt=0,
+        description="speed at 100 %, of fans whose measured speed the controller gives in per cent alone",
     )
     temperature: str = Field(
         default="",
-        description="sensor of the air: its name (Thermal), or a key of TemperatureSummaryCelsius (ThermalSubsystem)",
+        description="sensor of the air: its name (Thermal, ThermalMetrics), a key of TemperatureSummaryCelsius, or the "
+        "name of a sensor of the chassis",
     )
     verify: StrictBool | Path = Field(
         default=True,
         description="whether the certificate of the controller is checked; or that of the authority that signed it",
     )
 
+    @field_validator("command")
+    @classmethod
+    def _is_no_measurement(cls, value: tuple[str, ...]) -> tuple[str, ...]:
+        if MEASURED_PERCENT in value:
+            raise ValueError(f"{MEASURED_PERCENT} is the measured speed in per cent of the rated one: no command")
+        return value
+
     @model_validator(mode="after")
     def _has_password(self) -> Self:
         if self.username and not self.password_file:
             raise ValueError("the user in url needs password_file")
+        if self.speed and self.speed in self.command:
+            raise ValueError(f"speed and command are both {self.speed}: a twin of it could never be wrong")
         return self
 
     @property

@@ -2,20 +2,76 @@
 
 from __future__ import annotations
 
+import json
 import math
 import re
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 from pydantic import ValidationError
 
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.sources.found import Found
-from fantwin.pipeline.sources.polling import DeviceError
+from fantwin.pipeline.sources.host_address import hosts_of
 from fantwin.pipeline.sources.redfish.config import RedfishConfig
 from fantwin.pipeline.sources.redfish.source import RedfishSource
 from fantwin.pipeline.sources.source import SourceContext
 
 HIGHEST_RPM = 50_000
+AT_ONCE = 32
+"""controllers that are asked at the same time"""
+
+
+def discover_controllers(url: str, password_file: Path | None, folder: Path) -> list[Found]:
+    """The [[tray]] of a controller, or of those of a range: one for all that have the same fans.
+
+    Of a range, a controller that cannot be asked is one that can be no tray.
+
+    Raises:
+        UserError: the address or the range is none, or its only controller cannot be asked, or has no fans.
+    """
+    try:
+        urls = hosts_of(url)
+    except ValueError as error:
+        raise UserError(f"--redfish {error}") from error
+    if urls == [url]:
+        return [discover_controller(url, password_file, folder)]
+
+    def found(each: str) -> Found:
+        try:
+            return discover_controller(each, password_file, folder)
+        except UserError as error:
+            return Found("redfish", f"controller {each}", {}, missing=(str(error).removeprefix(f"{each}: "),))
+
+    with ThreadPoolExecutor(AT_ONCE) as pool:
+        return list(_alike(url, list(pool.map(found, urls))))
+
+
+def _alike(url: str, found: Sequence[Found]) -> Iterator[Found]:
+    """One tray with hosts for all controllers whose trays differ in nothing else; and those that are none."""
+    groups: dict[str, list[Found]] = {}
+    for each in found:
+        if each.tray:
+            groups.setdefault(json.dumps(_template(each.tray)), []).append(each)
+    for template, group in groups.items():
+        hosts = [_host(each.tray) for each in group]
+        of_range = re.sub(r"^[a-z]+://(?:.*@)?|/.*$", "", url)
+        names = [of_range] if len(group) == len(found) else hosts
+        title = f"{len(group)} controllers, {hosts[0]} to {hosts[-1]}"
+        notes = tuple(re.sub(r": .*", "", note) for note in group[0].notes)
+        yield Found("redfish", title, {"hosts": names, **json.loads(template)}, notes, group[0].missing)
+    yield from (each for each in found if not each.tray)
+
+
+def _host(tray: Mapping[str, Any]) -> str:
+    return RedfishConfig.model_validate(tray["source"]).parts.netloc.rpartition("@")[2]
+
+
+def _template(tray: Mapping[str, Any]) -> dict[str, Any]:
+    source = {**tray["source"], "url": tray["source"]["url"].replace(_host(tray), "{host}")}
+    return {key: value for key, value in tray.items() if key != "name"} | {"source": source}
 
 
 def discover_controller(url: str, password_file: Path | None, folder: Path) -> Found:
@@ -31,18 +87,17 @@ def discover_controller(url: str, password_file: Path | None, folder: Path) -> F
     source = RedfishSource(config, SourceContext(0, "rpm", folder))
     try:
         source.connect()
-        fans = source.fans_there()
-    except DeviceError as error:
+        fans, problem = source.fans_there()
+    except UserError as error:
         raise UserError(f"{url}: {error}") from error
     finally:
         source.disconnect()
     if not fans:
         raise UserError(f"{url}: it has no fans")
-    notes = [f"fan {number} is {fan.name}: {fan.rpm:.0f} rpm" for number, fan in enumerate(fans)]
-    missing = []
-    if lacking := [fan.name for fan in fans if math.isnan(fan.command)]:
-        where = f"no command at {config.command} of {', '.join(lacking)}"
-        missing = [f"{where}: say with source.command where it is; without commands no twin can be learned"]
+    notes = [f"fan {number} is {fan.name}: {_shown(fan.rpm)} rpm" for number, fan in enumerate(fans)]
+    lacking = [fan.name for fan in fans if math.isnan(fan.command)]
+    if lacking and not problem:
+        problem = f"no command is known of {', '.join(lacking)}: say where by source.command"
     are_named = len({fan.called.casefold() for fan in fans} - {""}) == len(fans)
     named = {"fan": [{"name": fan.called, "place": fan.place} for fan in fans]}
     keys = {
@@ -58,4 +113,9 @@ def discover_controller(url: str, password_file: Path | None, folder: Path) -> F
             "fans": [fan.name for fan in fans],
         },
     }
-    return Found("redfish", f"controller {config.address}{config.chassis}", keys, tuple(notes), tuple(missing))
+    missing = (problem,) if problem else ()
+    return Found("redfish", f"controller {config.address}{config.chassis}", keys, tuple(notes), missing)
+
+
+def _shown(rpm: float) -> str:
+    return "no" if math.isnan(rpm) else f"{rpm:.0f}"

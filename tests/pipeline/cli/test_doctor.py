@@ -158,7 +158,7 @@ def test_the_ports_of_the_own_running_site_are_no_problem_and_those_of_a_strange
     [
         (NEEDED[0], "problems", f"{NEEDED[0]}: not installed; {how_to_install('fantwin')}"),
         (NEEDED[-1], "problems", f"{NEEDED[-1]}: not installed; {how_to_install('fantwin')}"),
-        ("sushy", "good", f"extra 'devices': not installed (sushy); {how_to_install('fantwin[devices]')}"),
+        ("pymodbus", "good", f"extra 'devices': not installed (pymodbus); {how_to_install('fantwin[devices]')}"),
     ],
 )
 def test_a_package_that_fantwin_needs_is_a_problem_when_it_is_missing_and_one_of_an_extra_is_none(

@@ -23,6 +23,7 @@ from fantwin.pipeline.sources.serial.config import SerialConfig
 from fantwin.schemas.wire import Protocol, Sample, encode
 from tests.support.fantwin_command import as_typed, error_of, fantwin, usage_error_of
 from tests.support.hwmon_trees import add_chip, board
+from tests.support.ports import free_port
 from tests.support.redfish_server import Controller, redfish_server
 from tests.support.written_logs import write_ulog
 
@@ -123,9 +124,28 @@ def test_the_fans_of_a_controller_are_named_as_it_names_them(file: Path) -> None
     assert isinstance(one.source, RedfishConfig) and one.source.fans == ("FAN1", "FAN2")
     with redfish_server(Controller(is_new=False)) as url:
         missing = fantwin("init", "--redfish", url, "-c", "old.toml").stdout
-    assert "no command at /SpeedPercent/Reading of FAN1, FAN2: say with source.command where it is" in missing
+    assert "no command is known: say where by source.command; FAN1 has Reading 4000, Oem/Vendor/PWM 40" in missing
     gone = f"{url}: does not answer within 5 s, or cannot be reached; waiting for it"
     assert error_of("init", "--redfish", url, "-c", "new.toml") == gone
+
+
+def test_a_range_of_controllers_is_one_tray_with_hosts_and_one_that_does_not_answer_is_named(file: Path) -> None:
+    with redfish_server(Controller(is_new=True)) as one, redfish_server(Controller(is_new=True)) as other:
+        ports = sorted(int(url.rpartition(":")[2]) for url in (one, other))
+        gone = free_port()
+        url = f"http://127.0.0.1:[{ports[0]},{gone},{ports[1]}]"
+        done = fantwin("init", "--redfish", url)
+    assert done.exit_code == 0, done.output
+    assert [tray.fans for tray in trays(file)] == [2, 2]
+    assert [tray.source.url for tray in trays(file) if isinstance(tray.source, RedfishConfig)] == [
+        f"http://127.0.0.1:{port}" for port in ports
+    ]
+    assert file.read_text().count("[[tray]]") == 1
+    assert f"left out: controller http://127.0.0.1:{gone}: does not answer within 5 s, or cannot" in done.stdout
+    assert f"trays of 2 controllers, 127.0.0.1:{ports[0]} to 127.0.0.1:{ports[1]}, fans 2" in done.stdout
+    assert error_of("init", "--redfish", "https://bmc[9-1]", "-c", "x.toml").startswith(
+        "--redfish https://bmc[9-1]: a r"
+    )
 
 
 def test_logs_need_no_configuration_and_the_command_that_reads_them_is_said(file: Path, tmp_path: Path) -> None:
