@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 from fantwin.pipeline.runtime.ending import Step
 from fantwin.pipeline.runtime.inbox import FromSource, Inbox
 from fantwin.pipeline.runtime.stage import BuiltStage, Core, Source
+
+MOST_STOPPED_AT_ONCE = 128
+"""a controller that does not answer takes seconds to be left, and a stage may have hundreds"""
 
 
 class Sources:
@@ -50,11 +54,9 @@ class Sources:
         return self._stopping
 
     def _stop_each(self) -> None:
-        errors: list[Exception] = []
-        for source in self._started:
-            try:
-                source.stop()
-            except Exception as error:  # noqa: BLE001  the others are stopped as well
-                errors.append(error)
-        if errors:
-            raise errors[0]
+        if not self._started:
+            return
+        with ThreadPoolExecutor(min(len(self._started), MOST_STOPPED_AT_ONCE)) as pool:
+            stopped = [pool.submit(source.stop) for source in self._started]  # one waits for its device, not for others
+        for each in stopped:
+            each.result()

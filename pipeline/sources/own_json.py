@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 import re
-import sys
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from typing import Any
 
 from pydantic import BaseModel, Field
@@ -81,8 +81,7 @@ def number_at(value: Any, pointer: str) -> float:
 def _at(value: Any, pointer: str) -> tuple[bool, Any]:
     """Whether there is a value at a pointer, and it; or the last value on the way there."""
     here = value
-    for part in pointer.split("/")[1:]:
-        key = part.replace("~1", "/").replace("~0", "~")
+    for key in _keys_of(pointer):
         if isinstance(here, Mapping) and key in here:
             here = here[key]
         elif isinstance(here, Sequence) and not isinstance(here, str) and key.isdecimal() and int(key) < len(here):
@@ -92,6 +91,11 @@ def _at(value: Any, pointer: str) -> tuple[bool, Any]:
     return True, here
 
 
+@lru_cache(maxsize=1024)
+def _keys_of(pointer: str) -> tuple[str, ...]:
+    return tuple(part.replace("~1", "/").replace("~0", "~") for part in pointer.split("/")[1:])
+
+
 def number_of(value: Any, *, speed_unit: str = "", on: float = math.nan) -> float | None:
     """The number that a device writes; NaN where it says that there is none, None where it is no number.
 
@@ -99,7 +103,10 @@ def number_of(value: Any, *, speed_unit: str = "", on: float = math.nan) -> floa
     on: the command of a fan that is switched on, for values such as ON and true; NaN: they are no number.
     """
     if isinstance(value, int | float) and not isinstance(value, bool):
-        return float(value) if abs(value) <= sys.float_info.max else math.copysign(math.inf, value)
+        try:
+            return float(value)
+        except OverflowError:
+            return None
     text = "" if value is None else str(value).strip().lower() if isinstance(value, str | bool) else "-"
     if text in _NONE:
         return math.nan

@@ -176,7 +176,7 @@ def test_doctor_prints_what_each_source_and_stage_lacks(capsys, monkeypatch):
     Path("fantwin.toml").write_text(CONFIGURATION.format(folder=Path.cwd(), launcher=NAMED))
     lines = printed_by("doctor --listen-s 0", capsys, monkeypatch)
     for what, extra in {
-        **{f"source {kind}": "devices" for kind in ("mqtt", "modbus", "redfish")},
+        **{f"source {kind}": "devices" for kind in ("mqtt", "modbus")},
         **{f"stage {stage}": "outputs" for stage in ("opcua", "mqtt")},
         "target mail: apprise": "outputs",
         "stage viewer": "view",

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
+import base64
+import http.client
 import json
 import ssl
 from collections.abc import Mapping
 from contextlib import suppress
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
-from urllib.parse import urlsplit
+from typing import Any
+from urllib.parse import urljoin, urlsplit
 
 from fantwin.pipeline.sources.polling import DeviceError
-
-if TYPE_CHECKING:
-    from urllib3 import HTTPConnectionPool
 
 Json = Mapping[str, Any]
 ROOT = "/redfish/v1/"
@@ -29,54 +28,52 @@ class RedfishClient:
 
     def __init__(self, address: str, verify: bool | str, user: str, password: str | None) -> None:
         """address: scheme, host and port. verify: whether the certificate is, or the file of its authority."""
-        import urllib3  # noqa: PLC0415  of an extra
-
-        if user and urlsplit(address).scheme == "http":
+        parts = urlsplit(address)
+        if user and parts.scheme == "http":
             raise DeviceError(f"{address} would send the password in the clear: use https")
-        options: dict[str, Any] = {}
-        if address.startswith("https:"):
+        self._address = address
+        host = parts.hostname or ""
+        if parts.scheme == "http":
+            self._line = http.client.HTTPConnection(host, parts.port, timeout=TIMEOUT_S)
+        else:
             try:
-                options["ssl_context"] = _tls(verify)
+                tls = _tls(verify)
             except OSError as error:
                 raise DeviceError(f"source.verify = {verify}: {error.strerror or error}") from error
-            if verify is False:
-                options["assert_hostname"] = False
-                urllib3.disable_warnings(urllib3.exceptions.InsecureRequestWarning)
-        self._pool: HTTPConnectionPool = urllib3.connection_from_url(
-            address,
-            maxsize=1,
-            timeout=urllib3.Timeout(connect=TIMEOUT_S, read=TIMEOUT_S),
-            retries=urllib3.Retry(MOST_REDIRECTS, connect=0, read=0, redirect=MOST_REDIRECTS, status=0, other=0),
-            headers={"Accept": "application/json", "OData-Version": "4.0", "User-Agent": "fantwin"},
-            **options,
-        )
-        self._login: dict[str, str] = {}
-        """headers that say who asks"""
-        self._session = ""
+            self._line = http.client.HTTPSConnection(host, parts.port, timeout=TIMEOUT_S, context=tls)
         self._user, self._password = user, password or ""
+        self._headers = {"Accept": "application/json", "OData-Version": "4.0", "User-Agent": "fantwin"}
+        self._session = ""
+        """path of the session that has begun"""
 
     def log_in(self) -> None:
         """Begin a session; a controller without sessions is sent user and password with each request."""
-        import urllib3  # noqa: PLC0415
-
         if not self._user:
             return
         said = json.dumps({"UserName": self._user, "Password": self._password})
         status, headers, _ = self._send("POST", f"{ROOT}SessionService/Sessions", said)
-        if token := headers.get("X-Auth-Token", ""):
-            self._login = {"X-Auth-Token": token}
+        if token := headers.get("X-Auth-Token"):
+            self._headers["X-Auth-Token"] = token
             self._session = urlsplit(headers.get("Location", "")).path
-        elif status == 401:
+        elif status == http.client.UNAUTHORIZED:
             raise _refused_login()
         else:
-            self._login = urllib3.make_headers(basic_auth=f"{self._user}:{self._password}")
+            basic = base64.b64encode(f"{self._user}:{self._password}".encode()).decode()
+            self._headers["Authorization"] = f"Basic {basic}"
 
     def get(self, path: str) -> Json:
         """The object at a path."""
-        status, _, body = self._send("GET", path)
-        if status in (401, 403):
+        status, headers, body = self._send("GET", path)
+        for _ in range(MOST_REDIRECTS):
+            if status not in (301, 302, 303, 307, 308):
+                break
+            there = urlsplit(urljoin(f"{self._address}{path}", headers.get("Location", "")))
+            if f"{there.scheme}://{there.netloc}" != self._address:
+                raise DeviceError(f"{path}: sent to another host, so no Redfish service")
+            status, headers, body = self._send("GET", there._replace(scheme="", netloc="").geturl())
+        if status in (http.client.UNAUTHORIZED, http.client.FORBIDDEN):
             raise _refused_login()
-        if status >= 300:
+        if status >= http.client.MULTIPLE_CHOICES:
             raise DeviceError(f"{path}: refused with HTTP status {status}")
         try:
             found = json.loads(body)
@@ -91,33 +88,36 @@ class RedfishClient:
         if self._session:
             with suppress(DeviceError):
                 self._send("DELETE", self._session)
-        self._session, self._login = "", {}
-        self._pool.close()
+        self._session = ""
+        self._line.close()
 
-    def _send(self, method: str, path: str, body: str | None = None) -> tuple[int, Mapping[str, str], bytes]:
-        from urllib3 import exceptions  # noqa: PLC0415
-
-        headers = {**self._pool.headers, **self._login}
-        if body is not None:
-            headers["Content-Type"] = "application/json"
+    def _send(self, method: str, path: str, body: str | None = None) -> tuple[int, http.client.HTTPMessage, bytes]:
+        headers = self._headers if body is None else {**self._headers, "Content-Type": "application/json"}
+        is_kept = self._line.sock is not None
         try:
-            answer = self._pool.urlopen(method, path, body, headers, preload_content=False)
-            content = answer.read(LARGEST_BYTES + 1, decode_content=True)
-        except exceptions.HTTPError as error:
-            cause = error.reason if isinstance(error, exceptions.MaxRetryError) else error
-            if isinstance(cause, exceptions.SSLError) and "certificate" in str(cause).lower():
-                why = "its certificate cannot be verified: name the authority by source.verify"
-            elif isinstance(cause, exceptions.SSLError):
-                why = f"no TLS connection: {cause}"
-            elif isinstance(cause, exceptions.ResponseError | exceptions.HostChangedError):
-                raise DeviceError(f"{path}: sent elsewhere, so no Redfish service") from error
-            else:
-                why = f"does not answer within {TIMEOUT_S:g} s, or cannot be reached"
-            raise DeviceError(f"{why}; waiting for it", is_lost=True) from error
+            self._line.request(method, path, body, headers)
+            answer = self._line.getresponse()
+            content = answer.read(LARGEST_BYTES + 1)
+        except ConnectionError as error:
+            self._line.close()
+            if is_kept:  # the controller has ended it meanwhile
+                return self._send(method, path, body)
+            raise _lost() from error
+        except ssl.SSLCertVerificationError as error:
+            self._line.close()
+            raise _lost("its certificate cannot be verified: name the authority by source.verify") from error
+        except ssl.SSLError as error:
+            self._line.close()
+            raise _lost(f"no TLS connection: {error.reason}") from error
+        except (OSError, UnicodeError) as error:  # UnicodeError: a name that can be no host
+            self._line.close()
+            raise _lost() from error
+        except (http.client.HTTPException, ValueError) as error:
+            self._line.close()
+            raise DeviceError(f"{path}: no HTTP, so no Redfish service: {type(error).__name__}") from error
         if len(content) > LARGEST_BYTES:
-            answer.close()
+            self._line.close()
             raise DeviceError(f"{path}: an answer of more than {LARGEST_BYTES:,} bytes")
-        answer.release_conn()
         return answer.status, answer.headers, content
 
 
@@ -129,6 +129,11 @@ def _tls(verify: bool | str) -> ssl.SSLContext:
         context.check_hostname = False
         context.verify_mode = ssl.CERT_NONE
     return context
+
+
+def _lost(why: str = "") -> DeviceError:
+    why = why or f"does not answer within {TIMEOUT_S:g} s, or cannot be reached"
+    return DeviceError(f"{why}; waiting for it", is_lost=True)
 
 
 def _refused_login() -> DeviceError:

@@ -18,7 +18,7 @@ def _several(value: object) -> object:
 
 
 class RedfishConfig(PolledConfig, LogIn, frozen=True):
-    """Fans of a server by its baseboard controller. It needs the extra `devices`."""
+    """Fans of a server by its baseboard controller."""
 
     schemes: ClassVar[Mapping[str, int]] = {"http": 80, "https": 443}
     shares_process: ClassVar[bool] = True

@@ -10,6 +10,7 @@ import math
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 from fantwin.pipeline.sources.own_json import found_at, has, number_at
@@ -37,13 +38,16 @@ _SIDES = {"tach", "tacho", "fantach", "fanpwm", "pwm", "rpm", "duty", "speed", "
 
 @dataclass
 class FanObject:
-    """A fan as the controller lists it. sensor: where its speed comes from. why_unread: empty if it could be read."""
+    """A fan as the controller lists it. why_unread: empty if it could be read.
+
+    sensor: where its speed comes from, set before its speed is asked for.
+    """
 
     own: Json
     sensor: Json = field(default_factory=dict[str, Any])
     why_unread: str = ""
 
-    @property
+    @cached_property
     def keys(self) -> list[str]:
         """What it may be called by in `source.fans`, the best one first."""
         return [str(self.own[key]) for key in NAMES if self.own.get(key) not in (None, "")]
@@ -60,7 +64,7 @@ class FanObject:
         places = (str(each) for each in (label, self.own.get("PhysicalContext")) if each)
         return next(filter(is_one_short_line, places), "")
 
-    @property
+    @cached_property
     def is_measured(self) -> bool:
         """False where it is absent, or off."""
         return found_at(self.own, "/Status/State") not in NOT_MEASURED
@@ -106,6 +110,8 @@ class FanObject:
 def rpm_at(value: Json) -> str:
     """The pointer of the speed in rpm of an object; empty if it has none."""
     found = [pointer for pointer in _RPM_KEYS if has(value, pointer)]
+    if found and not math.isnan(number_at(value, found[0])):
+        return found[0]
     for reading, units in _READINGS:
         if not has(value, reading):
             continue

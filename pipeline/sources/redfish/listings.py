@@ -20,11 +20,14 @@ from fantwin.pipeline.sources.redfish.fan_objects import (
     last_part,
     link,
     listed,
+    rpm_at,
 )
 
 Json: TypeAlias = Mapping[str, Any]
 MOST_SENSORS = 64
 """sensors that are asked one by one"""
+MEMBERS_HOLD = 60
+"""readings after which the members of a collection are asked for again: fans are exchanged while a server runs"""
 SCHEMAS = ("Thermal", "ThermalSubsystem", "EnvironmentMetrics", "Sensors")
 """keys of a chassis that lead to its fans, those that take fewer requests first"""
 
@@ -51,11 +54,14 @@ class ChassisFans:
         self._client = client
         self.path = path
         self._chassis = chassis
-        self._expands = expands
+        self._expanding = ("?$expand=.", "") if expands else ("",)
+        """queries by which a collection may give its members themselves; some controllers do so unasked"""
         self.unread: dict[str, str] = {}
         """why, by path; since it was last cleared"""
         self._links: dict[str, str] = {}
         """what was found to lead where, by resource and key"""
+        self._paths: dict[str, tuple[list[str], int]] = {}
+        """members of collections, and for how many readings they still hold"""
         self._known: dict[str, Json] = {}
         """members of collections as they were last read, by path"""
 
@@ -82,7 +88,7 @@ class ChassisFans:
             "Thermal": lambda: [FanObject(each) for each in listed(self._resource("Thermal"), "Fans")],
             "ThermalSubsystem": self._newer,
             "EnvironmentMetrics": self._metrics,
-            "Sensors": lambda: [self._member(path) for path in self.sensor_paths() if _is_tacho(last_part(path))],
+            "Sensors": lambda: [self._member(path) for path in self._tachos()[:MOST_SENSORS]],
         }
         found = ways[schema]()
         are_mixed = any(each.rpm_at for each in found)
@@ -91,8 +97,7 @@ class ChassisFans:
 
     def sensor_paths(self) -> list[str]:
         """Paths of the sensors of the chassis; none if they cannot be listed."""
-        members = listed(self._resource("Sensors"), "Members")
-        return [path for path in map(link, members) if path]
+        return self._member_paths(link(self._chassis.get("Sensors")))
 
     def sensor(self, path: str) -> Json:
         """A sensor, or any resource; without anything where it cannot be read."""
@@ -156,7 +161,7 @@ class ChassisFans:
     def _newer(self) -> list[FanObject]:
         fans = list(self._members(self._link("ThermalSubsystem", "Fans")))
         for fan in fans:
-            if fan.why_unread or not math.isnan(fan.rpm) or not fan.is_measured:
+            if fan.why_unread or not fan.is_measured or not math.isnan(number_at(fan.own, rpm_at(fan.own))):
                 continue
             path = str(found_at(fan.own, "/SpeedPercent/DataSourceUri") or "")
             if path and not is_pwm_name(last_part(path)):
@@ -176,18 +181,31 @@ class ChassisFans:
             for each in listed(self._resource("EnvironmentMetrics"), "FanSpeedsPercent")
         ]
 
+    def _tachos(self) -> list[str]:
+        return [path for path in self.sensor_paths() if _is_tacho(last_part(path))]
+
+    def _member_paths(self, path: str) -> list[str]:
+        """The paths of the members of a collection, as they were last read."""
+        found, left = self._paths.get(path, ([], 0))
+        if not left:
+            found, left = [each for each in map(link, listed(self.read(path), "Members")) if each], MEMBERS_HOLD
+        self._paths[path] = (found, left - 1 if found else 0)
+        return found
+
     def _members(self, path: str) -> Iterator[FanObject]:
         """The members of a collection. One that cannot be read is there all the same, as it was last known."""
         if not path:
             return
-        collection: Json = {}
-        if self._expands:
-            collection = self.read(f"{path}?$expand=.")
-            self._expands = bool(collection)
-            self.unread.pop(f"{path}?$expand=.", None)
-        collection = collection or self.read(path)
-        for each in listed(collection, "Members"):
-            yield self._member(link(each)) if len(each) == 1 else FanObject(each)
+        for query in self._expanding:
+            members = listed(self.read(f"{path}{query}"), "Members")
+            if any(len(each) > 1 for each in members):
+                self._expanding = (query,)
+                yield from (self._member(link(each)) if len(each) == 1 else FanObject(each) for each in members)
+                return
+            self.unread.pop(f"{path}{query}", None)
+        self._expanding = ()
+        for each in self._member_paths(path):
+            yield self._member(each)
 
     def _member(self, path: str) -> FanObject:
         found = self.read(path)

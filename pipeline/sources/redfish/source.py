@@ -12,7 +12,6 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from fantwin.pipeline.errors import refusals
-from fantwin.pipeline.extras import require
 from fantwin.pipeline.sources.own_json import has, number_at
 from fantwin.pipeline.sources.polling import DeviceError, PollingSource
 from fantwin.pipeline.sources.redfish.client import RedfishClient
@@ -41,9 +40,7 @@ class RedfishSource(PollingSource):
     """A `SampleSource`."""
 
     def __init__(self, config: RedfishConfig, context: SourceContext) -> None:
-        """Raises UserError if the extra is missing."""
         super().__init__(config, config.period_s)
-        require("source redfish", "devices", "urllib3")
         self._config = config
         self._fans = context.fans
         self._folder = context.folder
@@ -76,12 +73,14 @@ class RedfishSource(PollingSource):
         client.log_in()
         self._chassis, listing = self._one_of(find_chassis(client, config.chassis))
         self._schema, self._polls_without_speed = listing.schema, 0
+        self.fans_called = ()
         self._commands = FanCommands(self._chassis, config.command)
 
     def read(self) -> Reading | Rejected:
         """Speeds and commands of the fans, and the temperature if asked for."""
         fans, speeds, commands = self._look()
-        self.fans_called = tuple((fan.called, fan.place) for fan in fans)
+        if not self.fans_called:
+            self.fans_called = tuple((fan.called, fan.place) for fan in fans)
         if why := self._why_unusable(fans, commands):
             return why
         measured = {TEMPERATURE: (self._temperature_c(),) * len(fans)} if self._config.temperature else {}
