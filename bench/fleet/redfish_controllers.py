@@ -66,9 +66,8 @@ class Hall:
     def __init__(self, plan: Plan) -> None:
         self.plan = plan
 
-    def fan(self, number: int, fan: int) -> tuple[float, float]:
-        """Command in per cent and speed in rpm, now."""
-        now_s = time.time()
+    def fan(self, number: int, fan: int, now_s: float) -> tuple[float, float]:
+        """Command in per cent and speed in rpm at a time."""
         pace = 2.0 * math.pi / (40.0 + number % 7)
         phase = number / 3.0 + fan
         percent = round(55.0 + 30.0 * math.sin(pace * now_s + phase))
@@ -81,7 +80,7 @@ class Hall:
 
     def answer(self, number: int, path: str) -> tuple[int, Any]:
         """Status and object."""
-        fans = [self.fan(number, fan) for fan in range(FANS)]
+        fans = [self.fan(number, fan, time.time()) for fan in range(FANS)]
         if number in self.plan.broken and path.endswith(("/Fans/2", "fantach_FAN2", "/Oem/Fans")):
             return 500, {}
         documents = {"/redfish/v1": {"Id": "Root", "Chassis": link("/redfish/v1/Chassis")}}

@@ -24,7 +24,7 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from bench.fleet.redfish_controllers import SHAPES, Plan
+from bench.fleet.redfish_controllers import SHAPES, Hall, Plan
 from bench.printing import JsonOption, progress, show
 from bench.runtime.stage_memory import free_endpoint, memory_mb
 from fantwin.pipeline.acquisition.raw_samples import RawSamples
@@ -32,6 +32,10 @@ from fantwin.pipeline.bus.session import join_bus
 from fantwin.pipeline.config.loading import load_config
 from fantwin.pipeline.config.settings import Config
 from fantwin.pipeline.site.site_watcher import SiteWatcher
+from fantwin.schemas.codec import decode
+from fantwin.schemas.enums import Transition
+from fantwin.schemas.messages import Alarm
+from fantwin.schemas.topics import tray_key
 from fantwin.schemas.units import NS_PER_S
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
@@ -39,6 +43,9 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 from tests.support.running_chain import RunningCommand, eventually
 
 STARTS_S = 300.0
+FAULT_AFTER_S = 150.0
+"""since the controllers were started: the fans are known by then"""
+LEARNED_S = 1800.0
 ORDINARY = "ordinary"
 
 
@@ -48,17 +55,24 @@ def main(
     period_s: Annotated[float, typer.Option(help="Between two readings.")] = 1.0,
     seconds: Annotated[float, typer.Option(help="That are measured.")] = 60.0,
     tls: Annotated[bool, typer.Option("--tls", help="By HTTPS.")] = False,
+    faulty: Annotated[
+        int, typer.Option(help="Controllers with a fan that becomes 15 % slower; fans are then scored, too.")
+    ] = 0,
     json_output: JsonOption = False,
 ) -> None:
     """Print what acquisition takes, and by kind of controller which of the due samples came, and when."""
     plan = Plan(_free_port(), controllers)
     for number, kind in enumerate(_BAD * bad):
         getattr(plan, kind).append((7 + 11 * number) % controllers)
+    plan.faulty = [(3 + 17 * number) % controllers for number in range(faulty)]
+    plan.fault_at = time.time() + FAULT_AFTER_S
     with tempfile.TemporaryDirectory() as folder:
+        twin = _twin(plan, Path(folder), period_s) if faulty else None
+        plan.fault_at = time.time() + FAULT_AFTER_S
         if tls:
             plan.certificate = _certificate(plan, Path(folder))
         with _served(plan) as server:
-            about, rows = _measured(plan, Path(folder), period_s, seconds, server)
+            about, rows = _measured(plan, Path(folder), period_s, seconds, server, twin)
     show({"acquisition": [about], "samples by kind of controller": rows}, [], as_json=json_output)
 
 
@@ -66,14 +80,16 @@ _BAD = ("broken", "slow", "silent", "lying", "dead")
 
 
 def _measured(
-    plan: Plan, folder: Path, period_s: float, seconds: float, server: int
+    plan: Plan, folder: Path, period_s: float, seconds: float, server: int, twin: Path | None
 ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     path = folder / "site.toml"
-    path.write_text(_configuration(plan, period_s), encoding="utf-8")
+    path.write_text(_configuration(plan, period_s, twin), encoding="utf-8")
     config = load_config(path, stages=())
     names = [tray.name for tray in config.trays]
     with join_bus(config) as bus:
         watcher, arriving = SiteWatcher(bus, config.site), RawSamples(bus, config.site, names)
+        raised: list[tuple[str, int]] = []
+        bus.subscribe(tray_key(config.site, "*", "alarm"), lambda _key, payload: _add_alarm(raised, payload))
         progress("starting acquisition")
         began_s = time.monotonic()
         up = RunningCommand(["up", "-c", path, "--json"])
@@ -87,7 +103,9 @@ def _measured(
 
             eventually(all_send, "all controllers that can be read are read", STARTS_S)
             started_s = time.monotonic() - began_s
-            process = next(view.health.process_id for view in watcher.stages() if view.alive)
+            process = next(
+                view.health.process_id for view in watcher.stages() if view.alive and view.health.stage == "acquisition"
+            )
             cpu_s = [_cpu_s(process), _cpu_s(server)]
             progress(f"{len(seen)} controllers after {started_s:.0f} s; measuring for {seconds:g} s")
             times_ns, delays_s = _received(arriving, seconds)
@@ -105,10 +123,49 @@ def _measured(
                 "99 %, ms": 1e3 * float(np.quantile(delays_s, 0.99)),
                 "controllers' core, %": 100.0 * used_s[1] / seconds,
             }
+            if twin:
+                about |= _alarms(plan, raised)
             up.end()
         finally:
             up.kill()
     return about, list(_rows(plan, config, times_ns, seconds / period_s))
+
+
+def _add_alarm(raised: list[tuple[str, int]], payload: bytes) -> None:
+    alarm = decode(Alarm, payload)
+    if alarm.transition == Transition.RAISED:
+        raised.append((alarm.header.tray, alarm.fan))
+
+
+def _alarms(plan: Plan, raised: Sequence[tuple[str, int]]) -> dict[str, Any]:
+    faulty = {(plan.address(number).replace(".", "-"), 0) for number in plan.faulty}
+    return {
+        "faults": len(faulty),
+        "found": len(faulty & set(raised)),
+        "other alarms": len([each for each in raised if each not in faulty]),
+    }
+
+
+def _twin(plan: Plan, folder: Path, period_s: float) -> Path:
+    """A calibrated twin of the fans, from tables of what three of them did, sampled like the hall."""
+    progress("learning the twin")
+    hall, twin = Hall(plan), folder / "twin.onnx"
+    for fan in range(3):
+        at_s = np.arange(0.0, LEARNED_S, period_s)
+        rows = [f"{t:g},{u:g},{y:g}" for t, (u, y) in ((t, hall.fan(fan + 1, 0, float(t))) for t in at_s)]
+        (folder / f"{fan}.csv").write_text("\n".join(["t,u,y", *rows, ""]), encoding="ascii")
+        table = f"import {folder}/{fan}.csv --time t:s --command u --speed y:rpm -o {folder}/{fan}.mcap"
+        _run(table)
+    _run(f"train {folder}/0.mcap --validate {folder}/1.mcap --model physical -o {twin}")
+    _run(f"calibrate {twin} {folder}/1.mcap {folder}/2.mcap --false-alarms-per-day 1 --extrapolate")
+    return twin
+
+
+def _run(words: str) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "fantwin", *words.split()], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
 
 
 def _received(arriving: RawSamples, seconds: float) -> tuple[Mapping[str, list[int]], list[float]]:
@@ -145,7 +202,7 @@ def _rows(plan: Plan, config: Config, times_ns: Mapping[str, list[int]], due: fl
         }
 
 
-def _configuration(plan: Plan, period_s: float) -> str:
+def _configuration(plan: Plan, period_s: float, twin: Path | None) -> str:
     scheme = "https" if plan.certificate else "http"
     trays = ""
     for shape, command in enumerate(SHAPES.values()):
@@ -153,11 +210,14 @@ def _configuration(plan: Plan, period_s: float) -> str:
         source = {"kind": "redfish", "url": f"{scheme}://{{host}}:{plan.port}", "command": command}
         keys = "".join(f"{key} = {json.dumps(value)}\n" for key, value in source.items() if value)
         verify = f"verify = {json.dumps(plan.certificate)}\n" if plan.certificate else ""
+        of_twin = f"twin = {json.dumps(str(twin))}\n" if twin else ""
         trays += (
             f'[[tray]]\nhosts = {json.dumps(hosts)}\nfans = 2\nspeed_unit = "rpm"\nspeed_max = 50000\n'
-            f"command_max = 100\n[tray.source]\n{keys}{verify}period_s = {period_s:g}\n"
+            f"command_max = 100\n{of_twin}[tray.source]\n{keys}{verify}period_s = {period_s:g}\n"
         )
-    bus, launcher = f'bus = {{ endpoint = "{free_endpoint()}" }}', 'launcher = { stages = ["acquisition"] }'
+    stages = ["acquisition", *(("resampler", "twin_integrator", "scorer") if twin else ())]
+    bus = f'bus = {{ endpoint = "{free_endpoint()}" }}'
+    launcher = f"launcher = {{ stages = {json.dumps(stages)} }}"
     return f'run_folder = "runs"\n{bus}\n{launcher}\n{trays}'
 
 

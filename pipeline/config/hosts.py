@@ -16,8 +16,8 @@ from fantwin.pipeline.sources.host_address import hosts_of
 
 MOST_TRAYS = 4096
 ABOUT = (
-    "instead of name: many devices alike, each of them a tray. Names or ranges (`bmc[001-400].hall`), or tables { host "
-    "= ..., KEY = ... }; {host}, {name} (the host without its domain) and {KEY} in texts of this tray stand for theirs"
+    "instead of name: devices alike, each a tray: names, ranges (`bmc[001-400].hall`), or tables { host = ..., KEY = "
+    "... }; texts may contain {host}, {name} (the host without its domain) and {KEY}"
 )
 _PLACE = re.compile(r"\{([a-z_]+)\}")
 

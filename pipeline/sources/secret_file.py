@@ -30,8 +30,8 @@ class LogIn(BaseModel, frozen=True):
     url: str
     password_file: Path | None = Field(
         default=None,
-        description="file with the password in its first line; only its owner may be able to read it. Or a folder with "
-        "such a file for each host, called like it, and `default` for all others",
+        description="file with the password in its first line; only its owner may be able to read it. Or a folder of "
+        "such files: HOST, or `default`",
     )
 
     @property

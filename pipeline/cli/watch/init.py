@@ -71,8 +71,8 @@ def init(
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="File with the password of that user in its first line; or a folder with such a file for each host, "
-            "called like it, and `default`.",
+            help="File with the password of that user in its first line; or a folder of such files: HOST, or "
+            "`default`.",
         ),
     ] = None,
     logs: Annotated[

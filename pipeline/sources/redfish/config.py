@@ -36,26 +36,24 @@ class RedfishConfig(PolledConfig, LogIn, frozen=True):
     command: Annotated[tuple[str, ...], BeforeValidator(_several, json_schema_input_type=str | tuple[str, ...])] = (
         Field(
             default=(),
-            description="where the command of each fan is, or one for all: a JSON pointer in the object of a fan "
-            "(/Oem/Vendor/PWM), the name of a sensor of the chassis (fanpwm_FAN1), or PATH#POINTER of a resource. "
-            "Without it, the set-point of the fan, or the pwm that the controller names like it",
+            description="where the command of each fan is, or of all: a JSON pointer in the object of a fan "
+            "(/Oem/Vendor/PWM), a sensor of the chassis (fanpwm_FAN1), or PATH#POINTER of a resource. Without it, its "
+            "set-point, or the pwm that the controller names like it",
         )
     )
     speed: str = Field(
         default="",
         pattern="^(/.*)?$",
-        description="where the speed in rpm is, if the controller does not say so: a JSON pointer in the object of a "
-        "fan (/Reading)",
+        description="where the speed in rpm is in the object of a fan, if the controller does not say so (/Reading)",
     )
     rated_rpm: float | None = Field(
         default=None,
         gt=0,
-        description="speed at 100 %, of fans whose measured speed the controller gives in per cent alone",
+        description="speed at 100 %, where the controller gives the measured speed in per cent alone",
     )
     temperature: str = Field(
         default="",
-        description="sensor of the air: its name (Thermal, ThermalMetrics), a key of TemperatureSummaryCelsius, or the "
-        "name of a sensor of the chassis",
+        description="sensor of the air: its name, or a key of TemperatureSummaryCelsius",
     )
     verify: StrictBool | Path = Field(
         default=True,
