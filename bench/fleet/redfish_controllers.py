@@ -21,6 +21,8 @@ from typing import Any
 
 FANS = 2
 CHASSIS = "/redfish/v1/Chassis/1"
+ONE_DUTY = 4
+"""shape whose fans have one duty"""
 RPM_PER_PERCENT, LAG_S, NOISE_RPM = 150.0, 2.0, 15.0
 SLOW_S = 2.5
 SPEED_LOSS = 0.15
@@ -68,8 +70,8 @@ class Hall:
 
     def fan(self, number: int, fan: int, now_s: float) -> tuple[float, float]:
         """Command in per cent and speed in rpm at a time."""
-        pace = 2.0 * math.pi / (40.0 + number % 7)
-        phase = number / 3.0 + fan
+        pace = 2.0 * math.pi / (120.0 + number % 7)
+        phase = number / 3.0 + (fan if number % len(SHAPES) != ONE_DUTY else 0)
         percent = round(55.0 + 30.0 * math.sin(pace * now_s + phase))
         lagging = math.atan(pace * LAG_S)
         moved = 55.0 + 30.0 * math.cos(lagging) * math.sin(pace * now_s + phase - lagging)

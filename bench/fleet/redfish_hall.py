@@ -43,9 +43,9 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 from tests.support.running_chain import RunningCommand, eventually
 
 STARTS_S = 300.0
-FAULT_AFTER_S = 150.0
+FAULT_AFTER_S = 200.0
 """since the controllers were started: the fans are known by then"""
-LEARNED_S = 1800.0
+LEARNED_S = 1200.0
 ORDINARY = "ordinary"
 
 

@@ -38,6 +38,9 @@ class SourceConfig(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
     shares_process: ClassVar[bool] = False
     """true if one process of acquisition has all such trays of a site, unless the configuration says otherwise"""
 
+    no_speed: ClassVar[str] = "is its tacho connected?"
+    """what to look at where a fan has no speed"""
+
     kind: str
 
     @property

@@ -208,8 +208,9 @@ def _ranges(
     for fan in sorted(silent & doubts.keys()):
         yield False, f"no speed of {tray.label(fan)}: {doubts[fan].read}"
     if unknown := sorted(silent - doubts.keys()):
-        yield False, f"no speed of {tray.names.labels(unknown)}: is its tacho connected?"
-    low, high = float(command.min()), float(command.max())
+        yield False, f"no speed of {tray.names.labels(unknown)}: {tray.source.no_speed}"
+    known_commands = command[np.isfinite(command)]  # a fan's may be unknown, but not all
+    low, high = float(known_commands.min()), float(known_commands.max())
     if twin and not (twin.card.command_range[0] <= high and low <= twin.card.command_range[1]):
         known = "{:g} to {:g}".format(*twin.card.command_range)
         yield False, f"commands {low:g} to {high:g}, and the twin knows {known}: do device and twin have one unit?"

@@ -22,6 +22,7 @@ class RedfishConfig(PolledConfig, LogIn, frozen=True):
 
     schemes: ClassVar[Mapping[str, int]] = {"http": 80, "https": 443}
     shares_process: ClassVar[bool] = True
+    no_speed: ClassVar[str] = "its controller gives none now"
 
     kind: Literal["redfish"] = "redfish"
     period_s: float = Field(default=1.0, gt=0, le=SLOWEST_S, description="time between two readings")

@@ -187,8 +187,8 @@ class RedfishSource(PollingSource):
         if not any(map(self._gives_speed, there)):
             if any(fan.has_percent for fan in there) and not self._config.speed:
                 why = "the controller gives per cent, no rpm: its fans cannot be judged without source.rated_rpm"
-            else:
-                why = f"the object of {called} has no speed in rpm: say where by source.speed; it has {first.numbers}"
+                return Rejected("unknown_speed", why, is_sample=True, setting="source.rated_rpm")
+            why = f"the object of {called} has no speed in rpm: say where by source.speed; it has {first.numbers}"
             return Rejected("unknown_speed", why, is_sample=True, setting="source.speed")
         if all(map(math.isnan, commands)):
             assert self._commands is not None
