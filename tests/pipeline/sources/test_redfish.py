@@ -311,7 +311,7 @@ PERCENT = {"Reading": 12, "ReadingUnits": "Percent"}
         (two({"Reading": None, "ReadingUnits": "RPM", "Status": OFF}), "fans_off", "all fans are off or absent"),
         (
             with_sensors(
-                with_thermal({"Name": "Fan 1", "Reading": 4100, "ReadingUnits": "RPM"}),
+                with_thermal({"Name": "Fan 1", "MemberId": "1", "Reading": 4100, "ReadingUnits": "RPM"}),
                 fanpwm_Pwm_1=(40, "%"),
             ),
             "unknown_command",
