@@ -32,7 +32,7 @@ went wrong as one line on standard error.
 
 {fill(app.info.epilog or "", 120)}
 
-This page is made from the commands in the code: `make reference`. Options of many commands are listed here alone:
+This page is made from the commands in the code: `make reference`. Options of several commands are listed here alone:
 
 """
 _EXAMPLE = re.compile(r"^Example: ((?:.+\n)+)", re.MULTILINE)
@@ -41,8 +41,6 @@ _OF_ALL = re.compile(
 )
 """what each command has alike"""
 _OPTION = re.compile(r"^\* `(-[\w-]+(?:, --[\w-]+)?).*\n?", re.MULTILINE)
-MANY_COMMANDS = 3
-"""an option that as many have alike is said once"""
 
 
 def page() -> str:
@@ -52,7 +50,7 @@ def page() -> str:
         group.command(name)(function_of(name))
     abouts = {name: _about(get_command(group), name) for name in COMMANDS}
     options = Counter(found[0].strip() for about in abouts.values() for found in _OPTION.finditer(about))
-    shared = {line for line, commands in options.items() if commands >= MANY_COMMANDS}
+    shared = {line for line, commands in options.items() if commands > 1}
     parts = [_INTRODUCTION + "".join(f"{line}\n" for line in sorted(shared))]
     for folder, heading in PANELS.items():
         parts.append(f"## {heading}\n")
@@ -72,7 +70,7 @@ def _about(click: Any, name: str) -> str:
 
 
 def _without(shared: set[str], about: str) -> str:
-    """The same, with the names alone of options that many commands share."""
+    """The same, with the names alone of options that several commands have alike."""
     has = [f"`{found[1]}`" for found in _OPTION.finditer(about) if found[0].strip() in shared]
     own = _OPTION.sub(lambda found: "" if found[0].strip() in shared else found[0], about)
     return f"{own.rstrip()}\n" + (f"* and {', '.join(has)}\n" if has else "")

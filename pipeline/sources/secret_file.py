@@ -30,8 +30,8 @@ class LogIn(BaseModel, frozen=True):
     url: str
     password_file: Path | None = Field(
         default=None,
-        description="file with the password in its first line; only its owner may be able to read it. Or a folder of "
-        "such files: HOST, or `default`",
+        description="file whose first line is the password, readable by its owner alone; or a folder of such: HOST, "
+        "`default`",
     )
 
     @property

@@ -200,11 +200,11 @@ class HwmonWorld(World):
         self.stack.callback(shutil.rmtree, self.chip)
 
     def show(self, number: int, source: SampleSource, deliver: Callable[[SourceEvent], None]) -> None:
-        for fan, rpm in enumerate(speeds_of(number), 1):
+        speeds = {f"fan{fan}_input": f"{rpm:.0f}" for fan, rpm in enumerate(speeds_of(number), 1)}
+        for name, text in {**speeds, "pwm1": "128"}.items():  # never a moment without content
             new = self.chip / "new"
-            new.write_text(f"{rpm:.0f}\n")
-            new.rename(self.chip / f"fan{fan}_input")
-        (self.chip / "pwm1").write_text("128\n")
+            new.write_text(f"{text}\n")
+            new.rename(self.chip / name)
 
     def garble(self, source: SampleSource, deliver: Callable[[SourceEvent], None]) -> None:
         (self.chip / "pwm1").write_text("\n")

@@ -20,12 +20,12 @@ class BrokerSettings(LogIn, frozen=True):
     schemes: ClassVar[Mapping[str, int]] = {"mqtt": 1883, "mqtts": 8883}
 
     url: str = Field(
-        description="address of the broker: mqtt://HOST, or mqtts://HOST to encrypt the connection and check the "
-        "broker's certificate; USER@ before the host logs in, :PORT after it is a port other than 1883, of mqtts 8883"
+        description="mqtt://HOST; mqtts://HOST encrypts, and checks the broker's certificate; USER@HOST logs in; "
+        "HOST:PORT, if not 1883 (mqtts: 8883)"
     )
     ca: Path | None = Field(
         default=None,
-        description="certificate of the authority that signed the broker's; without it, those of the system are used",
+        description="authority that signed the broker's certificate; without it, those of the system",
     )
     certificate: Path | None = Field(default=None, description="certificate of this client, if the broker asks for one")
     key: Path | None = Field(default=None, description="private key of that certificate")

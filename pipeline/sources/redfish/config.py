@@ -37,15 +37,14 @@ class RedfishConfig(PolledConfig, LogIn, frozen=True):
     command: Annotated[tuple[str, ...], BeforeValidator(_several, json_schema_input_type=str | tuple[str, ...])] = (
         Field(
             default=(),
-            description="where the command of each fan is, or of all: a JSON pointer in the object of a fan "
-            "(/Oem/Vendor/PWM), a sensor of the chassis (fanpwm_FAN1), or PATH#POINTER of a resource. Without it, its "
-            "set-point, or the pwm that the controller names like it",
+            description="where the command of each fan is, or of all: a JSON pointer in the fan's object "
+            "(/Oem/Vendor/PWM), a sensor (fanpwm_FAN1), or PATH#POINTER; without it, set-point or pwm are looked for",
         )
     )
     speed: str = Field(
         default="",
         pattern="^(/.*)?$",
-        description="where the speed in rpm is in the object of a fan, if the controller does not say so (/Reading)",
+        description="where the speed in rpm is in the fan's object, if the controller does not say so (/Reading)",
     )
     rated_rpm: float | None = Field(
         default=None,

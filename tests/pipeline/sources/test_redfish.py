@@ -432,7 +432,8 @@ def test_a_password_comes_from_a_file_of_its_owner_and_goes_over_a_verified_line
         assert reading(made).speed == (4000.0, 4200.0)
         made.disconnect()
         assert controller.ended == ["/redfish/v1/SessionService/Sessions/7"]
-        assert reading(connected(url, **(settings | {"verify": False}))).speed == (4000.0, 4200.0)
+        settings["verify"] = False
+        assert reading(connected(url, **settings)).speed == (4000.0, 4200.0)
     with pytest.raises(DeviceError, match="would send the password in the clear"):
         connected("http://operator@127.0.0.1:9", folder=tmp_path, password_file="bmc.secret")
     assert SECRET not in caplog.text
