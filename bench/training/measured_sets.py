@@ -22,7 +22,8 @@ from scipy.io import loadmat
 from fantwin.pipeline.learning.training_data import Part, read_training_data
 from fantwin.pipeline.recordings.raw_recordings import write_table
 from fantwin.pipeline.replay.offline.healthy_runs import in_this_process
-from fantwin.pipeline.sources.tables.table_file import read_table
+from fantwin.pipeline.sources.imported_file import read_file
+from fantwin.pipeline.sources.samples_of_file import Wanted
 from fantwin.pipeline.sources.tables.units import RAD_S_PER_TABLE_UNIT
 from fantwin.twin.runs import Run
 
@@ -139,7 +140,7 @@ def _imported(
     name: str | None = None,
 ) -> list[Run]:
     recording = folder / f"{name or table.stem}.mcap"
-    write_table(read_table(table, time, command, speed, period=period), recording, "tray1")
+    write_table(read_file(table, Wanted(command, speed, time, period)), recording, "tray1")
     return read_training_data([recording], Part(), in_this_process).runs
 
 

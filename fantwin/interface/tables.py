@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from fantwin.interface.columns import SUFFIX_OF_UNIT, Columns, Fan, FoundColumns, find_columns
 from fantwin.interface.words import warn
 from fantwin.pipeline.errors import FantwinError
+from fantwin.pipeline.sources.column_file import NO_TIME
 from fantwin.pipeline.sources.tables.fan_columns import FanColumns
 from fantwin.pipeline.sources.tables.measured_table import Table, table_of
 from fantwin.pipeline.sources.tables.units import RAD_S_PER_TABLE_UNIT
@@ -31,7 +32,6 @@ NAME = Path("the table")
 _LEAST_SHARED = 0.5
 """share of the samples of a long table that the fans must have at common times"""
 _SHOWN = 6
-_NOT_A_TIME = np.iinfo(np.int64).min
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class Form:
         if self.times_are == "seconds":
             return np.where(known, t_ns / NS_PER_S, np.nan)
         kind = "datetime64[ns]" if self.times_are == "dates" else "timedelta64[ns]"
-        return np.where(known, t_ns, _NOT_A_TIME).view(kind)
+        return np.where(known, t_ns, NO_TIME).view(kind)
 
     def speed_column(self, name: str) -> str:
         """The name of a column of speeds, with their unit at its end."""
@@ -113,13 +113,10 @@ def fan_table(table: Any, wanted: Columns, *, needs_speed: bool = True) -> FanTa
         command=tuple(f"command of fan {fan}" for fan in of.fans),
         speed=tuple(f"speed of fan {fan}" for fan in of.fans),
         others={what: tuple(f"{what} of fan {fan}" for fan in of.fans) for what in found.others},
-        unit=found.unit,
-        assumed="",
-        notes=(),
     )
     named = {name: named.get(name, unknown) for name in chosen.names}
     unit = found.unit or "rpm"
-    samples = table_of(NAME, chosen, named, of.t_ns, of.known, RAD_S_PER_TABLE_UNIT[unit], unit)
+    samples = table_of(NAME, chosen, named, np.where(of.known, of.t_ns, NO_TIME), RAD_S_PER_TABLE_UNIT[unit], unit)
     if not found.speed:
         samples = replace(samples, repairs=replace(samples.repairs, speeds_missing=0))
     lines = [f"{NAME}: {note}" for note in samples.notes]

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from fantwin.schemas.messages import Array
+from fantwin.pipeline.sources.column_file import Column
+from fantwin.pipeline.sources.tables.units import unit_in_name
 
 
 @dataclass(frozen=True)
@@ -66,8 +67,9 @@ class Preview:
         return " ".join(["fantwin", "import", shlex.quote(str(self.path)), *known, "-o", "REC.mcap"])
 
 
-def column_of(name: str, values: Array, unit: str = "", rate_hz: float = 0.0, note: str = "") -> PreviewColumn:
-    """A column by its numbers, NaN where there is none."""
-    known = values[np.isfinite(values)]
+def column_of(name: str, column: Column, label: str) -> PreviewColumn:
+    """A column by its numbers, with what it is called beside its name."""
+    known = column.values[np.isfinite(column.values)]
     lowest, highest = (float(known.min()), float(known.max())) if len(known) else (None, None)
-    return PreviewColumn(name, len(known), lowest, highest, unit, rate_hz, note)
+    unit = column.unit or unit_in_name(name)
+    return PreviewColumn(name, len(known), lowest, highest, unit, column.rate_hz, column.note or label)

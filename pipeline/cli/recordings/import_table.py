@@ -17,9 +17,10 @@ from fantwin.pipeline.cli.recordings.import_preview import show_previews
 from fantwin.pipeline.config.settings import NAME_PATTERN
 from fantwin.pipeline.errors import UsageError, UserError
 from fantwin.pipeline.recordings.raw_recordings import write_table
-from fantwin.pipeline.sources.imported_file import Wanted, preview_of, read_files
+from fantwin.pipeline.sources.imported_file import preview_of, read_files
+from fantwin.pipeline.sources.samples_of_file import Wanted
 from fantwin.pipeline.sources.tables.measured_table import Table, period_in_words
-from fantwin.pipeline.sources.tables.table_file import Reading
+from fantwin.pipeline.sources.tables.reading import Reading
 from fantwin.pipeline.sources.tables.tachos import parse_tachos
 from fantwin.pipeline.sources.tacho_evidence import tacho_hints
 from fantwin.schemas.channels import CHANNELS
@@ -127,18 +128,16 @@ def import_table(
         raise UsageError(f"--tray {tray}: use letters, digits, - and _, but not {' or '.join(RESERVED_TRAY_NAMES)}")
     if output.exists() and not force:
         raise UserError(f"{output}: exists; name another file with -o, or replace it with --force")
-    imported = read_files(paths, wanted)
-    table = imported.table
+    table = read_files(paths, wanted)
     tachos = parse_tachos(tacho or (), table.fans)
-    notes = list(filter(None, (table.assumed, *imported.notes)))
-    names = FanNames(tuple(label if is_fan_name(label) else "" for label in imported.labels))
+    names = FanNames(tuple(label if is_fan_name(label) else "" for label in table.labels))
     write_table(table, output, tray, tachos, names)
     hints = tacho_hints(table.t_ns / NS_PER_S, table.speed_rad_s, tachos, range(table.fans), names)
     fans = "1 fan" if table.fans == 1 else f"{table.fans} fans"
     period_text = f"{period_in_words(table.median_period_s)} apart (median)"
     line = f"{output}: {len(table.t_ns)} samples of {fans} over {table.duration_s:.1f} s, {period_text}"
-    lines = (line, *(f"  {note}" for note in (*notes, *table.notes)))
-    found = import_summary(table, output) | {"hints": hints, "notes": notes, "remarks": list(table.remarks)}
+    found = import_summary(table, output) | {"hints": hints}
+    lines = (line, *(f"  {note}" for note in (table.assumed, *table.notes) if note))
     show(found, *lines, json_output=json_output)
     for hint in hints if not json_output else ():
         typer.echo(f"hint: {hint}; see --tacho", err=True)
@@ -175,6 +174,7 @@ def import_summary(table: Table, output: Path) -> dict[str, object]:
         "median_rate_hz": 1 / table.median_period_s,
         "speed_unit": table.speed_unit,
         "assumed": table.assumed,
+        "notes": list(table.remarks),
         "gaps": table.gaps,
         "columns": list(table.auxiliary),
         **asdict(table.repairs),

@@ -14,9 +14,10 @@ from pydantic import Field
 from fantwin.pipeline.config.loading import checked_section, set_key
 from fantwin.pipeline.config.settings import Section
 from fantwin.pipeline.errors import UsageError, UserError
-from fantwin.pipeline.sources.imported_file import Wanted, read_file
+from fantwin.pipeline.sources.imported_file import read_file
+from fantwin.pipeline.sources.samples_of_file import Wanted
 from fantwin.pipeline.sources.simulated.table import TableDevice
-from fantwin.pipeline.sources.tables.table_file import Reading
+from fantwin.pipeline.sources.tables.reading import Reading
 from fantwin.schemas import wire
 from fantwin.schemas.channels import CHANNELS
 from fantwin.schemas.tacho import INSTANTANEOUS, Tacho, Tachos
@@ -116,7 +117,7 @@ class Scenario(Section):
         channels = {name: list(columns) for name, columns in file.channels.items()}
         reading = Reading(file.dates, file.zone, file.decimal)
         wanted = Wanted(file.command, file.speed, file.time, file.period, channels, reading)
-        table = read_file(file.path, wanted).table
+        table = read_file(file.path, wanted)
         return TableDevice(table, file.from_s, math.inf if file.to_s is None else file.to_s)
 
     def tray(self, tachos: tuple[Tacho, ...], rate_hz: float) -> SimulatedTray:

@@ -26,7 +26,7 @@ from mcap.records import Channel, Chunk, Header, McapRecord, Message, Metadata, 
 from mcap.stream_reader import StreamReader, get_chunk_data_stream
 from zstandard import ZstdDecompressor, ZstdError
 
-from fantwin.pipeline.sources.logs.log_file import LogError, in_one_line
+from fantwin.pipeline.sources.column_file import LogError, in_one_line
 
 MCAP_START, SQLITE_START, ROS_1_START = b"\x89MCAP0\r\n", b"SQLite format 3\0", b"#ROSBAG V2.0"
 ZSTD_START = b"\x28\xb5\x2f\xfd"

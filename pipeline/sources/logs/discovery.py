@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.sources.column_file import LogError
 from fantwin.pipeline.sources.logs.formats import LOG_FORMATS, log_format
-from fantwin.pipeline.sources.logs.log_file import LogError
 
 _TABLES = (".csv", ".tsv", ".txt")
 

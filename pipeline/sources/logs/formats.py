@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from fantwin.pipeline.extras import missing_extra
+from fantwin.pipeline.sources.column_file import ColumnFile, LogError
 from fantwin.pipeline.sources.logs.bag_files import (
     MCAP_START,
     METADATA_FILE,
@@ -16,7 +17,6 @@ from fantwin.pipeline.sources.logs.bag_files import (
     ZSTD_START,
     files_in,
 )
-from fantwin.pipeline.sources.logs.log_file import LogError, LogFile
 
 _START_BYTES = 1 << 16
 
@@ -137,7 +137,7 @@ def _of_folder(path: Path) -> LogFormat:
     return found or inside[0]
 
 
-def open_log(path: Path, kind: LogFormat) -> LogFile:
+def open_log(path: Path, kind: LogFormat) -> ColumnFile:
     """Open a log of this format.
 
     Raises:
@@ -146,9 +146,10 @@ def open_log(path: Path, kind: LogFormat) -> LogFile:
     if problem := missing_extra(f"{path}: a {kind.title}", "logs", kind.needs):
         raise LogError(problem)
     module, _, name = kind.reader.partition(":")
-    log: LogFile = getattr(import_module(module), name)(path)
+    log: ColumnFile = getattr(import_module(module), name)(path)
     if not log.names:
         raise LogError(
             f"{path}: no field with numbers in this {kind.title}: it ends before its data, or has texts only"
         )
+    log.title = f"{kind.title}, {len(log.names)} fields"
     return log

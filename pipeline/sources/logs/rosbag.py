@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 from zstandard import ZstdDecompressor, ZstdError
 
+from fantwin.pipeline.sources.column_file import Column, ColumnFile, LogError, in_one_line
 from fantwin.pipeline.sources.logs.bag_files import ZSTD_START, Topic, bag_files
-from fantwin.pipeline.sources.logs.log_file import LogError, Series, in_one_line
 from fantwin.schemas.messages import Array
 from fantwin.schemas.units import NS_PER_S
 
@@ -69,7 +69,7 @@ class _Messages:
         return int(np.median(np.array(self.received_ns, np.int64) - np.array(self.stamps_ns, np.int64)))
 
 
-class RosbagFile:
+class RosbagFile(ColumnFile):
     """A bag whose messages have been read."""
 
     def __init__(self, path: Path) -> None:
@@ -99,8 +99,8 @@ class RosbagFile:
             texts = "its messages have no numbers" if self._topics else "no message"
             raise LogError(f"{path}: nothing to import in this ROS bag: {'; '.join(self._notes[:3]) or texts}")
 
-    def read(self, names: Sequence[str]) -> Mapping[str, Series]:
-        """See LogFile."""
+    def read(self, names: Sequence[str]) -> Mapping[str, Column]:
+        """See ColumnFile."""
         used = list(dict.fromkeys(self._of_field[name] for name in names))
         why = {name: self._topics[name].without_stamps for name in used}
         by_receipt = {name for name in used if why[name]}
@@ -122,9 +122,9 @@ class RosbagFile:
         }
         return {name: self._series(name, times[self._of_field[name]]) for name in names}
 
-    def _series(self, name: str, t_ns: Array) -> Series:
+    def _series(self, name: str, t_ns: Array) -> Column:
         rows, values = self._topics[self._of_field[name]].values[name]
-        return Series(t_ns[rows], np.array(values))
+        return Column(t_ns[rows], np.array(values))
 
 
 def _topics_of(why: Mapping[str, str], reason: str) -> str:

@@ -10,14 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from fantwin.pipeline.sources.logs.log_file import LogError, Series, in_one_line
+from fantwin.pipeline.sources.column_file import Column, ColumnFile, LogError, in_one_line
 
 NS_PER_US = 1000
 MOST_FIELDS = 10_000
 """of one topic, arrays and nested formats counted out; PX4's largest has some hundreds"""
 
 
-class ULogFile:
+class ULogFile(ColumnFile):
     """An open ULog."""
 
     def __init__(self, path: Path) -> None:
@@ -47,14 +47,14 @@ class ULogFile:
             *(["the file is damaged: what could be read was read"] if log.file_corruption else []),
         ]
 
-    def read(self, names: Sequence[str]) -> Mapping[str, Series]:
-        """See LogFile."""
-        found: dict[str, Series] = {}
+    def read(self, names: Sequence[str]) -> Mapping[str, Column]:
+        """See ColumnFile."""
+        found: dict[str, Column] = {}
         for name in names:
             topic, _, field = name.partition(".")
             columns = self._data[topic]
             t_ns = columns["timestamp"].astype(np.int64) * NS_PER_US
-            found[name] = Series(t_ns, columns[field].astype(np.float64))
+            found[name] = Column(t_ns, columns[field].astype(np.float64))
         return found
 
 

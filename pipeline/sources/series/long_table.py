@@ -10,23 +10,22 @@ import re
 from array import array
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import islice
 
 import numpy as np
 
 from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.sources.column_file import NO_TIME
 from fantwin.pipeline.sources.series.series_file import Label, SeriesFile, named
-from fantwin.pipeline.sources.tables.fan_columns import with_unit
 from fantwin.pipeline.sources.tables.layout import Layout, all_rows_of, rows_of
-from fantwin.pipeline.sources.tables.numbers import Marks, NumberColumn, OtherMarkError
-from fantwin.pipeline.sources.tables.table_file import AS_FOUND, Reading
-from fantwin.pipeline.sources.tables.times import TIME_UNITS, TimeColumn, time_names, usual_time
+from fantwin.pipeline.sources.tables.numbers import Marks
+from fantwin.pipeline.sources.tables.reading import AS_FOUND, Reading
+from fantwin.pipeline.sources.tables.table_file import read_cells
+from fantwin.pipeline.sources.tables.times import time_names, usual_time
 from fantwin.schemas.messages import Array
 
 MOST_SERIES = 10_000
 _LEAST_VALUES = 2
 """of a series, on average"""
-_ROWS_IN_PART = 4096
 _TOO_MANY_BACK = 0.1
 """steps back within series, as a share of those from row to row"""
 _MOSTLY = 0.5
@@ -54,8 +53,12 @@ def is_annotated(layout: Layout) -> bool:
     return _TIME in layout.names and (_VALUE in layout.names or "result" in layout.names)
 
 
+class _TooManyError(Exception):
+    """A table with more series than there are fans anywhere."""
+
+
 def long_table(layout: Layout, time: str | None = None, reading: Reading = AS_FOUND) -> SeriesFile | None:
-    """The series of a table; None: it is not long. time: as for `TimeColumn`.
+    """The series of a table; None: it is not long. time: as for `TableFile`.
 
     Raises:
         UserError: it is one, and its times or numbers cannot be read.
@@ -63,68 +66,58 @@ def long_table(layout: Layout, time: str | None = None, reading: Reading = AS_FO
     columns = _of_influx(layout) if is_annotated(layout) else _of_any(layout, time)
     if columns is None:
         return None
-    shown: dict[str, str] = {}
-    while True:
-        try:
-            return _read(layout, columns, reading, shown)
-        except OtherMarkError as found:
-            shown[found.name] = found.decimal
-
-
-def _read(layout: Layout, columns: _Columns, reading: Reading, shown: dict[str, str]) -> SeriesFile | None:
-    whole = replace(
-        layout,
-        names=columns.names,
-        second_names=(),
-        units=tuple(layout.unit(name) if name in layout.names else "" for name in columns.names),
-        kinds=tuple(layout.kinds[layout.index(name)] if name in layout.names else "" for name in columns.names),
-        marks=tuple(layout.marks[layout.index(name)] if name in layout.names else Marks() for name in columns.names),
-    )
-    decimal = reading.decimal or shown.get(with_unit(columns.time, columns.names, TIME_UNITS)[0], "")
-    times = TimeColumn(whole, columns.time, reading.dates, reading.zone, decimal)
-    numbers = [
-        NumberColumn(
-            layout.path,
-            name,
-            columns.names.index(name),
-            reading.decimal or shown.get(name) or (layout.decimal_of(name) if name in layout.names else layout.decimal),
-            is_final=bool(reading.decimal) or name in shown,
-        )
-        for name in columns.values
-    ]
     at = [columns.names.index(key) for key in columns.keys]
     known: dict[tuple[str, ...], int] = {}
     of_row = array("i")
-    rows = _annotated_rows(layout, columns.names) if is_annotated(layout) else rows_of(layout)
-    while part := list(islice(rows, _ROWS_IN_PART)):
-        times.add(part)
-        for column in numbers:
-            column.add(part)
-        of_row.extend([known.setdefault(tuple(row[k] for k in at), len(known)) for row in part])
-        if len(known) > MOST_SERIES:
-            return None
-    if not of_row:
+
+    def rows() -> Iterator[list[str]]:
+        known.clear()
+        del of_row[:]
+        for row in _annotated_rows(layout, columns.names) if is_annotated(layout) else rows_of(layout):
+            of_row.append(known.setdefault(tuple(row[k] for k in at), len(known)))
+            if len(known) > MOST_SERIES:
+                raise _TooManyError
+            yield row
+
+    try:
+        times, numbers, _ = read_cells(_with_names(layout, columns.names), columns.time, columns.values, reading, rows)
+    except _TooManyError:
         return None
-    t_ns, has_time = times.values()
-    series = np.asarray(of_row)
+    if not of_row or times is None:
+        return None
+    t_ns, series = times.values(), np.asarray(of_row)
+    has_time = t_ns != NO_TIME
     is_keyed = all(_LIKE_A_KEY.fullmatch(key) for key in columns.keys)
     if not is_annotated(layout) and not _is_long(t_ns[has_time], series[has_time], len(known), is_keyed=is_keyed):
         return None
+    for problem in filter(None, (column.problem for column in numbers.values())):
+        raise problem
     order = np.argsort(series, kind="stable")
-    starts = np.searchsorted(series[order], np.arange(len(known) + 1))
-    arrays = [column.values(may_be_empty=True) for column in numbers]
-    parts = [(key, order[starts[k] : starts[k + 1]]) for key, k in known.items()]
+    parts = np.split(order, np.cumsum(np.bincount(series))[:-1])
     by = " and ".join(map(repr, columns.keys)) or "nothing"
-    notes = [*times.notes, *(f"{column.name!r}: {texts}" for column in numbers if (texts := column.texts(has_time)))]
+    notes = [f"{name!r}: {texts}" for name, column in numbers.items() if (texts := column.texts(has_time))]
     found = [
-        (_label(columns, key, name), t_ns[rows][is_value], values[rows][is_value])
-        for key, rows in parts
-        for name, values in zip(columns.values, arrays, strict=True)
-        if (is_value := has_time[rows] & np.isfinite(values[rows])).any()
+        (_label(columns, key, name), t_ns[rows][is_value], column.values[rows][is_value])
+        for key, rows in zip(known, parts, strict=True)
+        for name, column in numbers.items()
+        if (is_value := has_time[rows] & np.isfinite(column.values[rows])).any()
     ]
     if not found:
         raise UserError(f"{layout.path}: a row a value, and none of the values is a number")
-    return SeriesFile(f"long table, {len(found)} series by {by}", named(found), tuple(notes))
+    return SeriesFile(f"long table, {len(found)} series by {by}", named(found), (*times.notes, *notes))
+
+
+def _with_names(layout: Layout, names: Sequence[str]) -> Layout:
+    """A layout of rows with these columns, in this order."""
+    at = {name: layout.names.index(name) for name in names if name in layout.names}
+    return replace(
+        layout,
+        names=tuple(names),
+        second_names=(),
+        units=tuple(layout.units[at[name]] if name in at else "" for name in names),
+        kinds=tuple(layout.kinds[at[name]] if name in at else "" for name in names),
+        marks=tuple(layout.marks[at[name]] if name in at else Marks() for name in names),
+    )
 
 
 def _label(columns: _Columns, key: Sequence[str], value_column: str) -> Label:
@@ -153,22 +146,17 @@ def _is_long(t_ns: Array, series: Array, count: int, *, is_keyed: bool) -> bool:
 
 def _of_any(layout: Layout, time: str | None) -> _Columns | None:
     time = time or usual_time(layout)
-    if not time:
+    of_time = time_names(layout, time)[0] if time else []
+    if not time or not all(name in layout.all_names for name in of_time):
         return None
-    try:
-        of_time, _ = time_names(layout, time)
-    except UserError:
-        return None
-    pairs = [
-        (name, kind) for name, kind in zip(layout.names, layout.kinds, strict=True) if name and name not in of_time
-    ]
-    numbers = [name for name, kind in pairs if kind == "number"]
-    keys = [name for name, kind in pairs if kind == "text"]
+    kinds = dict(zip(layout.names, layout.kinds, strict=True))
+    numbers, keys = (
+        [name for name, kind in kinds.items() if name and name not in of_time and kind == wanted]
+        for wanted in ("number", "text")
+    )
     likely = [name for name in numbers if _LIKE_A_KEY.fullmatch(name) and len(numbers) > 1 and _few_whole(layout, name)]
     values = [name for name in numbers if name not in likely]
-    if not (keys or likely) or not values:
-        return None
-    return _Columns(layout.names, time, (*keys, *likely), tuple(values))
+    return _Columns(layout.names, time, (*keys, *likely), tuple(values)) if values and (keys or likely) else None
 
 
 def _few_whole(layout: Layout, name: str) -> bool:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
-from fantwin.pipeline.sources.logs.log_file import Series
+from fantwin.pipeline.sources.column_file import Column, ColumnFile
 from fantwin.schemas.messages import Array
 
 
@@ -20,36 +20,37 @@ class Label:
     tags: tuple[tuple[str, str], ...] = ()
 
 
-@dataclass(frozen=True, eq=False)
-class SeriesFile:
-    """An open file of series; a `LogFile`.
+class SeriesFile(ColumnFile):
+    """An open file of series, which are read already."""
 
-    Attributes:
-        title: what it is, for people.
-        about: as of `Layout`; empty.
-    """
+    def __init__(self, title: str, series: Mapping[str, Column], notes: Sequence[str] = ()) -> None:
+        self.title, self.names, self.notes = title, list(series), (title, *notes)
+        self._series = series
 
-    title: str
-    series: Mapping[str, Series]
-    notes: tuple[str, ...] = ()
-    about: Mapping[str, str] = field(default_factory=dict[str, str])
-
-    @property
-    def names(self) -> Sequence[str]:
-        """The names of the series."""
-        return list(self.series)
-
-    @property
-    def all_names(self) -> Sequence[str]:
-        """The names by which `profile_of` finds a program."""
-        return self.names
-
-    def read(self, names: Sequence[str]) -> Mapping[str, Series]:
-        """See LogFile."""
-        return {name: self.series[name] for name in names}
+    def read(self, names: Sequence[str]) -> Mapping[str, Column]:
+        """See ColumnFile."""
+        return {name: self._series[name] for name in names}
 
 
-def named(found: Iterable[tuple[Label, Array, Array]]) -> dict[str, Series]:
+class JoinedFile(ColumnFile):
+    """The columns of several files by their times; of several of one name the first."""
+
+    def __init__(self, files: Sequence[ColumnFile]) -> None:
+        self._file_of = {name: file for file in reversed(files) for name in file.names}
+        self.title = f"columns of {len(files)} files by their times"
+        self.names = list(self._file_of)
+
+    def read(self, names: Sequence[str]) -> Mapping[str, Column]:
+        """See ColumnFile."""
+        found: dict[str, Column] = {}
+        self.notes = [self.title]
+        for file in dict.fromkeys(self._file_of[name] for name in names):
+            found |= file.read([name for name in names if self._file_of[name] is file])
+            self.notes += file.notes
+        return found
+
+
+def named(found: Iterable[tuple[Label, Array, Array]]) -> dict[str, Column]:
     """Series by name: `base{tag=value}`, without the tags that are the same in all. found: labels, times and values."""
     rows = list(found)
     values: dict[str, set[str]] = {}
@@ -58,7 +59,7 @@ def named(found: Iterable[tuple[Label, Array, Array]]) -> dict[str, Series]:
             values.setdefault(key, set()).add(value)
     everywhere = Counter(key for label, _, _ in rows for key, _ in label.tags)
     constant = {key for key, seen in values.items() if len(seen) == 1 and everywhere[key] == len(rows)}
-    series: dict[str, Series] = {}
+    series: dict[str, Column] = {}
     for label, t_ns, numbers in rows:
         tags = [(key, value) for key, value in label.tags if key not in constant]
         if label.base:
@@ -71,5 +72,5 @@ def named(found: Iterable[tuple[Label, Array, Array]]) -> dict[str, Series]:
         while name in series:
             again += 1
             name = f"{name.partition(' [')[0]} [{again}]"
-        series[name] = Series(np.asarray(t_ns, np.int64), np.asarray(numbers, np.float64))
+        series[name] = Column(np.asarray(t_ns, np.int64), np.asarray(numbers, np.float64))
     return series

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.sources.column_file import listed
 from fantwin.schemas.messages import Array
 from fantwin.schemas.units import NS_PER_S
 
@@ -74,10 +75,9 @@ def continued(path: Path, t_ns: Array, has_time: Array, *, longest_part: bool = 
     damaged = _damaged(t_ns)
     if len(damaged):
         is_good[damaged] = False
-        shown = ", ".join(str(int(rows[k]) + 1) for k in damaged[:3])
-        more = f" and {len(damaged) - 3} more" if len(damaged) > 3 else ""
+        shown = listed([str(int(rows[k]) + 1) for k in damaged])
         row = "row" if len(damaged) == 1 else "rows"
-        notes.append(f"{len(damaged)} {row} dropped: the time contradicts the rows around ({row} {shown}{more})")
+        notes.append(f"{len(damaged)} {row} dropped: the time contradicts the rows around ({row} {shown})")
     good = np.flatnonzero(is_good)
     behind = np.maximum.accumulate(t_ns[good]) - t_ns[good]
     back = np.flatnonzero(behind > OUT_OF_ORDER_NS)
@@ -184,15 +184,20 @@ def _set_back_in_words(t_ns: Array, rows: Array, at: int) -> str:
     often = "" if count == 1 else f", and {count - 1} times more"
     span = f"from {time_in_words(reached)} to {time_in_words(int(t_ns[at]))}"
     seen = f"time goes back by {by_ns / NS_PER_S:.3f} s at row {int(rows[at]) + 1}, {span}{often}"
-    if abs(by_ns - _HOUR_NS) < 60 * NS_PER_S and reached > _YEAR_NS:
+    if abs(by_ns - _HOUR_NS) < 60 * NS_PER_S and is_date(reached):
         return f"{seen}: an hour that repeats when summer time ends; name the time zone, such as --zone Europe/Berlin"
     if count > 1:
         return f"{seen}: rows of several series or runs, or another column has the times: give each run a file"
     return f"{seen}: the clock was set, or a second run begins: cut the file there and import the parts"
 
 
+def is_date(t_ns: int) -> bool:
+    """Whether a time is since 1970, and not since a start."""
+    return abs(t_ns) >= _YEAR_NS
+
+
 def time_in_words(t_ns: int) -> str:
     """A time as a date, or in s where it is not since 1970."""
-    if abs(t_ns) < _YEAR_NS:
+    if not is_date(t_ns):
         return f"{t_ns / NS_PER_S:.3f} s"
     return datetime.fromtimestamp(t_ns / NS_PER_S, UTC).strftime("%Y-%m-%d %H:%M:%S")

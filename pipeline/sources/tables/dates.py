@@ -8,21 +8,19 @@ from __future__ import annotations
 
 import re
 from array import array
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, date, datetime, timedelta
 from pathlib import Path
-from typing import TypeAlias
 
 import numpy as np
 
 from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.sources.column_file import NO_TIME
+from fantwin.pipeline.sources.tables.reading import ORDERS
 from fantwin.schemas.messages import Array
 from fantwin.schemas.units import NS_PER_S
 
-Order: TypeAlias = str
-"""of the parts of a date: `d`, `m` and `y`"""
-ORDERS: tuple[Order, ...] = ("dmy", "mdy", "ymd")
 ZONES = {
     **dict.fromkeys(("Z", "UTC", "GMT", "WET"), 0.0),
     **dict.fromkeys(("CET", "WEST", "MEZ"), 1.0),
@@ -49,6 +47,7 @@ _FRACTION = re.compile(r"(\d\d:\d\d:\d\d)[:,](\d+)")  # some loggers write 17:14
 _UNIX_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _EPOCH_DAY = _UNIX_EPOCH.toordinal()
 _NS_PER_DAY = 86_400 * NS_PER_S
+_NO_DAY = -(1 << 31)
 _LARGER_STEPS = 10.0
 _TWO_DIGITS = 100
 _FIRST_YEAR, _LAST_YEAR = 1900, 2116
@@ -69,8 +68,8 @@ def is_time_of_day(text: str) -> bool:
 
 
 @dataclass(frozen=True)
-class _Part:
-    """A date as it is written: three numbers, of which one is the year. is_fixed: it can be read in one way only."""
+class _Date:
+    """A date as it is written: three numbers, of which one is the year."""
 
     numbers: tuple[int, int, int]
     by: str
@@ -80,40 +79,35 @@ class _Part:
 class DateColumn:
     """A column of dates, or of times of day, in ns."""
 
-    def __init__(self, path: Path, name: str, order: Order, *, has_zone: bool = False) -> None:
-        """order: of the parts of a date, as the user or the writer of such files gives it;
-        empty: found. has_zone: the user names the
-        zone that a name of several stands for."""
+    def __init__(self, path: Path, name: str, order: str, *, has_zone: bool = False) -> None:
+        """order: of the parts of a date, as the user or the writer of such files gives it; empty: found. has_zone: the
+        user names the zone that a name of several stands for."""
         self._path, self._name, self._given, self._has_zone = path, name, order, has_zone
         self._t_ns = array("q")
-        self._known = bytearray()
         self._zoned = bytearray()
-        self._dates: dict[str, _Part] = {}
-        self._texts: list[str] = []
-        """of the dates in the order of rows, where they change"""
-        self._changes: list[tuple[int, int]] = []
-        """row and time of day, in ns, at each of them"""
-        self._last_ns = 0
+        self._dates: dict[_Date, int] = {}
+        """those that are not ISO, numbered"""
+        self._date_of = array("i")
+        """the number of the date of each row that is not ISO; -1: it has none"""
         self._first_cell = ""
         self._of_day = False
         self._hours_lost = False
+        self._unknown_zone = ""
         self.is_iso = False
 
     def add(self, cells: Sequence[str]) -> None:
-        """Append some cells. Raises UserError for a name of a zone that means several."""
+        """Append some cells."""
         for text in cells:
             self._first_cell = self._first_cell or text
-            t_ns = None if self._texts else _iso_ns(text)
+            t_ns = None if self._dates else _iso_ns(text)
             if t_ns is not None:
                 self.is_iso = True
-                self._append(t_ns[0], is_zoned=t_ns[1])
+                self._append(*t_ns)
             else:
                 self._other(text.strip())
 
-    def _append(self, t_ns: int, *, is_zoned: bool, is_known: bool = True) -> None:
-        is_known = is_known and abs(t_ns) < _FURTHEST_NS
-        self._t_ns.append(t_ns if is_known else 0)
-        self._known.append(is_known)
+    def _append(self, t_ns: int = NO_TIME, is_zoned: bool = False) -> None:
+        self._t_ns.append(t_ns if abs(t_ns) < _FURTHEST_NS else NO_TIME)
         self._zoned.append(is_zoned)
 
     def _other(self, text: str) -> None:
@@ -122,159 +116,136 @@ class DateColumn:
         if found is None:
             self._time_of_day(text)
             return
-        part = _part_of(found)
+        date_of = _date_of(found)
         of_day_ns = _of_day_ns(found)
-        if part is None or of_day_ns is None:
-            self._append(0, is_zoned=False, is_known=False)
+        if date_of is None or of_day_ns is None:
+            self._append()
             return
-        key = repr(part)
-        if not self._texts or self._texts[-1] != key:
-            self._dates[key] = part
-            self._texts.append(key)
-            self._changes.append((len(self._t_ns), self._last_ns))
         offset_ns = self._offset_ns(found["zone"])
-        self._last_ns = of_day_ns
-        self._append(of_day_ns - (offset_ns or 0), is_zoned=offset_ns is not None)
+        self._date_of.extend([-1] * (len(self._t_ns) - len(self._date_of)))
+        self._date_of.append(self._dates.setdefault(date_of, len(self._dates)))
+        self._append(of_day_ns - (offset_ns or 0), offset_ns is not None)
 
     def _time_of_day(self, text: str) -> None:
         found = _OF_DAY.fullmatch(text)
         minutes = _MINUTES.fullmatch(text)
         if minutes and (minutes["f"] or int(minutes["m"]) > 23):
-            t_ns = (int(minutes["m"]) * 60 + int(minutes["s"])) * NS_PER_S + _fraction_ns((minutes["f"] or "0")[1:])
             self._hours_lost = self._of_day = True
-            self._append(t_ns, is_zoned=False)
+            self._append((int(minutes["m"]) * 60 + int(minutes["s"])) * NS_PER_S + _fraction_ns(minutes["f"][1:]))
             return
         of_day_ns = _of_day_ns(found) if found else None
         if found is None or of_day_ns is None:
-            self._append(0, is_zoned=False, is_known=False)
+            self._append()
             return
         self._of_day = True
-        self._append(int(found["days"] or 0) * _NS_PER_DAY + of_day_ns, is_zoned=False)
+        self._append(int(found["days"] or 0) * _NS_PER_DAY + of_day_ns)
 
     def _offset_ns(self, zone: str | None) -> int | None:
         if not zone:
             return None
         if zone.upper() in ZONES:
-            hours = ZONES[zone.upper()]
-        elif found := re.fullmatch(r"(?:UTC|GMT)?([+-])(\d\d):?(\d\d)", zone):
-            hours = (int(found[2]) + int(found[3]) / 60) * (-1 if found[1] == "-" else 1)
-        elif self._has_zone:
-            return None
-        else:
-            raise UserError(
-                f"{self._path}: column {self._name!r}: {zone!r} is no zone, or the name of several: give the one that "
-                "is meant, for example --zone Asia/Shanghai"
-            )
-        return round(hours * 3600) * NS_PER_S
+            return round(ZONES[zone.upper()] * 3600) * NS_PER_S
+        if found := re.fullmatch(r"(?:UTC|GMT)?([+-])(\d\d):?(\d\d)", zone):
+            return (int(found[2]) * 60 + int(found[3])) * (-60 if found[1] == "-" else 60) * NS_PER_S
+        if not self._has_zone:
+            self._unknown_zone = self._unknown_zone or zone
+        return None
 
     @property
     def is_time_of_day(self) -> bool:
         """Whether it has times of day without a date."""
-        return self._of_day and not self._texts and not self.is_iso
+        return self._of_day and not self._dates and not self.is_iso
 
-    def values(self) -> tuple[Array, Array, Array, str]:
-        """(rows,) times in ns since 1970, whether each could be read, whether each has a zone, and the format in words.
+    def values(self) -> tuple[Array, Array, str]:
+        """(rows,) times in ns since 1970, whether each has a zone, and the format in words.
 
-        Those without a zone are as if they were in UTC. Raises UserError if none could be read, or their order is open.
+        Those without a zone are as if they were in UTC.
+
+        Raises:
+            UserError: none could be read, their order is open, or a zone is the name of several.
         """
-        known = np.frombuffer(bytes(self._known), dtype=np.bool_)
-        zoned = np.frombuffer(bytes(self._zoned), dtype=np.bool_)
+        if self._unknown_zone:
+            raise UserError(
+                f"{self._path}: column {self._name!r}: {self._unknown_zone!r} is no zone, or the name of several: give "
+                "the one that is meant, for example --zone Asia/Shanghai"
+            )
+        t_ns = np.asarray(self._t_ns)
+        zoned = np.frombuffer(self._zoned, dtype=np.bool_)
+        known = t_ns != NO_TIME
         if not known.any():
             raise UserError(
                 f"{self._path}: column {self._name!r} has no times in iso, but for example {self._first_cell!r}; use "
                 "numbers in s, ms, us or ns, or dates such as 2026-01-31 13:45:00.250"
             )
-        t_ns = np.asarray(self._t_ns)
         if self.is_time_of_day:
-            return _unwrapped(t_ns, known, self._hours_lost), known, zoned, "times of day without a date"
-        if not self._texts:
-            return t_ns, known, zoned, "dates (ISO)"
-        order = self._order()
-        days = [_day(self._dates[text], order) for text in self._texts]
-        starts = [row for row, _ in self._changes]
-        day_of_row = np.zeros(len(t_ns), np.int64)
-        steps = np.diff(np.array([0, *(day or 0 for day in days)], np.int64))
-        np.add.at(day_of_row, starts, steps)
-        possible = np.ones(len(t_ns), np.bool_)
-        for k, day in enumerate(days):
-            if day is None:
-                possible[starts[k] : starts[k + 1] if k + 1 < len(starts) else None] = False
-        t_ns = t_ns + np.cumsum(day_of_row) * _NS_PER_DAY
-        words = "dates with the name of the month" if self._is_wordy else f"dates as {_ORDER_IN_WORDS[order]}"
-        return t_ns, known & possible, zoned, words
+            return _unwrapped(t_ns, known, self._hours_lost), zoned, "times of day without a date"
+        if not self._dates:
+            return t_ns, zoned, "dates (ISO)"
+        self._date_of.extend([-1] * (len(t_ns) - len(self._date_of)))
+        of_row = np.asarray(self._date_of)
+        order, days = self._order(of_row[of_row >= 0])
+        day = np.append(days, 0)[of_row]
+        found = np.where(known & (day != _NO_DAY), t_ns + day * _NS_PER_DAY, NO_TIME)
+        is_wordy = all(each.month_is_word for each in self._dates)
+        return found, zoned, "dates with the name of the month" if is_wordy else f"dates as {_ORDER_IN_WORDS[order]}"
 
-    @property
-    def _is_wordy(self) -> bool:
-        return all(part.month_is_word for part in self._dates.values())
-
-    def _order(self) -> Order:
-        """The order of day, month and year."""
-        parts = list(self._dates.values())
-        if self._given:
-            return self._given
-        orders = _orders(parts[0])
-        days = {order: [_day(self._dates[text], order) for text in self._texts] for order in orders}
-        possible = [order for order in orders if None not in days[order]]
-        if not possible:  # some date is damaged: the order that reads the most
-            possible = sorted(orders, key=lambda order: days[order].count(None))[:1]
-        days = {order: days[order] for order in possible}
-        if len({tuple(found) for found in days.values()}) == 1:
-            return possible[0]
-        by_rows = _by_order_of_rows({order: [day for day in of if day is not None] for order, of in days.items()})
-        if by_rows is None:
+    def _order(self, of_row: Array) -> tuple[str, Array]:
+        """The order of day, month and year, and the days since 1970 of the dates. of_row: numbers of the dates."""
+        orders = [self._given] if self._given else _orders(next(iter(self._dates)))
+        days = {order: np.array([_day(each, order) for each in self._dates], np.int64) for order in orders}
+        missing = {order: int(np.count_nonzero(found == _NO_DAY)) for order, found in days.items()}
+        possible = [order for order in orders if not missing[order]]
+        possible = possible or [min(orders, key=missing.__getitem__)]  # some date is damaged
+        if all(np.array_equal(days[order], days[possible[0]]) for order in possible):
+            return possible[0], days[possible[0]]
+        order = _by_order_of_rows({order: days[order][of_row] for order in possible})
+        if not order:
             example = self._first_cell.split()[0]
-            either = " or ".join(f"--dates {order} ({_ORDER_IN_WORDS[order]})" for order in possible)
+            either = " or ".join(f"--dates {each} ({_ORDER_IN_WORDS[each]})" for each in possible)
             raise UserError(
                 f"{self._path}: column {self._name!r}: {example} can be read in {len(possible)} ways, and no row "
                 f"tells: give {either}"
             )
-        return by_rows
+        return order, days[order]
 
 
-def _by_order_of_rows(days: dict[Order, list[int]]) -> Order | None:
-    """The order with which dates follow one another; None: none is clearly better.
-
-    days: of the dates in the order of rows, by order.
-    """
+def _by_order_of_rows(days: Mapping[str, Array]) -> str:
+    """The order with which dates follow one another; empty: none is clearly better. days: of the rows, by order."""
     steps = {order: np.diff(found) for order, found in days.items()}
-    largest: dict[Order, int] = {
-        order: int(step.max()) for order, step in steps.items() if len(step) and (step >= 0).all()
-    }
+    largest = {order: int(step.max()) for order, step in steps.items() if len(step) and (step >= 0).all()}
     ranked = sorted(largest, key=largest.__getitem__)
-    if len(ranked) > 1 and largest[ranked[1]] < _LARGER_STEPS * max(1, largest[ranked[0]]):
-        return None
-    return ranked[0] if ranked else None
+    if not ranked or (len(ranked) > 1 and largest[ranked[1]] < _LARGER_STEPS * max(1, largest[ranked[0]])):
+        return ""
+    return ranked[0]
 
 
-def _orders(part: _Part) -> Sequence[Order]:
+def _orders(written: _Date) -> Sequence[str]:
     """Orders in which a date may be written, by its form."""
-    if part.numbers[0] >= _TWO_DIGITS:
+    if written.numbers[0] >= _TWO_DIGITS:
         return ("ymd",)
-    if part.month_is_word or part.by == ".":
+    if written.month_is_word or written.by == ".":
         return ("dmy",)
-    return ("dmy", "mdy") if part.numbers[2] >= _TWO_DIGITS else ("dmy", "mdy", "ymd")
+    return ("dmy", "mdy") if written.numbers[2] >= _TWO_DIGITS else ORDERS
 
 
-def _part_of(found: re.Match[str]) -> _Part | None:
+def _date_of(found: re.Match[str]) -> _Date | None:
     if found["month"]:
         month = _MONTHS.get(found["month"][:3].lower())
-        return _Part((int(found["day"]), month, int(found["year"])), " ", month_is_word=True) if month else None
-    middle = int(found["b"]) if found["b"].isdigit() else _MONTHS.get(found["b"][:3].lower())
-    if middle is None:
-        return None
-    return _Part((int(found["a"]), middle, int(found["c"])), found["by"], month_is_word=not found["b"].isdigit())
+        return _Date((int(found["day"]), month, int(found["year"])), " ", month_is_word=True) if month else None
+    is_word = not found["b"].isdigit()
+    middle = _MONTHS.get(found["b"][:3].lower()) if is_word else int(found["b"])
+    return None if middle is None else _Date((int(found["a"]), middle, int(found["c"])), found["by"], is_word)
 
 
-def _day(part: _Part, order: Order) -> int | None:
-    """Days since 1970; None: there is no such date."""
-    by_letter = dict(zip("ymd" if part.numbers[0] >= _TWO_DIGITS else order, part.numbers, strict=True))
+def _day(written: _Date, order: str) -> int:
+    """Days since 1970; _NO_DAY: there is no such date."""
+    by_letter = dict(zip("ymd" if written.numbers[0] >= _TWO_DIGITS else order, written.numbers, strict=True))
     year = by_letter["y"] + (2000 if by_letter["y"] < _TWO_DIGITS else 0)
-    if not _FIRST_YEAR <= year <= _LAST_YEAR:
-        return None
     try:
-        return date(year, by_letter["m"], by_letter["d"]).toordinal() - _EPOCH_DAY
+        day = date(year, by_letter["m"], by_letter["d"]).toordinal() - _EPOCH_DAY
     except ValueError:
-        return None
+        return _NO_DAY
+    return day if _FIRST_YEAR <= year <= _LAST_YEAR else _NO_DAY
 
 
 def _of_day_ns(found: re.Match[str]) -> int | None:

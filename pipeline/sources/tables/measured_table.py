@@ -7,25 +7,19 @@ counted (`Repairs`). How a file is read: `table_file`.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import astuple, dataclass, field, replace
+from dataclasses import astuple, dataclass, field
 from pathlib import Path
 
 import numpy as np
 
-from fantwin.pipeline.errors import UsageError, UserError
-from fantwin.pipeline.sources.tables.clocks import continued, goes_back
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.sources.column_file import NO_TIME
+from fantwin.pipeline.sources.tables.clocks import continued, goes_back, is_date
 from fantwin.pipeline.sources.tables.fan_columns import FanColumns
-from fantwin.pipeline.sources.tables.units import (
-    ELECTRICAL,
-    ELECTRICAL_HUNDREDS,
-    RAD_S_PER_TABLE_UNIT,
-)
 from fantwin.schemas.messages import Array
 from fantwin.schemas.units import NS_PER_S
 
 GAP_IN_MEDIAN_PERIODS = 5.0
-
-NO_COLUMNS: Mapping[str, Sequence[str]] = {}
 
 
 @dataclass(frozen=True)
@@ -70,9 +64,14 @@ class Table:
     auxiliary: Mapping[str, Array] = field(default_factory=dict[str, Array])
     """other measured columns, (n, fans) each, NaN where missing, by name in schemas.channels"""
     remarks: tuple[str, ...] = ()
-    """notes on how it was read, a line each"""
-    has_dates: bool = False
-    """whether times are since 1970"""
+    """notes on how it was read and what was left out, a line each"""
+    labels: tuple[str, ...] = ()
+    """what its file calls each fan, where it has names"""
+
+    @property
+    def has_dates(self) -> bool:
+        """Whether times are since 1970."""
+        return is_date(int(self.t_ns[0]))
 
     @property
     def fans(self) -> int:
@@ -125,72 +124,67 @@ def period_in_words(seconds: float) -> str:
     return f"{seconds * 1e6:.3g} us"
 
 
-def rad_s_per(unit: str, poles: int | None) -> tuple[float, str]:
-    """rad/s of one unit, and the unit that people are shown. poles: magnetic ones, for electrical speeds."""
-    if unit not in (ELECTRICAL, ELECTRICAL_HUNDREDS):
-        return RAD_S_PER_TABLE_UNIT[unit], unit
-    if poles is None:
-        raise UsageError(
-            "speeds in erpm are electrical revolutions: give the magnetic poles of the motor, for example --poles 14"
-        )
-    if poles < 2 or poles % 2:
-        raise UsageError(f"--poles {poles}: magnetic poles come in pairs, for example 14")
-    return (100.0 if unit == ELECTRICAL_HUNDREDS else 1.0) * RAD_S_PER_TABLE_UNIT["rpm"] / (poles / 2), "rpm"
-
-
-def used_fans(path: Path, chosen: FanColumns, values: Mapping[str, Array]) -> tuple[FanColumns, list[str]]:
-    """The columns of the fans of a pattern that ever turned and had a command, and a note on the others.
-
-    Boards and flight controllers log slots that nothing is connected to. Fans that were named are kept.
-
-    Raises:
-        UserError: none is left.
-    """
-    if not chosen.is_pattern:
-        return chosen, []
-    turned = [bool(np.any(np.nan_to_num(values[name]) != 0)) for name in chosen.speed]
-    told = [bool(np.any(np.isfinite(values[name]))) for name in chosen.command]
-    used = [k for k, both in enumerate(zip(turned, told, strict=True)) if all(both)]
-    if not used:
-        raise UserError(f"{path}: no fan of {chosen.speed[0]} and others ever turns")
-    unused = [name for k, name in enumerate(chosen.speed) if k not in used]
-    if not unused:
-        return chosen, []
-    picked = {channel: tuple(names[k] for k in used) for channel, names in chosen.others.items()}
-    command, speed = (tuple(names[k] for k in used) for names in (chosen.command, chosen.speed))
-    more = f" and {len(unused) - 3} more" if len(unused) > 3 else ""
-    note = f"left out, because the speed is always 0 or missing: {', '.join(unused[:3])}{more}"
-    return replace(chosen, command=command, speed=speed, others=picked), [note]
-
-
 def table_of(
     path: Path,
     chosen: FanColumns,
     values: Mapping[str, Array],
     t_ns: Array,
-    has_time: Array,
     rad_s_per_unit: float,
     unit: str,
     *,
     longest_part: bool = False,
 ) -> Table:
-    """The samples of fans from columns. values: (n,) of each column by its name; a channel without one is NaN. t_ns,
-    has_time, unit, longest_part: as for `clean_samples`. rad_s_per_unit: of the values of speed."""
+    """The samples of fans from columns: rows sorted by time, commands held, rows of the same time merged, and all of it
+    counted. A step that changes nothing copies nothing: most tables are in order and may be large.
+
+    values: (n,) of each column by its name; a channel without one is NaN. t_ns: (n,), NO_TIME where unknown.
+    rad_s_per_unit: of the values of speed. longest_part: as for `continued`.
+
+    Raises:
+        UserError: no two rows are left, or times go back.
+    """
     unknown = np.full(len(t_ns), np.nan)
     command, speed, *others = (
         np.column_stack([values[name] if name else unknown for name in names])
         for names in (chosen.command, chosen.speed, *chosen.others.values())
     )
     speed *= rad_s_per_unit
-    table = clean_samples(
-        path, t_ns, has_time, command, np.column_stack([speed, *others]), unit, longest_part=longest_part
+    has_time = t_ns != NO_TIME
+    columns = _rows([t_ns, command, np.hstack([speed, *others])], has_time)
+    clock = continued(path, columns[0], has_time, longest_part=longest_part)
+    columns = _rows([clock.t_ns, *columns[1:]], clock.is_good)
+    out_of_order = 0
+    if goes_back(columns[0]):
+        out_of_order = int(np.count_nonzero(np.maximum.accumulate(columns[0]) - columns[0]))
+        order = np.argsort(columns[0], kind="stable")
+        columns = [each[order] for each in columns]
+    missing = np.isnan(columns[1])
+    if missing.any():
+        columns[1] = hold_last(columns[1])
+    known = ~np.any(np.isnan(columns[1]), axis=1)
+    t_ns, command, measured = _rows(columns, known)
+    first = np.flatnonzero(np.diff(t_ns, prepend=t_ns[:1] - 1))
+    if len(first) < 2:
+        raise UserError(f"{path}: fewer than two rows with a time and a command")
+    repairs = Repairs(
+        rows=len(has_time),
+        without_time=int(np.count_nonzero(~has_time)),
+        out_of_order=out_of_order,
+        repeated=len(t_ns) - len(first),
+        before_command=int(np.count_nonzero(~known)),
+        commands_held=int(np.count_nonzero(missing[known])),
+        speeds_missing=int(np.count_nonzero(np.isnan(measured[:, : len(chosen.speed)]))),
     )
-    of_speed, *measured = np.split(table.speed_rad_s, len(others) + 1, axis=1)
-    return replace(
-        table,
-        speed_rad_s=of_speed,
-        auxiliary=dict(zip(chosen.others, measured, strict=True)),
-    )
+    if repairs.repeated:
+        last = np.append(first[1:], len(t_ns)) - 1
+        t_ns, command, measured = t_ns[first], command[last], _means(measured, first)
+    of_speed, *of_others = np.split(measured, len(others) + 1, axis=1)
+    auxiliary = dict(zip(chosen.others, of_others, strict=True))
+    return Table(path, t_ns, command, of_speed, unit, repairs, auxiliary=auxiliary, remarks=clock.notes)
+
+
+def _rows(columns: Sequence[Array], keep: Array) -> list[Array]:
+    return list(columns) if keep.all() else [each[keep] for each in columns]
 
 
 def constant_commands(chosen: FanColumns, command: Array) -> list[str]:
@@ -201,60 +195,6 @@ def constant_commands(chosen: FanColumns, command: Array) -> list[str]:
         if not np.any(np.diff(command[:, fan]))
     )
     return [f"{name} is {value:g} throughout: a twin needs steps of the command" for name, value in never]
-
-
-def clean_samples(
-    path: Path,
-    t_ns: Array,
-    has_time: Array,
-    command: Array,
-    speed_rad_s: Array,
-    unit: str,
-    *,
-    longest_part: bool = False,
-) -> Table:
-    """Sort rows by time, hold commands, merge rows of the same time, and count all of it. speed_rad_s: and after the
-    columns of the fans any others that may be missing, which are treated alike. longest_part: as for `continued`.
-
-    A step that changes nothing copies nothing: most tables are in order and may be large.
-    """
-    rows = len(t_ns)
-    if not has_time.all():
-        t_ns, command, speed_rad_s = t_ns[has_time], command[has_time], speed_rad_s[has_time]
-    clock = continued(path, t_ns, has_time, longest_part=longest_part)
-    t_ns = clock.t_ns
-    if not clock.is_good.all():
-        t_ns, command, speed_rad_s = t_ns[clock.is_good], command[clock.is_good], speed_rad_s[clock.is_good]
-    out_of_order = 0
-    if goes_back(t_ns):
-        out_of_order = int(np.count_nonzero(np.maximum.accumulate(t_ns) - t_ns))
-        order = np.argsort(t_ns, kind="stable")
-        t_ns, command, speed_rad_s = t_ns[order], command[order], speed_rad_s[order]
-    commands_held = int(np.count_nonzero(np.isnan(command)))
-    held = hold_last(command) if commands_held else command
-    known = ~np.any(np.isnan(held), axis=1)
-    before_command = int(np.count_nonzero(~known))
-    if before_command:
-        commands_held = int(np.count_nonzero(np.isnan(command[known])))
-        t_ns, held, speed_rad_s = t_ns[known], held[known], speed_rad_s[known]
-    first = np.flatnonzero(np.diff(t_ns, prepend=t_ns[:1] - 1))
-    if len(first) < 2:
-        raise UserError(f"{path}: fewer than two rows with a time and a command")
-    speeds_missing = int(np.count_nonzero(np.isnan(speed_rad_s[:, : command.shape[1]])))
-    repeated = len(t_ns) - len(first)
-    if repeated:
-        last = np.append(first[1:], len(t_ns)) - 1
-        t_ns, held, speed_rad_s = t_ns[first], held[last], _means(speed_rad_s, first)
-    repairs = Repairs(
-        rows=rows,
-        without_time=rows - int(np.count_nonzero(has_time)),
-        out_of_order=out_of_order,
-        repeated=repeated,
-        before_command=before_command,
-        commands_held=commands_held,
-        speeds_missing=speeds_missing,
-    )
-    return Table(path, t_ns, held, speed_rad_s, unit, repairs, remarks=clock.notes)
 
 
 def hold_last(command: Array) -> Array:

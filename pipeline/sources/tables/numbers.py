@@ -183,7 +183,6 @@ class NumberColumn:
         self._decimal, self._is_final = decimal, is_final
         self._values = array("d")
         self._marks = Marks()
-        self._first = ""
         self._in_part = 0
         self._texts = array("q")
         """rows of cells with text"""
@@ -201,36 +200,39 @@ class NumberColumn:
             values = np.empty(len(cells))
             for self._in_part, cell in enumerate(cells):
                 values[self._in_part] = self.number(cell)
-        self._first = self._first or next(filter(None, cells), "")
         values[np.isinf(values)] = np.nan
         self._values.frombytes(values.tobytes())
 
-    def check(self) -> None:
-        """Raise UserError if a cell could mean two numbers."""
+    @property
+    def problem(self) -> UserError | None:
+        """Why its numbers cannot be used: a cell could mean two."""
         marks = self._marks
-        if marks.unsure and ((marks.point and marks.comma) or not self._decimal):
-            self._refuse_unsure()
+        if not marks.unsure or not ((marks.point and marks.comma) or not self._decimal):
+            return None
+        cell = cell_of(marks.unsure)
+        assert cell is not None
+        whole, part = cell.value(_OTHER[cell.mark[1]]), cell.value(cell.mark[1])
+        other = f", and {marks.point!r} and {marks.comma!r} differ" if marks.point else ""
+        return UserError(
+            f"{self._path}: column {self.name!r}: {marks.unsure!r} is {whole:g} or {part:g}{other}: give the "
+            f"decimal mark of the file, --decimal {cell.mark[1]} or --decimal {_OTHER[cell.mark[1]]}"
+        )
 
-    def values(self, *, may_be_empty: bool = False) -> Array:
-        """The column. Raises UserError if no cell is a number, or one could mean two numbers."""
-        self.check()
-        values = np.asarray(self._values)
-        if not may_be_empty and not np.any(np.isfinite(values)):
-            raise UserError(f"{self._path}: column {self.name!r} has no numbers, but for example {self._first!r}")
-        return values
+    @property
+    def values(self) -> Array:
+        """The column."""
+        return np.asarray(self._values)
 
     @property
     def unit(self) -> str:
         """The unit behind its numbers; empty if none was seen."""
         return known_unit(self._marks.unit)
 
-    def texts(self, rows: Array | None = None) -> str:
-        """What was in it and is no number, `3 cells with text, first 'n/a'`; empty: nothing.
-
-        rows: (rows,) those that count; None: all.
-        """
+    def texts(self, rows: Array) -> str:
+        """What was in it and is no number, `3 cells with text, first 'n/a'`; empty: nothing. rows: (rows,) those that
+        count."""
         at = np.asarray(self._texts)
-        counted = np.ones(len(at), np.bool_) if rows is None else rows[at]
+        counted = rows[at] if len(at) else np.zeros(0, np.bool_)
         count = int(np.count_nonzero(counted))
         if not count:
             return ""
@@ -264,13 +266,3 @@ class NumberColumn:
         if self._decimal or self._marks.unsure:
             raise OtherMarkError(self.name, mark)
         self._decimal = mark
-
-    def _refuse_unsure(self) -> None:
-        cell = cell_of(self._marks.unsure)
-        assert cell is not None
-        whole, part = cell.value(_OTHER[cell.mark[1]]), cell.value(cell.mark[1])
-        other = f", and {self._marks.point!r} and {self._marks.comma!r} differ" if self._marks.point else ""
-        raise UserError(
-            f"{self._path}: column {self.name!r}: {self._marks.unsure!r} is {whole:g} or {part:g}{other}: give the "
-            f"decimal mark of the file, --decimal {cell.mark[1]} or --decimal {_OTHER[cell.mark[1]]}"
-        )

@@ -8,25 +8,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Protocol
+from dataclasses import dataclass, field, replace
 
-from fantwin.pipeline.sources.preview import ProposedFan
+from fantwin.pipeline.sources.column_file import ColumnFile
+from fantwin.pipeline.sources.tables.fan_columns import FanColumns
 from fantwin.pipeline.sources.tables.units import ELECTRICAL, ELECTRICAL_HUNDREDS
-
-
-class Named(Protocol):
-    """What has columns with names, and says something about itself."""
-
-    @property
-    def all_names(self) -> Sequence[str]:
-        """What columns can be called."""
-        ...
-
-    @property
-    def about(self) -> Mapping[str, str]:
-        """Keys and values in the lines before the names."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -57,30 +43,37 @@ class Profile:
     channels: Mapping[str, tuple[str, ...]] = field(default_factory=dict[str, tuple[str, ...]])
     note: str = ""
 
-    def is_of(self, table: Named) -> bool:
-        """Whether this program wrote the table."""
-        names = table.all_names
-        return all(any(re.fullmatch(each, name) for name in names) for each in self.head) and all(
-            key in table.about and re.fullmatch(value, table.about[key]) for key, value in self.about.items()
+    def is_of(self, file: ColumnFile) -> bool:
+        """Whether this program wrote the file."""
+        return all(any(re.fullmatch(each, name) for name in file.names) for each in self.head) and all(
+            re.fullmatch(value, file.about.get(key, "")) for key, value in self.about.items()
         )
 
-    def time_in(self, table: Named) -> str:
+    def time_in(self, names: Sequence[str]) -> str:
         """The time columns of a table, as `--time` takes them; empty: it has none of those known."""
-        found = [next((name for name in table.all_names if re.fullmatch(each, name)), "") for each in self.time]
+        found = [next((name for name in names if re.fullmatch(each, name)), "") for each in self.time]
         unit = f":{self.time_unit}" if self.time_unit else ""
         return f"{'+'.join(found)}{unit}" if found and all(found) else ""
 
-    def fans_in(self, names: Sequence[str], labels: Mapping[str, str]) -> tuple[ProposedFan, ...]:
-        """The fans of a table: columns of command and speed that belong together. labels: of names, for people."""
-        commands, speeds = _by_fan(self.command, names), _by_fan(self.speed, names)
-        shared = commands.get("")
-        fans: list[ProposedFan] = []
-        for fan, speed in speeds.items():
-            command = commands.get(fan) or (shared if len(commands) == 1 else None)
-            if command:
-                label = labels.get(speed) or labels.get(command) or _UNIT.sub("", speed)
-                fans.append(ProposedFan(label, command, speed))
-        return tuple(fans)
+    def fans_in(self, file: ColumnFile) -> FanColumns:
+        """The columns of command and speed that belong together, and those of the channels that all fans share."""
+        commands, speeds = _by_fan(self.command, file.names), _by_fan(self.speed, file.names)
+        shared = commands.get("", "") if len(commands) == 1 else ""
+        pairs = [(command, name) for fan, name in speeds.items() if (command := commands.get(fan, shared))]
+        channels = {channel: _by_fan(patterns, file.names).get("") for channel, patterns in self.channels.items()}
+        labels = [
+            file.labels.get(speed)
+            or file.labels.get(command)
+            or ("" if _NUMBERED.search(speed) else _UNIT.sub("", speed))
+            for command, speed in pairs
+        ]
+        return FanColumns(
+            command=tuple(command for command, _ in pairs),
+            speed=tuple(speed for _, speed in pairs),
+            others={channel: (name,) * len(pairs) for channel, name in channels.items() if name},
+            is_found=True,
+            labels=tuple(labels),
+        )
 
     def unit_of(self, speeds: Sequence[str], given: str) -> tuple[str, list[str]]:
         """The unit of these speeds, if the user or the file gives this one, and a note on it."""
@@ -94,19 +87,24 @@ class Profile:
             return given, [f"{speeds[0]} of {self.title} is usually in {self.unit}, not {given}: check the speeds"]
         return given, []
 
-    def channels_in(self, names: Sequence[str]) -> dict[str, str]:
-        """The column of each channel beside command and speed that a table has for all fans."""
-        found = {channel: _by_fan(patterns, names).get("") for channel, patterns in self.channels.items()}
-        return {channel: name for channel, name in found.items() if name}
-
 
 _UNIT = re.compile(r"\s*[\[(](?:RPM|rpm)[\])]$")
-_MOTORS = (r"motor\[(?P<fan>\d+)\]",)
-_BLACKBOX_CHANNELS = {
-    "supply_voltage_v": (r"vbatLatest \(V\)", r"vbatLatest"),
-    "current_a": (r"amperageLatest \(A\)",),
-}
+_NUMBERED = re.compile(r"\[\d+\]")
+"""in the name of a fan that is called by its number"""
 _DEBUG = (r"debug\[(?P<fan>\d+)\]",)
+_POLES = "electrical revolutions: add --poles with the magnetic poles of the motors"
+_BLACKBOX = Profile(
+    "blackbox without speeds",
+    head=(r"motor\[0\]", r"time(?: \(us\))?"),
+    time=(r"time(?: \(us\))?",),
+    time_unit="us",
+    command=(r"motor\[(?P<fan>\d+)\]",),
+    channels={"supply_voltage_v": (r"vbatLatest \(V\)", r"vbatLatest"), "current_a": (r"amperageLatest \(A\)",)},
+    note="no speeds in it: switch on bidirectional DShot, or debug_mode RPM_FILTER, before the flight",
+)
+_OF_TOPIC = r"(?:(?P<before>.*/)?{}\.)?"
+"""before the name of a field in a log, and not in a table of one topic"""
+_MOTORS, _OUTPUTS, _ESCS = map(_OF_TOPIC.format, ("actuator_motors", "actuator_outputs", "esc_status"))
 PROFILES = (
     Profile(
         "HWiNFO",
@@ -125,56 +123,37 @@ PROFILES = (
         speed=(r"(?P<fan>/.+)/fan/(?P<number>\d+)",),
         unit="rpm",
     ),
-    Profile(
-        "Betaflight blackbox with debug_mode RPM_FILTER",
-        head=(r"motor\[0\]", r"debug\[0\]", r"time( \(us\))?"),
+    replace(
+        _BLACKBOX,
+        title="Betaflight blackbox with debug_mode RPM_FILTER",
         about={"debug_mode": r"46|RPM_FILTER"},
-        time=(r"time( \(us\))?",),
-        time_unit="us",
-        command=_MOTORS,
         speed=_DEBUG,
         unit="hz",
-        channels=_BLACKBOX_CHANNELS,
+        note="",
     ),
-    Profile(
-        "Betaflight blackbox with debug_mode DSHOT_RPM_TELEMETRY",
-        head=(r"motor\[0\]", r"debug\[0\]", r"time( \(us\))?"),
+    replace(
+        _BLACKBOX,
+        title="Betaflight blackbox with debug_mode DSHOT_RPM_TELEMETRY",
         about={"debug_mode": r"45|DSHOT_RPM_TELEMETRY"},
-        time=(r"time( \(us\))?",),
-        time_unit="us",
-        command=_MOTORS,
         speed=_DEBUG,
         unit=ELECTRICAL_HUNDREDS,
-        channels=_BLACKBOX_CHANNELS,
-        note="electrical revolutions: add --poles with the magnetic poles of the motors",
+        note=_POLES,
     ),
-    Profile(
-        "Betaflight blackbox",
-        head=(r"motor\[0\]", r"eRPM(\(/100\))?\[0\]", r"time( \(us\))?"),
-        time=(r"time( \(us\))?",),
-        time_unit="us",
-        command=_MOTORS,
+    replace(
+        _BLACKBOX,
+        title="Betaflight blackbox",
+        head=(*_BLACKBOX.head, r"eRPM(\(/100\))?\[0\]"),
         speed=(r"eRPM(?:\(/100\))?\[(?P<fan>\d+)\]",),
         unit=ELECTRICAL_HUNDREDS,
-        channels=_BLACKBOX_CHANNELS,
-        note="electrical revolutions: add --poles with the magnetic poles of the motors",
+        note=_POLES,
     ),
-    Profile(
-        "INAV blackbox",
-        head=(r"motor\[0\]", "escRPM", r"time( \(us\))?"),
-        time=(r"time( \(us\))?",),
-        time_unit="us",
-        command=_MOTORS,
+    replace(
+        _BLACKBOX,
+        title="INAV blackbox",
+        head=(*_BLACKBOX.head, "escRPM"),
         note="escRPM is the mean of all motors, so no column is the speed of one motor",
     ),
-    Profile(
-        "blackbox without speeds",
-        head=(r"motor\[0\]", r"time( \(us\))?"),
-        time=(r"time( \(us\))?",),
-        time_unit="us",
-        command=_MOTORS,
-        note="no speeds in it: switch on bidirectional DShot, or debug_mode RPM_FILTER, before the flight",
-    ),
+    _BLACKBOX,
     Profile(
         "RCbenchmark",
         head=(r"Time \(s\)", r"(ESC.*|Throttle.*) \(.s\)", r"Motor (Electrical|Optical) Speed.* \((RPM|rad/s|Hz)\)"),
@@ -187,10 +166,17 @@ PROFILES = (
         channels={"supply_voltage_v": (r"Voltage \(V\)",), "current_a": (r"Current \(A\)",)},
     ),
     Profile(
-        "PX4 (ulog2csv)",
-        head=(r"output\[0\]|control\[0\]", r"esc\[0\]\.esc_rpm"),
-        command=(r"(?:output|control)\[(?P<fan>\d+)\]",),
-        speed=(r"esc\[(?P<fan>\d+)\]\.esc_rpm",),
+        "PX4",
+        head=(rf"(?:{_MOTORS}control|{_OUTPUTS}output)\[0\]".replace("?P<before>", "?:"), rf"{_ESCS}esc\[0\]\.esc_rpm"),
+        command=(rf"{_MOTORS}control\[(?P<fan>\d+)\]", rf"{_OUTPUTS}output\[(?P<fan>\d+)\]"),
+        speed=(rf"{_ESCS}esc\[(?P<fan>\d+)\]\.esc_rpm",),
+        unit="rpm",
+    ),
+    Profile(
+        "MAVROS",
+        head=(r".*mavros/rc/out\.channels\[0\]", r".*mavros/esc_status\.esc_status\[0\]\.rpm"),
+        command=(r"(?P<before>.*)mavros/rc/out\.channels\[(?P<fan>\d+)\]",),
+        speed=(r"(?P<before>.*)mavros/esc_status\.esc_status\[(?P<fan>\d+)\]\.rpm",),
         unit="rpm",
     ),
     Profile(
@@ -201,7 +187,7 @@ PROFILES = (
         note="name them: ESC 0 is RPM{0}, output 1 is C1, and SERVOn_FUNCTION says which output drives which motor",
     ),
     Profile(
-        "PX4 (ulog2csv), one topic",
+        "PX4, one topic",
         head=("timestamp", r"output\[0\]|control\[0\]|esc\[0\]\.esc_rpm"),
         time=("timestamp",),
         time_unit="us",
@@ -238,9 +224,9 @@ PROFILES = (
 )
 
 
-def profile_of(table: Named) -> Profile | None:
-    """The program that wrote a table, by its names; None: it is not known."""
-    return next((each for each in PROFILES if each.is_of(table)), None)
+def profile_of(file: ColumnFile) -> Profile | None:
+    """The program that wrote a file, by its names; None: it is not known."""
+    return next((each for each in PROFILES if each.is_of(file)), None)
 
 
 def _by_fan(patterns: Sequence[str], names: Sequence[str]) -> dict[str, str]:

@@ -9,11 +9,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from fantwin.pipeline.errors import UsageError, UserError
-from fantwin.pipeline.sources.tables.dates import ORDERS, DateColumn, is_time_of_day
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.sources.column_file import NO_TIME
+from fantwin.pipeline.sources.tables.dates import DateColumn, is_time_of_day
 from fantwin.pipeline.sources.tables.fan_columns import require, with_unit
 from fantwin.pipeline.sources.tables.layout import Layout
 from fantwin.pipeline.sources.tables.numbers import NumberColumn
+from fantwin.pipeline.sources.tables.reading import Reading
 from fantwin.pipeline.sources.tables.units import NS_PER_UNIT
 from fantwin.pipeline.sources.tables.zones import as_utc, zone_of
 from fantwin.schemas.messages import FURTHEST_T_NS, Array
@@ -28,9 +30,8 @@ TIME_UNITS = (*NS_PER_UNIT, DATE_UNIT)
 class TimeColumn:
     """The column of times, or the two of date and time of day, in ns."""
 
-    def __init__(self, layout: Layout, given: str, dates: str = "", zone: str = "", decimal: str = "") -> None:
-        """given: `NAME`, `NAME:UNIT` or `DATE+TIME`. dates: the order of the parts of a date; empty: found. decimal:
-        mark of the numbers; empty: found, as of other columns.
+    def __init__(self, layout: Layout, given: str, reading: Reading, decimal: str = "") -> None:
+        """given: `NAME`, `NAME:UNIT` or `DATE+TIME`. decimal: mark of the numbers; empty: found, as of other columns.
 
         Without a unit, numbers are in the one that the file names, else since 1970 in the one that fits, else in s, and
         anything else is a date.
@@ -38,42 +39,34 @@ class TimeColumn:
         Raises:
             UserError: there is no such column, order or zone.
         """
-        if dates and dates not in ORDERS:
-            raise UsageError(f"--dates {dates}: give {', '.join(ORDERS[:-1])} or {ORDERS[-1]}, the order in the file")
         names = layout.all_names
         self._path = layout.path
         self.names, self._unit = time_names(layout, given)
-        pair = usual_time(layout).split("+")
-        if len(pair) == 2 and self.names[0] in pair and len(self.names) == 1:
-            self.names, self._unit = pair, DATE_UNIT  # the date is beside it
         for name in self.names:
-            require(layout.path, names, name)
+            require(str(layout.path), names, name)
         self.name = "+".join(self.names)
         self._indices = [layout.index(name) for name in self.names]
-        self._zone = zone_of(zone) if zone else None
+        self._zone = zone_of(reading.zone) if reading.zone else None
         self._is_given = bool(self._unit)
         self._by_file = False
         if not self._unit and len(self.names) == 1 and layout.unit(self.name) in NS_PER_UNIT:
             self._unit, self._by_file = layout.unit(self.name), True
-        self._dates = DateColumn(layout.path, self.name, dates, has_zone=bool(zone))
+        self._dates = DateColumn(layout.path, self.name, reading.dates, has_zone=bool(reading.zone))
         self._is_final = bool(decimal)
         self._decimal = decimal or layout.decimal_of(self.names[0])
         self._numbers = NumberColumn(layout.path, self.name, self._indices[0], self._decimal, is_final=self._is_final)
         self._first = ""
         self._far = 0
         self._t_ns = array("q")
-        self._known = bytearray()
         self.notes: list[str] = []
         self.format = ""
-        self.has_dates = False
 
     def add(self, rows: Sequence[Sequence[str]]) -> None:
         """Append the cells of some rows. Raises UserError for a time beyond the year 2116."""
         cells = self._cells(rows)
         self._first = self._first or next(filter(None, map(str.strip, cells)), "")
         if not self._first:
-            self._t_ns.extend([0] * len(cells))
-            self._known.extend(bytes(len(cells)))
+            self._t_ns.extend([NO_TIME] * len(cells))
             return
         if not self._unit or (self._by_file and not self._t_ns and self._unit != DATE_UNIT):
             self._unit = self._found_unit()
@@ -83,13 +76,10 @@ class TimeColumn:
                 del self._t_ns[:]
             self._dates.add(cells)
             return
-        t_ns, known = self._counted(cells, NS_PER_UNIT[self._unit])
-        self._t_ns.frombytes(t_ns.tobytes())
-        self._known.extend(known.tobytes())
+        self._t_ns.frombytes(self._counted(cells, NS_PER_UNIT[self._unit]).tobytes())
 
-    def _counted(self, cells: Sequence[str], scale: int) -> tuple[Array, Array]:
-        """(cells,) times in ns, and whether each could be read. Whole numbers are exact: a float cannot hold ns since
-        1970."""
+    def _counted(self, cells: Sequence[str], scale: int) -> Array:
+        """(cells,) times in ns. Whole numbers are exact: a float cannot hold ns since 1970."""
         try:
             whole = np.array(list(map(int, cells)), np.int64)
         except (ValueError, OverflowError):
@@ -97,7 +87,7 @@ class TimeColumn:
         else:
             near = np.abs(whole.astype(np.float64)) * scale < FURTHEST_T_NS
             self._far += int(np.count_nonzero(~near))
-            return np.where(near, whole, 0) * scale, near
+            return np.where(near, np.where(near, whole, 0) * scale, NO_TIME)
         try:
             values = np.array([float(cell) if cell else math.nan for cell in cells])
             if self._is_final or self._decimal != ".":
@@ -109,7 +99,8 @@ class TimeColumn:
         self._far += int(np.count_nonzero(finite & ~near))
         values = np.where(near, values, 0.0)
         whole = values.astype(np.int64)
-        return np.where(whole == values, whole * scale, np.rint(values * scale).astype(np.int64)), near
+        t_ns = np.where(whole == values, whole * scale, np.rint(values * scale).astype(np.int64))
+        return np.where(near, t_ns, NO_TIME)
 
     def _cells(self, rows: Sequence[Sequence[str]]) -> list[str]:
         if len(self._indices) == 1:
@@ -136,11 +127,12 @@ class TimeColumn:
             return fits[0]
         return "s"
 
-    def values(self) -> tuple[Array, Array]:
-        """(rows,) times in ns, and whether each could be read. Raises UserError if none could."""
+    def values(self) -> Array:
+        """(rows,) times in ns. Raises UserError if none could be read."""
         if self._unit == DATE_UNIT:
             return self._date_values()
-        known = np.frombuffer(bytes(self._known), dtype=np.bool_)
+        t_ns = np.asarray(self._t_ns)
+        known = t_ns != NO_TIME
         if self._far > np.count_nonzero(known):
             self._refuse_furthest()
         if not known.any():
@@ -148,28 +140,26 @@ class TimeColumn:
                 f"{self._path}: column {self.name!r} has no times in {self._unit or DATE_UNIT}, but for example "
                 f"{self._first!r}; use numbers in s, ms, us or ns, or dates such as 2026-01-31 13:45:00.250"
             )
-        self._numbers.check()
-        t_ns = np.asarray(self._t_ns)
-        since = " since 1970" if t_ns[np.argmax(known)] > _YEAR_2000_NS else ""
-        self.has_dates = bool(since)
-        self.format = f"numbers in {self._unit}{since}"
-        return t_ns, known
+        if self._numbers.problem:
+            raise self._numbers.problem
+        self.format = f"numbers in {self._unit}{' since 1970' if t_ns[np.argmax(known)] > _YEAR_2000_NS else ''}"
+        return t_ns
 
-    def _date_values(self) -> tuple[Array, Array]:
-        t_ns, known, zoned, self.format = self._dates.values()
-        self.has_dates = not self._dates.is_time_of_day
-        naive = known & ~zoned
-        if naive.any() and self._zone and self.has_dates:
-            t_ns = t_ns.copy()
+    def _date_values(self) -> Array:
+        t_ns, zoned, self.format = self._dates.values()
+        known = t_ns != NO_TIME
+        naive = known & ~zoned & (not self._dates.is_time_of_day)
+        if naive.any() and self._zone:
             t_ns[naive], notes = as_utc(self._path, self.name, t_ns[naive], self._zone)
             self.notes += notes
             self.format += f", {self._zone.key}"
-        elif naive.any() and self.has_dates:
+        elif naive.any():
             self.notes.append(f"dates of {self.name!r} have no time zone: UTC assumed; --zone Europe/Berlin names one")
         is_far = known & (np.abs(t_ns) >= FURTHEST_T_NS)
         if 2 * np.count_nonzero(is_far) > np.count_nonzero(known):
             self._refuse_furthest()
-        return t_ns, known & ~is_far
+        t_ns[is_far] = NO_TIME
+        return t_ns
 
     @property
     def is_notable(self) -> bool:
@@ -190,13 +180,15 @@ class TimeColumn:
 
 
 def time_names(layout: Layout, given: str) -> tuple[list[str], str]:
-    """The one or two columns that a user means by `NAME`, `NAME:UNIT` or `DATE+TIME`, and the unit."""
+    """The one or two columns that a user means by `NAME`, `NAME:UNIT` or `DATE+TIME`, and the unit. One of a pair of
+    date and time of day means both."""
     names = layout.all_names
     name, unit = with_unit(given, names, TIME_UNITS)
+    pair = usual_time(layout).split("+")
     parts = [part.strip() for part in name.split("+")]
     if name not in names and len(parts) == 2 and all(part in names for part in parts):
         return parts, DATE_UNIT
-    return [name], unit
+    return (pair, DATE_UNIT) if len(pair) == 2 and name in pair else ([name], unit)
 
 
 def usual_time(layout: Layout) -> str:

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import dataclass
+from typing import NamedTuple
 
+from fantwin.pipeline.errors import UsageError
+from fantwin.schemas.channels import BY_NAME
+from fantwin.schemas.messages import Array
 from fantwin.schemas.units import NS_PER_S, RAD_S_PER_UNIT
 
 RAD_S_PER_TABLE_UNIT = {**RAD_S_PER_UNIT, "hz": 2 * math.pi, "deg/s": math.pi / 180}
@@ -30,19 +33,18 @@ _TIMES = {
 }
 
 
-@dataclass(frozen=True)
-class Scale:
+class Scale(NamedTuple):
     """How values in a unit become those of a channel: `value * factor + offset`."""
 
-    factor: float
+    factor: float = 1.0
     offset: float = 0.0
 
 
 CHANNEL_SCALES = {
-    "supply_voltage_v": {"v": Scale(1.0), "volt": Scale(1.0), "volts": Scale(1.0), "mv": Scale(1e-3)},
-    "current_a": {"a": Scale(1.0), "amp": Scale(1.0), "amps": Scale(1.0), "ma": Scale(1e-3)},
+    "supply_voltage_v": {"v": Scale(), "volt": Scale(), "volts": Scale(), "mv": Scale(1e-3)},
+    "current_a": {"a": Scale(), "amp": Scale(), "amps": Scale(), "ma": Scale(1e-3)},
     "temperature_c": {
-        **dict.fromkeys(("c", "°c", "ºc", "degc", "celsius"), Scale(1.0)),
+        **dict.fromkeys(("c", "°c", "ºc", "degc", "celsius"), Scale()),
         **dict.fromkeys(("f", "°f", "ºf", "degf", "fahrenheit"), Scale(5 / 9, -160 / 9)),
         "m°c": Scale(1e-3),
         "k": Scale(1.0, -273.15),
@@ -61,6 +63,8 @@ _KNOWN = {
 _AT_END = re.compile(r"(?:[\[(]\s*(?P<in>[^\[\]()]*?)\s*[\])]|(?:_|\s-\s|,\s|\s/\s)(?P<last>[^\s_,\[\]()]+))\s*$")
 _LETTERS_IN_NAMES = {"f", "n", "w"}
 """no units behind an underscore"""
+_RPM_IN_NAME = re.compile(r"(?:(?<![A-Za-z])|(?<=[a-z])(?=RPM))([eE]?)(?:[Rr]pm|RPM)(?![a-z])")
+_TAGS = re.compile(r"\{.*\}$")
 
 
 def known_unit(text: str) -> str:
@@ -76,17 +80,40 @@ def is_unit(text: str) -> bool:
 
 
 def unit_in_name(name: str) -> str:
-    """The unit at the end of the name of a column, as in `Fan1 [RPM]`, `time (us)` or `speed_rpm`; empty: none."""
-    found = _AT_END.search(name)
-    if found is None:
-        return ""
-    text = found["in"] if found["in"] is not None else found["last"]
-    unit = known_unit(text) or ("K" if found["in"] == "K" else "")
-    if found["in"] is None and text.lower() in _LETTERS_IN_NAMES:
-        return ""
-    return unit
+    """The unit that the name of a column or series has at its end, as in `Fan1 [RPM]`, `time (us)` or `speed_rpm{a=b}`,
+    or rpm anywhere; empty: none."""
+    name = _TAGS.sub("", name)
+    if found := _AT_END.search(name):
+        text = found["in"] if found["in"] is not None else found["last"]
+        is_letter = found["in"] is None and text.lower() in _LETTERS_IN_NAMES
+        if unit := "K" if found["in"] == "K" else "" if is_letter else known_unit(text):
+            return unit
+    if of_rpm := _RPM_IN_NAME.search(name):
+        return ELECTRICAL if of_rpm[1] else "rpm"
+    return ""
 
 
-def scale_of(channel: str, unit: str) -> Scale | None:
-    """How values of a column in this unit become those of a channel; None: the unit is not one of the channel."""
-    return CHANNEL_SCALES[channel].get(unit.lower()) if channel in CHANNEL_SCALES else Scale(1.0)
+def in_unit_of(channel: str, name: str, values: Array, unit: str) -> tuple[Array, str]:
+    """The values of a column in the unit of its channel; and a note, where they were converted, or where their unit is
+    of another kind."""
+    if not unit or channel not in CHANNEL_SCALES:
+        return values, ""
+    scale = CHANNEL_SCALES[channel].get(unit.lower())
+    if scale is None:
+        return values, f"{name!r} is in {unit}, and is taken as {channel}, in {BY_NAME[channel].unit}"
+    if scale == Scale():
+        return values, ""
+    return values * scale.factor + scale.offset, f"{name!r} converted from {unit} to {BY_NAME[channel].unit}"
+
+
+def rad_s_per(unit: str, poles: int | None) -> tuple[float, str]:
+    """rad/s of one unit, and the unit that people are shown. poles: magnetic ones, for electrical speeds."""
+    if unit not in (ELECTRICAL, ELECTRICAL_HUNDREDS):
+        return RAD_S_PER_TABLE_UNIT[unit], unit
+    if poles is None:
+        raise UsageError(
+            "speeds in erpm are electrical revolutions: give the magnetic poles of the motor, for example --poles 14"
+        )
+    if poles < 2 or poles % 2:
+        raise UsageError(f"--poles {poles}: magnetic poles come in pairs, for example 14")
+    return (100.0 if unit == ELECTRICAL_HUNDREDS else 1.0) * RAD_S_PER_TABLE_UNIT["rpm"] / (poles / 2), "rpm"

@@ -10,7 +10,8 @@ import pytest
 
 from fantwin.pipeline.recordings.reading import read_recording
 from fantwin.pipeline.recordings.training_runs import read_runs
-from fantwin.pipeline.sources.logs.known_fields import known_columns
+from fantwin.pipeline.sources.column_file import ColumnFile
+from fantwin.pipeline.sources.tables.profiles import profile_of
 from fantwin.schemas.messages import Raw
 from fantwin.schemas.tacho import Tacho
 from tests.support.fantwin_command import error_of, fantwin
@@ -80,7 +81,9 @@ def test_a_ros_bag_with_times_of_its_messages(tmp_path: Path, storage: str) -> N
     assert result.exit_code == 0, result.output
     summary = json.loads(result.stdout)
     assert (summary["samples"], summary["fans"]) == (200, 2)
-    assert summary["notes"] == ["/fans/command: messages without a time of their own; that of the bag is used"]
+    without = "/fans/command: messages without a time of their own; that of the bag is used"
+    never = "/fans/command.data[1] is 0.5 throughout: a twin needs steps of the command"
+    assert summary["notes"] == [without, never]
     t_ns, command, speed_rad_s = raw_columns(recording)
     np.testing.assert_allclose(t_ns / 1e9, 100 + T_S, atol=1e-9)
     np.testing.assert_array_equal(command, COMMANDS)
@@ -93,7 +96,7 @@ def test_a_preview_shows_the_fields_with_their_rates_and_the_command_that_import
     found = {each["name"]: each for each in shown["columns"]}
     assert (found[field]["values"], found[field]["rate_hz"]) == (200, pytest.approx(50))
     lines = fantwin("import", path, "--preview").stdout.splitlines()
-    assert lines[0] == f"{path}: ULog, {len(found)} fields"
+    assert lines[0] == f"{path}: PX4: ULog, {len(found)} fields"
     assert any(line.startswith(field) for line in lines)
     assert lines[-1].startswith(f"to import it: fantwin import {path} --command ")
     path.write_bytes(path.read_bytes()[:20])
@@ -125,8 +128,8 @@ def quad(path: Path, *, silent: int = -1, motors: bool = False) -> Path:
 def test_a_px4_log_gives_the_motors_that_are_there_and_no_speed_while_their_esc_is_offline(tmp_path: Path) -> None:
     log, recording = quad(tmp_path / "quad.ulg", silent=2), tmp_path / "r.mcap"
     (shown,) = json.loads(fantwin("import", log, "--preview", "--json").stdout)["files"]
-    known = ["--command", "actuator_outputs.output[*]", "--speed", "esc_status.esc[*].esc_rpm:rpm"]
-    assert shown["options"] == known
+    known = [["--command", "actuator_outputs.output[0]"], ["--speed", "esc_status.esc[0].esc_rpm:rpm"]]
+    assert [shown["options"][:2], shown["options"][8:10]] == known
     volts = ("--channel", "supply_voltage_v=esc_status.esc[*].esc_voltage")
     result = json.loads(fantwin("import", log, *volts, "-o", recording, "--json").stdout)
     assert (result["fans"], result["samples"], result["speeds_missing"]) == (4, 300, 30)
@@ -201,7 +204,7 @@ def test_a_command_that_never_changes_is_named_with_its_field_and_later_with_its
     }
     write_ulog(tmp_path / "a.ulg", topics)
     result = json.loads(fantwin("import", tmp_path / "a.ulg", "-o", tmp_path / "r.mcap", "--json").stdout)
-    assert "actuator_outputs.output[1] is 0.5 throughout: a twin needs steps of the command" in result["remarks"]
+    assert "actuator_outputs.output[1] is 0.5 throughout: a twin needs steps of the command" in result["notes"]
     for name, *words in (("report",), ("train", "-o", tmp_path / "t.onnx")):
         said = error_of(name, *words, tmp_path / "r.mcap", "--fans", "1-1")
         assert said.splitlines()[-1] == "fan 1: the command never changes; record steps between three levels or more"
@@ -212,18 +215,18 @@ def test_a_command_that_never_changes_is_named_with_its_field_and_later_with_its
     [
         (
             ["actuator_motors.control[0]", "actuator_outputs.output[0]", "esc_status.esc[0].esc_rpm"],
-            "actuator_motors.control[*]",
-            "esc_status.esc[*].esc_rpm:rpm",
+            "actuator_motors.control[0]",
+            "esc_status.esc[0].esc_rpm",
         ),
         (
             ["/fmu/out/esc_status.esc[0].esc_rpm", "/fmu/out/actuator_outputs.output[0]"],
-            "/fmu/out/actuator_outputs.output[*]",
-            "/fmu/out/esc_status.esc[*].esc_rpm:rpm",
+            "/fmu/out/actuator_outputs.output[0]",
+            "/fmu/out/esc_status.esc[0].esc_rpm",
         ),
         (
             ["/uav1/mavros/esc_status.esc_status[0].rpm", "/uav1/mavros/rc/out.channels[0]"],
-            "/uav1/mavros/rc/out.channels[*]",
-            "/uav1/mavros/esc_status.esc_status[*].rpm:rpm",
+            "/uav1/mavros/rc/out.channels[0]",
+            "/uav1/mavros/esc_status.esc_status[0].rpm",
         ),
         (["esc_status.esc[0].esc_rpm", "input_rc.values[0]"], None, None),
     ],
@@ -231,5 +234,7 @@ def test_a_command_that_never_changes_is_named_with_its_field_and_later_with_its
 def test_the_fields_of_motors_are_known_in_logs_and_bags(
     names: list[str], command: str | None, speed: str | None
 ) -> None:
-    known = known_columns(names)
-    assert (known.get("--command"), known.get("--speed")) == (command, speed)
+    log = ColumnFile()
+    log.names = names
+    fans = profile.fans_in(log) if (profile := profile_of(log)) else None
+    assert (fans and fans.command, fans and fans.speed) == (command and (command,), speed and (speed,))

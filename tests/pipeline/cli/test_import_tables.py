@@ -17,7 +17,8 @@ import pytest
 from fantwin.pipeline.cli.simulation.scenario import FileScenario, Scenario
 from fantwin.pipeline.errors import FantwinError
 from fantwin.pipeline.recordings.training_runs import read_runs
-from fantwin.pipeline.sources.imported_file import Wanted, preview_of, read_file
+from fantwin.pipeline.sources.imported_file import preview_of, read_file
+from fantwin.pipeline.sources.samples_of_file import Wanted
 from fantwin.pipeline.sources.tables import profiles
 from fantwin.schemas.messages import Array
 from tests.support.fantwin_command import error_of, fantwin
@@ -569,7 +570,7 @@ def test_commands_and_speeds_in_two_tables_are_joined_by_their_times(tmp_path: P
     escs.write_text(lines(us, [1] * N, SPEED, head="timestamp,esc_count,esc[0].esc_rpm"), encoding="utf-8")
     result = fantwin("import", outputs, escs, "-o", tmp_path / "r.mcap")
     assert "columns of 2 files by their times" in result.stdout
-    assert "columns of PX4 (ulog2csv): esc[0].esc_rpm: command 'output[0]'" in result.stdout
+    assert "columns of PX4: esc[0].esc_rpm: command 'output[0]'" in result.stdout
     t_ns, command, speed = raw_columns(tmp_path / "r.mcap")
     np.testing.assert_allclose(t_ns / 1e9, us / 1e6)
     np.testing.assert_array_equal(command[:, 0], COMMAND)

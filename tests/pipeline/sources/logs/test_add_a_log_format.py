@@ -9,27 +9,26 @@ import numpy as np
 import pytest
 
 from fantwin.pipeline.recordings.training_runs import read_runs
+from fantwin.pipeline.sources.column_file import Column, ColumnFile
 from fantwin.pipeline.sources.logs import formats
 from fantwin.pipeline.sources.logs.formats import LogFormat
-from fantwin.pipeline.sources.logs.log_file import Series
 from fantwin.schemas.units import NS_PER_S
 from tests.support.fantwin_command import fantwin
 
 START = b"TOY LOG\n"
 
 
-class ToyLog:
-    """A `LogFile` of lines with a time in s, a duty and a speed in rpm."""
+class ToyLog(ColumnFile):
+    """A log of lines with a time in s, a duty and a speed in rpm."""
 
-    notes: Sequence[str] = ()
-    names: Sequence[str] = ("duty", "rpm")
+    names = ("duty", "rpm")
 
     def __init__(self, path: Path) -> None:
         rows = np.loadtxt(path, skiprows=1)
         t_ns = np.rint(rows[:, 0] * NS_PER_S).astype(np.int64)
-        self._fields = {name: Series(t_ns, rows[:, 1 + k]) for k, name in enumerate(self.names)}
+        self._fields = {name: Column(t_ns, rows[:, 1 + k]) for k, name in enumerate(self.names)}
 
-    def read(self, names: Sequence[str]) -> Mapping[str, Series]:
+    def read(self, names: Sequence[str]) -> Mapping[str, Column]:
         return {name: self._fields[name] for name in names}
 
 

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.sources.imported_file import read_file
+from fantwin.pipeline.sources.samples_of_file import Wanted
 from fantwin.pipeline.sources.tables import table_file
 from fantwin.pipeline.sources.tables.measured_table import Table
-from fantwin.pipeline.sources.tables.table_file import read_table
 
 RPM = 2 * np.pi / 60
 UNITS = {"rad/s": 1.0, "rpm": RPM, "hz": 2 * np.pi, "deg/s": np.pi / 180}
@@ -20,7 +21,7 @@ def table(
 ) -> Table:
     path = tmp_path / "measured.csv"
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
-    return read_table(path, time, command, speed, period=period)
+    return read_file(path, Wanted(command, speed, time, period))
 
 
 PLAIN = "t,u,y\n0,1,10\n1,2,20\n"
@@ -67,8 +68,8 @@ def test_a_table_is_read_and_repaired(tmp_path, text, arguments, t_s, command, s
 
 
 def test_a_file_that_is_missing_or_has_no_end_of_line_or_whose_times_go_back_is_a_one_line_error(tmp_path):
-    with pytest.raises(UserError, match=r"nowhere\.csv: cannot read the table: No such file"):
-        read_table(tmp_path / "nowhere.csv", "t", ["u"], ["y"])
+    with pytest.raises(UserError, match=r"nowhere\.csv: cannot be read: No such file"):
+        read_file(tmp_path / "nowhere.csv", Wanted(["u"], ["y"], "t"))
     with pytest.raises(UserError, match=r"\.csv: not a text file with columns: a line is longer than 1,048,576"):
         table(tmp_path, "t,u,y\n" + 1_100_000 * "1")
     with pytest.raises(UserError, match=r"goes back by 5\.000 s at row 9, from 7\.000 s to 2\.000 s: the clock was"):
@@ -120,8 +121,8 @@ def test_dates_and_periods_need_no_unit_and_a_name_with_blanks_is_quoted(tmp_pat
         ("t,u,y\n", "has no times|has no numbers|fewer than two"),
         ("t,u,y\n0,1,10\n", "fewer than two"),
         ("t,u,y\nthen,1,10\nnow,1,10\n", "has no times in iso, but for example 'then'"),
-        ("t,u,y\n0,1,fast\n1,1,slow\n", "'y' has no numbers, but for example 'fast'"),
-        (b"MATLAB 5.0 MAT-file\0\0\0\1", "not a text file with columns"),
+        ("t,u,y\n0,1,fast\n1,1,slow\n", "'y' has no numbers, but 2 cells with text .*first 'fast'"),
+        (b"not MATLAB's MAT-file\0\0\0\1", "not a text file with columns"),
     ],
 )
 def test_a_file_that_is_not_a_measured_table_is_a_one_line_error(tmp_path, content, expected):
@@ -160,7 +161,7 @@ def test_row_17_a_table_needs_little_more_memory_than_its_file(tmp_path):
     )
     tracemalloc.start()
     try:
-        read_table(path, "t:s", ["u"], ["y:rpm"])
+        read_file(path, Wanted(["u"], ["y:rpm"], "t:s"))
         _, peak_bytes = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()

@@ -1,0 +1,235 @@
+"""Samples of fans from the columns of a file: which columns are fans, in which units, and commands at the times of the
+speeds. What is left out is said."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from fantwin.pipeline.errors import UsageError, UserError
+from fantwin.pipeline.sources.column_file import NO_TIME, Column, ColumnFile, listed
+from fantwin.pipeline.sources.measured_where import read_measured, stops_where_nan
+from fantwin.pipeline.sources.tables.clocks import Clock, continued
+from fantwin.pipeline.sources.tables.fan_columns import FanColumns, fan_columns, used_fans
+from fantwin.pipeline.sources.tables.measured_table import Table, table_of
+from fantwin.pipeline.sources.tables.profiles import Profile, profile_of
+from fantwin.pipeline.sources.tables.reading import AS_FOUND, Reading
+from fantwin.pipeline.sources.tables.units import SPEED_UNITS, in_unit_of, rad_s_per, unit_in_name
+from fantwin.schemas.messages import Array
+
+_MOST_NAMED = 8
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What a user asks of a file.
+
+    Attributes:
+        command, speed: as for `fan_columns`; both empty: those that the program that wrote the file is known to write.
+        time, period: as for `TableFile`.
+        channels: columns, by the name of their channel.
+        reading: what the file does not show.
+    """
+
+    command: Sequence[str] = ()
+    speed: Sequence[str] = ()
+    time: str | None = None
+    period: str | None = None
+    channels: Mapping[str, Sequence[str]] = field(default_factory=dict[str, Sequence[str]])
+    reading: Reading = AS_FOUND
+
+
+def chosen_fans(path: Path, file: ColumnFile, wanted: Wanted, profile: Profile | None) -> FanColumns:
+    """The columns of the fans: those that the user names, else those of the program that wrote the file.
+
+    Raises:
+        UserError: there are none.
+    """
+    where = str(path) if file.is_rows else f"{path}: {file.title}"
+    if wanted.command and wanted.speed:
+        return fan_columns(where, file.names, wanted.command, wanted.speed, wanted.channels)
+    known = profile.fans_in(file) if profile else FanColumns((), ())
+    if wanted.command or wanted.speed or not known.speed or profile is None:
+        raise UsageError("an import needs --command and --speed; --preview shows the columns")
+    named = fan_columns(where, file.names, known.command, known.speed, wanted.channels)
+    fans = zip(known.labels, known.command, known.speed, strict=True)
+    said = listed(
+        [f"{label or speed}: command {command!r}, speed {speed!r}" for label, command, speed in fans], _MOST_NAMED
+    )
+    return replace(known, others={**known.others, **named.others}, notes=(f"columns of {profile.title}: {said}",))
+
+
+def samples_of(path: Path, file: ColumnFile, wanted: Wanted) -> Table:
+    """The samples of the fans of a file. Values of channels hold until the next one, as commands do, where a file has
+    them at other times than the speeds.
+
+    Raises:
+        UserError: the columns or units cannot be used.
+    """
+    profile = profile_of(file)
+    chosen = chosen_fans(path, file, wanted, profile)
+    columns, unmeasured = read_measured(file, chosen.names)
+    for name, column in columns.items():
+        if column.problem:
+            raise column.problem
+        if not chosen.is_found and not np.any(np.isfinite(column.values)):
+            raise UserError(f"{path}: column {name!r} has no numbers{column.note and f', but {column.note}'}")
+    columns, clocks = _continued(path, columns)
+    t_ns, values = _at_times_of_speeds(columns, chosen)
+    chosen = used_fans(path, chosen, values)
+    stopped = _without_stops(chosen, columns, values, t_ns)
+    unit, of_units = speed_unit(chosen, columns, profile)
+    for channel, names in chosen.others.items():
+        for name in dict.fromkeys(filter(None, names)):
+            values[name], note = in_unit_of(channel, name, values[name], _unit(name, columns))
+            of_units += [note] if note else []
+    table = table_of(
+        path, chosen, values, t_ns, *rad_s_per(unit or "rad/s", wanted.reading.poles), longest_part=not file.is_rows
+    )
+    example = f"--speed {shlex.quote(f'{(*wanted.speed, *chosen.speed)[0]}:rpm')}"
+    remarks = (
+        *file.notes,
+        *chosen.notes,
+        *(f"{name!r}: {columns[name].note}" for name in chosen.names if columns[name].note),
+        *_unmeasured_in_words(chosen, unmeasured),
+        *clocks,
+        *stopped,
+        *_rates(columns, chosen),
+        *of_units,
+        *table.remarks,
+        *_constant_commands(chosen, table.command),
+    )
+    assumed = _assumed(file.assumed, None if unit else ("speeds in rad/s", example))
+    return replace(table, assumed=assumed, remarks=remarks, labels=chosen.labels)
+
+
+def speed_unit(chosen: FanColumns, columns: Mapping[str, Column], profile: Profile | None) -> tuple[str, list[str]]:
+    """The unit of the speeds: the one that the user gives, else that of the file or its names, else the usual one of
+    the program; empty: none is known. And notes on it.
+
+    Raises:
+        UsageError: the file has speeds in several.
+    """
+    in_file = (unit if (unit := _unit(name, columns)) in SPEED_UNITS else "" for name in chosen.speed)
+    units = [chosen.unit] if chosen.unit else list(dict.fromkeys(in_file))
+    if len(units) > 1:
+        raise UsageError(
+            f"speeds in {', '.join(unit or 'no unit' for unit in units)}, as the file says: give one unit, as in "
+            f"--speed {shlex.quote(f'{chosen.speed[0]}:rpm')}, or import them apart"
+        )
+    return profile.unit_of(chosen.speed, units[0]) if profile else (units[0], [])
+
+
+def _unit(name: str, columns: Mapping[str, Column]) -> str:
+    return columns[name].unit or unit_in_name(name)
+
+
+def _assumed(*found: tuple[str, str] | None) -> str:
+    """Line on the units that were assumed, each with the option that says otherwise."""
+    known = list(filter(None, found))
+    if not known:
+        return ""
+    assumed, options = (" and ".join(words) for words in zip(*known, strict=True))
+    return f"no unit given, {assumed} assumed; if that is wrong, use for example {options}"
+
+
+def _unmeasured_in_words(chosen: FanColumns, unmeasured: Sequence[tuple[str, int, str]]) -> list[str]:
+    found: dict[str, dict[str, int]] = {}
+    for name, count, where in unmeasured:
+        if count and name in chosen.names:
+            found.setdefault(where, {})[name] = count
+    return [f"{_with_others(of)}: {sum(of.values())} values left out, where {where}" for where, of in found.items()]
+
+
+def _at_times_of_speeds(columns: Mapping[str, Column], chosen: FanColumns) -> tuple[Array, dict[str, Array]]:
+    """All times at which a speed was read, in the order of the file where they are common, and all values at them:
+    commands and channels are held, a speed is NaN where its fan has none then."""
+    speeds = [columns[name] for name in chosen.speed]
+    t_ns = speeds[0].t_ns
+    if not all(each.has_times(t_ns) for each in speeds):
+        t_ns = np.unique(np.concatenate([each.t_ns for each in speeds]))
+    values = {name: each.values if each.has_times(t_ns) else _held(each, t_ns) for name, each in columns.items()}
+    for name, each in zip(chosen.speed, speeds, strict=True):
+        if not each.has_times(t_ns):
+            values[name] = np.full(len(t_ns), np.nan)
+            values[name][np.searchsorted(t_ns, each.t_ns)] = each.values
+    return t_ns, values
+
+
+def _continued(path: Path, columns: Mapping[str, Column]) -> tuple[Mapping[str, Column], list[str]]:
+    """The columns with times that go on, from when all of them do to when one no longer does: a command that is read in
+    part must not hold for the rest. Columns that share their times are rows, and are left as they are."""
+    clocks: list[tuple[Column, Clock]] = []
+    found: dict[str, Column] = {}
+    notes: list[str] = []
+    first, *others = columns.values()
+    if all(each.has_times(first.t_ns) for each in others):
+        return columns, notes
+    for name, each in columns.items():
+        clock = next((of for other, of in clocks if each.has_times(other.t_ns)), None)
+        has_time = each.t_ns != NO_TIME
+        if clock is None:
+            clock = continued(path, each.t_ns[has_time], has_time, longest_part=True)
+            clocks.append((each, clock))
+            notes += [f"{name}: {note}" for note in clock.notes]
+        found[name] = replace(each, t_ns=clock.t_ns[clock.is_good], values=each.values[has_time][clock.is_good])
+    cut = [clock for _, clock in clocks if len(clock.t_ns)]
+    begin_ns = max((of.t_ns[of.is_good][0] for of in cut if not of.is_good[0]), default=-np.inf)
+    end_ns = min((of.t_ns[of.is_good][-1] for of in cut if not of.is_good[-1]), default=np.inf)
+    for name, each in found.items():
+        inside = (each.t_ns >= begin_ns) & (each.t_ns <= end_ns)
+        found[name] = replace(each, t_ns=each.t_ns[inside], values=each.values[inside])
+    return found, notes
+
+
+def _without_stops(
+    chosen: FanColumns, columns: Mapping[str, Column], values: dict[str, Array], t_ns: Array
+) -> list[str]:
+    """Take away the speeds at which a command says that its motor is stopped, as it is no number; a note on that."""
+    counts: dict[str, int] = {}
+    for command, speed in zip(chosen.command, chosen.speed, strict=True):
+        if stops_where_nan(command):
+            values[command] = _held(columns[command], t_ns)
+            is_stopped = np.isnan(_held(columns[command], t_ns, through_nan=False)) & np.isfinite(values[command])
+            values[speed] = np.where(is_stopped, np.nan, values[speed])
+            counts |= {speed: int(np.count_nonzero(is_stopped))} if is_stopped.any() else {}
+    why = "where their commands are NaN, as the motors were stopped"
+    return [f"{_with_others(counts)}: {sum(counts.values())} values left out, {why}"] if counts else []
+
+
+def _with_others(names: Collection[str]) -> str:
+    return listed(list(names), 1)
+
+
+def _rates(columns: Mapping[str, Column], chosen: FanColumns) -> list[str]:
+    command, speed = columns[chosen.command[0]], columns[chosen.speed[0]]
+    command_hz, speed_hz = command.rate_hz, speed.rate_hz
+    if command.t_ns is speed.t_ns or not speed_hz or 0.9 < command_hz / speed_hz < 1.1:
+        return []
+    faster = ": those between two readings are not in the recording" if command_hz > speed_hz else ""
+    return [
+        f"commands at {command_hz:.3g} Hz, speeds at {speed_hz:.3g} Hz; each speed has the command held then{faster}"
+    ]
+
+
+def _held(column: Column, t_ns: Array, *, through_nan: bool = True) -> Array:
+    """The value at these times: the last one that is known; NaN before the first. through_nan: NaN tells nothing."""
+    known = np.isfinite(column.values) | (not through_nan)
+    order = np.argsort(column.t_ns[known], kind="stable")
+    times, values = column.t_ns[known][order], column.values[known][order]
+    at = np.searchsorted(times, t_ns, "right") - 1
+    return np.where(at >= 0, values[np.maximum(at, 0)], np.nan) if len(values) else np.full(len(t_ns), np.nan)
+
+
+def _constant_commands(chosen: FanColumns, command: Array) -> list[str]:
+    """A note on each command (n, fans) that never changes, from which no twin can be made."""
+    never = dict.fromkeys(
+        (name, float(command[0, fan]))
+        for fan, name in enumerate(chosen.command)
+        if not np.any(np.diff(command[:, fan]))
+    )
+    return [f"{name} is {value:g} throughout: a twin needs steps of the command" for name, value in never]
