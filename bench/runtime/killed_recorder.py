@@ -87,17 +87,17 @@ class Kills:
         """Kill it so many times, at random, and let the last one end in order."""
         chance = random.Random(seed)
         self._start()
-        eventually(self._records, "the recorder records")
+        eventually(self._records, "the recorder records", every_s=0.25)
         for number in range(kills):
             time.sleep(chance.uniform(0.0, 4.0))  # at any moment, also while it starts or repairs
             self._kill()
             self._start()
             progress(number + 1)
-        eventually(self._records, "the recorder records")
+        eventually(self._records, "the recorder records", every_s=0.25)
         assert self._feed.stdin and self._recorder
         self._feed.stdin.close()
         self._heard("fed")
-        eventually(self._has_all, "the recorder has recorded all that was sent, or counted it as missing")
+        eventually(self._has_all, "the recorder has recorded all that was sent, or counted it as missing", every_s=0.25)
         self._recorder.send_signal(signal.SIGINT)
         status = self._recorder.wait(DEADLINE_S)
         assert status in (0, 3), (status, (self._folder / "recorder.log").read_text()[-2000:])

@@ -203,8 +203,7 @@ COUNTS = Tacho(kind="count", window_s=1.0)
 SCORERS = {
     "scorer": scorer(eventful),
     "scorer of stuck tachos": scorer(stuck, tachos=(COUNTS,)),
-    "scorer of disturbed fans": scorer(partial(disturbed, 1), standstill=STANDSTILL),
-    "scorer of a mixed tray": scorer(
+    "scorer of disturbed fans with different tachos": scorer(
         partial(disturbed, 2),
         tachos=(Tacho(), COUNTS, Tacho(kind="average", window_s=0.3)),
         standstill=STANDSTILL,

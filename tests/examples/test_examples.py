@@ -109,7 +109,7 @@ def test_the_commands_of_a_readme_lead_to_what_it_says(name: str, copied: Callab
             done = terminal.type(last)
             return done.returncode == 0 and SHOWN[name] in done.stdout
 
-        eventually(is_shown, f"{last} shows {SHOWN[name]}")
+        eventually(is_shown, f"{last} shows {SHOWN[name]}", every_s=2.0)
 
 
 def test_every_example_is_in_the_list_and_in_the_test() -> None:

@@ -12,10 +12,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-import torch
 
 import fantwin
-from fantwin.twin.errors import TwinError
 
 FANS = {"CPU": (2200.0, 1.5), "front": (1600.0, 2.5), "rear": (1400.0, 2.0)}
 """speed in rpm at full command, and seconds to settle"""
@@ -228,29 +226,3 @@ def test_errors_of_a_training_name_the_fans_of_the_table(table):
     assert not [line for line in said if "/tmp" in line or "[[" in line or "--" in line]
     with pytest.raises(fantwin.FantwinError, match="^CPU: the command never changes"):
         quiet(lambda: fantwin.train(table.assign(pwm=100.0), COLUMNS))
-
-
-FREE_RUNS: dict[str, tuple[Any, Any, str]] = {
-    "one command for each fan": (
-        torch.full((3,), 100.0),
-        torch.full((3,), 180.0),
-        r"commands must be \(n, 3\), not \(3,\)",
-    ),
-    "turned": (torch.full((3,), 100.0), torch.full((3, 30), 180.0), r"commands must be \(n, 3\), not \(3, 30\)"),
-    "one fan": (
-        torch.full((1,), 100.0),
-        torch.full((30, 3), 180.0),
-        r"initial_speed must be a tensor \(3,\).* not \(1,\)",
-    ),
-    "a number": (100.0, torch.full((30, 3), 180.0), r"initial_speed must be a tensor \(3,\).* not 100.0"),
-    "rpm": (torch.full((3,), 1000.0), torch.full((30, 3), 180.0), "convert it to rad/s"),
-    "unknown": (torch.full((3,), torch.nan), torch.full((30, 3), 180.0), "convert it to rad/s"),
-    "unknown command": (torch.full((3,), 100.0), torch.full((30, 3), torch.nan), "commands must be finite"),
-}
-
-
-@pytest.mark.parametrize("case", FREE_RUNS)
-def test_a_free_run_in_torch_refuses_what_cannot_be_right(twin, case):
-    initial_speed, commands, words = FREE_RUNS[case]
-    with pytest.raises(TwinError, match=words):
-        twin.as_torch().free_run(initial_speed, commands, period_s=1.0)

@@ -24,9 +24,10 @@ def add_recording(
     factor: tuple[float, float] = (1.0, 1.0),
     *,
     has_alarm: bool = False,
+    every: int = KEPT_EVERY,
 ) -> None:
     """Two published fans under stairs from 0 to 100, from first_s after START_S on. factor: on their speeds. has_alarm:
-    one of them has an alarm all the time."""
+    one of them has an alarm all the time. every: which samples of the simulation are kept."""
     run = published_run(seed, seconds, FANS)
-    command, speed = (each[::KEPT_EVERY] for each in (run.command, run.speed_rad_s * np.array(factor)))
-    add_history(folder, first_s, command, speed, RATE_HZ / KEPT_EVERY, has_alarm=has_alarm)
+    command, speed = (each[::every] for each in (run.command, run.speed_rad_s * np.array(factor)))
+    add_history(folder, first_s, command, speed, RATE_HZ / every, has_alarm=has_alarm)

@@ -39,13 +39,15 @@ def fantwin(*words: object, timeout_s: float = DEADLINE_S) -> subprocess.Complet
     )
 
 
-def eventually(condition: Callable[[], Any], what: str, deadline_s: float = DEADLINE_S) -> Any:
-    """The first true result of `condition`."""
+def eventually(
+    condition: Callable[[], Any], what: str, deadline_s: float = DEADLINE_S, *, every_s: float = 0.02
+) -> Any:
+    """The first true result of `condition`. every_s: between two looks, longer where a look takes work."""
     until_s = time.monotonic() + deadline_s
     pause = threading.Event()
     while not (answer := condition()):
         assert time.monotonic() < until_s, f"in {deadline_s:.0f} s it did not come to pass that {what}"
-        pause.wait(0.02)
+        pause.wait(every_s)
     return answer
 
 

@@ -33,14 +33,14 @@ def configuration(tmp_path: Path, endpoint: str) -> Path:
         encoding="utf-8",
     )
     folder = learning_folder(tmp_path / "runs", "tray1")
-    add_recording(folder, -100_000_000, 660.0, 1)
+    add_recording(folder, -100_000_000, 660.0, 1, every=20)
     return path
 
 
 def test_a_twin_is_learned_and_takes_over_while_the_stages_run(
     tmp_path: Path, configuration: Path, start_command: Callable[..., RunningCommand]
 ) -> None:
-    line = ("--link", tmp_path / "line", "--profile", "prbs", "--set", "rate_hz=20", "--json")
+    line = ("--link", tmp_path / "line", "--profile", "prbs", "--set", "rate_hz=10", "--json")
     start_command("simulate", "--fans", FANS, *line).line_with("fans on")
     versions = TwinVersions(learning_folder(configuration.parent / "runs", "tray1"), "tray1")
     up = start_command("up", "-c", configuration, "--json")
