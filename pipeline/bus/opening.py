@@ -36,7 +36,7 @@ from fantwin.pipeline.bus.settings import Settings
 from fantwin.pipeline.config.settings import BusConfig
 
 if TYPE_CHECKING:
-    from fantwin.pipeline.bus.identity import Credentials
+    from fantwin.pipeline.bus.credentials import Credentials
 
 
 UNACKNOWLEDGED_MS = 6000
@@ -102,7 +102,7 @@ def credentials_of(config: BusConfig, roles: Sequence[str]) -> Credentials | Non
     require_tls_with_security(config)
     if config.security is None:
         return None
-    from fantwin.pipeline.bus.identity import checked_credentials  # noqa: PLC0415  takes 0.1 s, which most do without
+    from fantwin.pipeline.bus.credentials import checked_credentials  # noqa: PLC0415  takes 0.1 s, which most do without
 
     return checked_credentials(config.security, roles)
 

@@ -15,7 +15,7 @@ from fantwin.pipeline.bus.router_link import LEASE_MS, RETRY
 from fantwin.pipeline.bus.settings import Settings
 
 if TYPE_CHECKING:
-    from fantwin.pipeline.bus.identity import Credentials
+    from fantwin.pipeline.bus.credentials import Credentials
 
 QUEUE_BATCHES = 16
 """of 64 KiB for each client, the most that Zenoh allows: for what is sent to a client that has vanished"""

@@ -11,7 +11,7 @@ import zenoh
 from fantwin.pipeline.bus.errors import BusError, reason
 
 if TYPE_CHECKING:
-    from fantwin.pipeline.bus.identity import Credentials
+    from fantwin.pipeline.bus.credentials import Credentials
 
 TLS = "transport/link/tls"
 

@@ -27,7 +27,7 @@ from fantwin.client import (
 )
 from fantwin.client.outbox import MOST_SENT_MESSAGES
 from fantwin.client.times import times_ns
-from fantwin.pipeline.bus.identity import checked_credentials
+from fantwin.pipeline.bus.credentials import checked_credentials
 from fantwin.pipeline.bus.rights import SiteRoles
 from fantwin.pipeline.bus.router import open_router
 from fantwin.pipeline.config.loading import parse_config

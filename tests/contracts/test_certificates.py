@@ -18,7 +18,7 @@ from cryptography.hazmat.primitives.serialization import (
 )
 
 from fantwin.pipeline import certificates
-from fantwin.pipeline.bus.identity import checked_credentials
+from fantwin.pipeline.bus.credentials import checked_credentials
 from fantwin.pipeline.certificates import client_context, make_self_signed, server_context, tls_refusal
 from fantwin.pipeline.config.settings import SecurityConfig
 from fantwin.pipeline.errors import UserError

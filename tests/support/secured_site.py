@@ -9,7 +9,7 @@ from pathlib import Path
 
 import zenoh
 
-from fantwin.pipeline.bus.identity import Credentials, checked_credentials
+from fantwin.pipeline.bus.credentials import Credentials, checked_credentials
 from fantwin.pipeline.bus.rights import SiteRoles
 from fantwin.pipeline.bus.router import open_router
 from fantwin.pipeline.bus.settings import Settings

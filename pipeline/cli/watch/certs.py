@@ -14,7 +14,7 @@ from typing import Annotated
 import typer
 from cryptography.hazmat.primitives.serialization import Encoding
 
-from fantwin.pipeline.bus.identity import warning
+from fantwin.pipeline.bus.credentials import warning
 from fantwin.pipeline.certificates import (
     LONGEST_NAME,
     Authority,

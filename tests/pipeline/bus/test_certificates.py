@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from fantwin.pipeline.bus.credentials import Credentials, checked_credentials, warning
 from fantwin.pipeline.bus.errors import BusError
-from fantwin.pipeline.bus.identity import Credentials, checked_credentials, warning
 from fantwin.pipeline.bus.opening import zenoh_config
 from fantwin.pipeline.bus.session import Bus
 from fantwin.pipeline.certificates import CLOCK_SKEW, Authority, read_certificate

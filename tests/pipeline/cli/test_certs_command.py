@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner, Result
 
-from fantwin.pipeline.bus.identity import checked_credentials
+from fantwin.pipeline.bus.credentials import checked_credentials
 from fantwin.pipeline.certificates import Authority, is_host, write_pair
 from fantwin.pipeline.cli import main as command_line
 from fantwin.pipeline.config.loading import load_config
