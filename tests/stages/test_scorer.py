@@ -78,7 +78,7 @@ def test_each_message_begins_with_the_name_of_its_fan_and_carries_it_also_after_
     for each in alarms:
         assert each.fan_name == each.label.partition(" (")[0] == ("CPU", "rear top")[each.fan]
         assert each.message == f"{each.label}: {each.about}" and not each.about.startswith(("fan", each.fan_name))
-    silent = prediction_of(np.zeros((40 * SECOND, 2)), np.zeros((40 * SECOND, 2), np.bool_), first=500)
+    silent = prediction_of(np.zeros((11 * SECOND, 2)), np.zeros((11 * SECOND, 2), np.bool_), first=500)
     core.step(silent)
     assert core.problem().startswith("CPU (fan 0), rear top (fan 1) are not scored: ")
     renamed = core_of(2, names=FanNames(("CPU", "front")))

@@ -82,8 +82,8 @@ def test_stopped_killed_or_ended_with_the_site_a_sweep_gives_the_fans_their_comm
     def begin() -> None:
         _, said, _ = eventually(lambda: (found := ann.ask("POST", SWEEP, {}))[0] == 200 and found, "it begins")
         assert said["running"], said
-        eventually(lambda: " of 46: command " in sweep()["running"], "it says what it does")
-        eventually(lambda: commands() != [FORMER] * 2, "the fans are moved")
+        eventually(lambda: " of 46: command " in sweep()["running"], "it says what it does", every_s=0.2)
+        eventually(lambda: commands() != [FORMER] * 2, "the fans are moved", every_s=0.2)
 
     begin()
     refused = ann.ask("POST", "/api/v1/fans/tray1/0/requests", {"action": "out_of_service"})
@@ -93,12 +93,13 @@ def test_stopped_killed_or_ended_with_the_site_a_sweep_gives_the_fans_their_comm
         f"stopped; the fans are left at the commands they had before: CPU (fan 0) {FORMER}, rear (fan 1) {FORMER}; "
         "`fantwin command` sets others"
     )
-    eventually(lambda: sweep()["ended"] == left, "it has stopped")
-    eventually(lambda: commands() == [FORMER] * 2, "the fans have their commands after a stop")
+    eventually(lambda: sweep()["ended"] == left, "it has stopped", every_s=0.2)
+    eventually(lambda: commands() == [FORMER] * 2, "the fans have their commands after a stop", every_s=0.2)
 
     begin()
     os.kill(site.process_ids()["learner"], signal.SIGKILL)
-    eventually(lambda: commands() == [FORMER] * 2, "the fans have their commands though their learner was killed")
+    had = "the fans have their commands though their learner was killed"
+    eventually(lambda: commands() == [FORMER] * 2, had, every_s=0.2)
 
     begin()
     assert up.end() == 0, up.lines

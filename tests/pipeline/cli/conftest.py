@@ -32,6 +32,12 @@ def _restored_signals() -> Iterator[None]:
         signal.signal(number, handler)
 
 
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pages of reports have no figures, which take a second a fan: the test is about their words and numbers."""
+    monkeypatch.setattr("fantwin.twin.report.page.fan_figures", lambda *_: [])
+
+
 @pytest.fixture(scope="module")
 def healthy(made_once: MadeOnce) -> Path:
     """Four recordings of two simulated fans, one of them with a fault of fan 1; their twin; the twin with limits, and

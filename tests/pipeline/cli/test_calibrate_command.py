@@ -92,6 +92,7 @@ def test_the_printed_interval_decides_and_a_rate_is_broken_only_by_more_alarms_t
     assert math.isfinite(Check(0, 1.0, 1.0).interval_95[1])
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_without_an_output_the_twin_itself_is_calibrated_and_people_read_what_was_done_and_what_is_missing(
     healthy: Path, tmp_path: Path
 ) -> None:

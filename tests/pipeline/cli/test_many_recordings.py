@@ -145,8 +145,14 @@ def test_a_recording_that_was_skipped_stays_so_in_all_that_follows(folder: Path)
     assert seen == [folder / "a.mcap"]
 
 
+def end_itself(_path: Path) -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
 @pytest.mark.parametrize("jobs", [1, 2])
-def test_in_every_process_linear_algebra_has_one_thread_and_torch_is_not_loaded(folder: Path, jobs: int) -> None:
+def test_in_every_process_linear_algebra_has_one_thread_and_torch_is_not_loaded_and_one_that_is_killed_is_one_line(
+    folder: Path, jobs: int
+) -> None:
     """More threads would round in another order, so results would depend on the number of cores."""
 
     def found(path: Path) -> tuple[set[int], bool]:
@@ -156,15 +162,9 @@ def test_in_every_process_linear_algebra_has_one_thread_and_torch_is_not_loaded(
     paths = [folder / name for name in RECORDINGS[:2]]
     with threadpool_limits(2), RecordingsInParallel(jobs) as pool:
         assert list(pool.map(found, paths, "counting")) == [({1}, False)] * 2
-
-
-def test_a_process_that_is_killed_is_an_error_of_one_line(folder: Path) -> None:
-    def end_itself(_path: Path) -> None:
-        os.kill(os.getpid(), signal.SIGKILL)
-
-    paths = [folder / name for name in RECORDINGS[:2]]
-    with pytest.raises(UserError, match="ended from outside, .* fewer --jobs than 2"):
-        list(RecordingsInParallel(jobs=2).map(end_itself, paths, "reading"))
+        if jobs > 1:
+            with pytest.raises(UserError, match="ended from outside, .* fewer --jobs than 2"):
+                list(pool.map(end_itself, paths, "reading"))
 
 
 def test_ctrl_c_ends_all_processes_with_one_line(tmp_path: Path) -> None:
@@ -230,14 +230,16 @@ def test_a_command_that_is_ended_while_it_fetches_a_recording_leaves_no_copy(tmp
     assert [*temporary.iterdir()] == []
 
 
-def cluster_of(workers: int) -> Any:
-    distributed: Any = import_module("distributed")  # slow, and only these tests need it
-    return distributed.LocalCluster(n_workers=workers, threads_per_worker=1, host="127.0.0.1", dashboard_address=None)
-
-
 @needs_distributed
-def test_two_workers_of_a_cluster_give_what_one_process_gives(folder: Path, tmp_path: Path) -> None:
-    with cluster_of(2) as cluster:
+def test_two_workers_of_a_cluster_give_what_one_process_gives_and_one_that_is_killed_is_one_line(
+    folder: Path, tmp_path: Path
+) -> None:
+    dask: Any = import_module("dask")
+    distributed: Any = import_module("distributed")  # slow, and only these tests need it; with settings of its own
+    with (
+        dask.config.set({"distributed.scheduler.allowed-failures": 0}),
+        distributed.LocalCluster(2, threads_per_worker=1, host="127.0.0.1", dashboard_address=None) as cluster,
+    ):
         scheduler = "--jobs", cluster.scheduler_address
         result = run_all("replay", folder, RECORDINGS, tmp_path / "there", *scheduler)
         assert is_as_of_one_process(result, tmp_path / "there", folder)
@@ -246,24 +248,12 @@ def test_two_workers_of_a_cluster_give_what_one_process_gives(folder: Path, tmp_
         result = run_all("report", folder, ("a.mcap", "bad.mcap"), tmp_path / "skipped", *scheduler, "--skip-bad")
         (skipped,) = json.loads(result.stdout)["skipped"]
         assert (result.exit_code, skipped["recording"]) == (4, str(bad))
-
-
-def end_worker(_path: Path) -> None:
-    os.kill(os.getpid(), signal.SIGKILL)
-
-
-@needs_distributed
-def test_a_worker_of_a_cluster_that_is_killed_is_an_error_of_one_line(folder: Path) -> None:
-    dask: Any = import_module("dask")
-    import_module("distributed")  # with its own settings: the end of `set` would take them away if it had made them
-    paths = [folder / name for name in RECORDINGS]
-    with (
-        dask.config.set({"distributed.scheduler.allowed-failures": 0}),
-        cluster_of(1) as cluster,
-        RecordingsInParallel(jobs=cluster.scheduler_address) as pool,
-        pytest.raises(UserError, match=f"ended from outside, .*: see {cluster.scheduler_address}"),
-    ):
-        list(pool.map(end_worker, paths, "reading"))
+        paths = [folder / name for name in RECORDINGS]
+        with (
+            RecordingsInParallel(jobs=cluster.scheduler_address) as pool,
+            pytest.raises(UserError, match=f"ended from outside, .*: see {cluster.scheduler_address}"),
+        ):
+            list(pool.map(end_itself, paths, "reading"))
 
 
 @needs_distributed

@@ -193,6 +193,7 @@ def test_a_part_of_a_recording_and_some_of_its_fans_can_be_used(folder, twin, tm
     assert (result["evaluated_on"], result["samples"]) == ("held-out", 2000)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_twin_is_not_judged_by_samples_that_made_it_and_others_of_the_same_recording_judge_it(folder, tmp_path):
     twin, validated = tmp_path / "part.onnx", tmp_path / "validated.onnx"
     words = ("train", folder / "healthy.mcap", "--to", 20, "--model", "physical", "-o")
@@ -263,6 +264,7 @@ def test_the_json_of_evaluate_has_other_grids_and_the_residual_analysis(recorded
         assert left["white"] == (left["ljung_box_p"] >= 0.05)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_evaluate_shows_a_row_for_each_fan_and_each_grid_and_warns_as_the_report_does(
     recorded: tuple[Path, Path], tmp_path: Path
 ) -> None:
@@ -293,6 +295,7 @@ def tray(made_once: MadeOnce) -> Path:
     return made_once("three-fans", make)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_card_names_the_fans_it_is_of_and_a_fan_is_judged_by_its_own_parameters(tray: Path, tmp_path: Path) -> None:
     twin, recording = tray / "twin.onnx", tray / "three.mcap"
     assert OnnxTwin(twin).card.training.fans == (0, 2)

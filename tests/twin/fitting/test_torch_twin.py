@@ -170,9 +170,9 @@ REFUSED: dict[str, tuple[Any, tuple[float, ...], str]] = {
 @pytest.mark.parametrize("case", REFUSED)
 def test_a_free_run_refuses_what_cannot_be_right(torch, tmp_path, case):
     speed, commands, words = REFUSED[case]
-    initial, given = (
+    given: list[Any] = [
         each if isinstance(each, float) else torch.full(each[:-1], each[-1]) for each in (speed, commands)
-    )
+    ]
     module = written(tmp_path, PhysicalModel()).as_torch()
     with pytest.raises(TwinError, match=words):
-        module.free_run(initial, given, period_s=1.0)
+        module.free_run(*given, period_s=1.0)
