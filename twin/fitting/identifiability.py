@@ -10,7 +10,7 @@ not right once the load fluctuates, too (Ljung, System Identification, second ed
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from scipy.stats import f as f_distribution
+from scipy.special import fdtrc
 
 from fantwin.twin.models.physics import PARAMETER_NAMES
 from fantwin.twin.runs import Array, Run
@@ -162,7 +162,7 @@ def feedback_share(pieces: Sequence[Run], fan: int) -> float:
     share = float(explained / (move @ move))
     if extra <= 0 or free <= 0 or share < FEEDBACK_SHARE:
         return 0.0
-    probability = f_distribution.sf((explained / extra) / (unexplained / free), extra, free)
+    probability = fdtrc(extra, free, (explained / extra) / (unexplained / free))
     return share if probability < FALSE_ALARM_PROBABILITY else 0.0
 
 

@@ -25,7 +25,7 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-from scipy.stats import t as student_t
+from scipy.special import stdtrit
 
 from fantwin.twin.errors import TwinError
 from fantwin.twin.fitting.damped_least_squares import Flags
@@ -93,7 +93,7 @@ class Identification:
     @property
     def interval_95(self) -> Array:
         """(fans, 4, 2), of the t distribution with the degrees of freedom of each."""
-        reach = student_t.ppf(0.975, self.degrees_of_freedom) * self.standard_errors
+        reach = stdtrit(self.degrees_of_freedom, 0.975) * self.standard_errors
         return np.stack((self.parameters - reach, self.parameters + reach), axis=-1)
 
 

@@ -22,7 +22,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.signal import lfilter
 
 from fantwin.twin.errors import TwinError
 from fantwin.twin.evaluation.accuracy import evaluation_pieces, free_run_residuals, pooled_rmse_rad_s
@@ -30,6 +29,7 @@ from fantwin.twin.fitting.narx_fit import LAG_SCALE, OutputErrorFit, forgets_its
 from fantwin.twin.models.narx import INPUTS, ORDER, UNITS, Narx, regressor_rows
 from fantwin.twin.models.network import Scaling
 from fantwin.twin.models.physics import PARAMETER_NAMES
+from fantwin.twin.models.recursion import linear_recursion
 from fantwin.twin.progress import Progress, unreported
 from fantwin.twin.runs import STARTING_SAMPLES, Array, Run
 
@@ -87,7 +87,8 @@ def first_order_filter(commands: Sequence[Array], speeds: Sequence[Array]) -> tu
 
 def _low_pass(command: Array, kept: float) -> Array:
     """x[k+1] = kept x[k] + (1 - kept) command[k], at rest at the first command."""
-    return command[0] + np.asarray(lfilter([0.0, 1.0 - kept], [1.0, -kept], command - command[0]))
+    forcing = np.append(0.0, (1.0 - kept) * (command[:-1] - command[0]))
+    return command[0] + linear_recursion(np.full((len(command) - 1, 1), kept), forcing[:, np.newaxis])[:, 0]
 
 
 MAX_ITERATIONS = 100
