@@ -23,12 +23,15 @@ from fantwin.schemas.formats import TWIN_CARD
 from fantwin.schemas.model_uncertainty import ModelUncertainty
 from fantwin.schemas.reference_conditions import ReferenceConditions
 from fantwin.schemas.standstill import Standstill
+from fantwin.schemas.steady_curve import SteadyCurve
 from fantwin.schemas.tacho import INSTANTANEOUS, Tacho, Tachos, tacho_of_each_fan
-from fantwin.schemas.units import RAD_S_PER_UNIT
+from fantwin.schemas.units import RAD_S_PER_UNIT, period_in_words
 
 CARD_PROPERTY = "fantwin.card"
 GRAPH_INPUTS = ("state", "command", "step_s", "parameters")
 GRAPH_OUTPUTS = ("speed_rad_s", "state_out")
+STATIC_PARAMETERS = ("time_constant_s", "unknown_time")
+"""first parameters of a twin of the speed over the command (twin.models.static), whose samples hardly show motion"""
 
 NOT_CALIBRATED = (
     "is not calibrated: its alarms are by the priors of a population of fans, 0.03 false alarms per fan and day"
@@ -241,7 +244,8 @@ class TwinCard:
     start nor stand; empty where tachos are instantaneous: it is sigma_rad_s there.
     model_uncertainty: how far the twin itself may be wrong at each speed and command, for each fan; of hybrids only,
     None for other kinds. conditions: the supply voltage and the air for which it holds, and so the
-    columns that it needs beside the command (schemas.reference_conditions); None: none. format: of the card.
+    columns that it needs beside the command (schemas.reference_conditions); None: none. steady_commands: those at which
+    the parameters of a static twin are speeds; empty: it is none. format: of the card.
     """
 
     kind: str
@@ -275,6 +279,7 @@ class TwinCard:
     reading_sigma_rad_s: tuple[Positive, ...] = ()
     model_uncertainty: ModelUncertainty | None = None
     conditions: ReferenceConditions | None = None
+    steady_commands: tuple[float, ...] = ()
     format: int = TWIN_CARD.written
 
     @model_validator(mode="after")
@@ -314,7 +319,12 @@ class TwinCard:
         low, high = (speed / rpm for speed in self.speed_range_rad_s)
         return "\n".join(
             (
-                f"{self.name}: {self.kind} twin of {fans}, {self.rate_hz:.3g} Hz",
+                f"{self.name}: {self.kind} twin of {fans}, "
+                + (
+                    f"samples every {period_in_words(1.0 / self.rate_hz)}"
+                    if self.is_static
+                    else f"{self.rate_hz:.3g} Hz"
+                ),
                 f"trained on {sum(each.samples for each in self.training.data)} samples, {self.created}",
                 f"command {self.command_range[0]:.4g} to {self.command_range[1]:.4g} {self.command_unit}".rstrip()
                 + f", speed_rpm {low:.4g} to {high:.4g}",
@@ -343,6 +353,21 @@ class TwinCard:
     def fan_numbers(self) -> tuple[int, ...]:
         """Numbers of the fans in the recordings; counted from 0 where the card does not say."""
         return self.training.fans or tuple(range(self.fans))
+
+    @property
+    def title(self) -> str:
+        """Its kind, for people."""
+        return f"{self.kind}, samples every {period_in_words(1.0 / self.rate_hz)}" if self.is_static else self.kind
+
+    @property
+    def is_static(self) -> bool:
+        """Whether it is the speed over the command alone: samples were too far apart to show the motion."""
+        return len(self.steady_commands) > 0
+
+    def steady_curve(self, parameters: Array) -> SteadyCurve | None:
+        """The curve of fans with these parameters, (fans, n); None where the twin is not static."""
+        speeds = parameters[:, len(STATIC_PARAMETERS) :]
+        return SteadyCurve(np.array(self.steady_commands), speeds, parameters[:, 0]) if self.is_static else None
 
     @property
     def tacho_of_each_fan(self) -> tuple[Tacho, ...]:

@@ -33,7 +33,6 @@ from pydantic import Field, model_validator
 from fantwin.pipeline.config.registry import STAGES
 from fantwin.pipeline.runtime.stage import BuiltStage, Context, Core, Stage, StageConfig
 from fantwin.pipeline.timebase.grid_timing import (
-    RATES_HZ,
     GridTiming,
     grid_rate_hz,
     grid_timing,
@@ -45,7 +44,7 @@ from fantwin.pipeline.timebase.sample_grid import SampleGrid
 from fantwin.schemas.fan_names import NO_NAMES, FanNames
 from fantwin.schemas.messages import Grid, Raw, StatedTacho
 from fantwin.schemas.tacho import INSTANTANEOUS, Tacho, tacho_of_each_fan
-from fantwin.schemas.units import NS_PER_S
+from fantwin.schemas.units import NS_PER_S, period_in_words
 
 FASTER = 2.0  # a line that sends this many times the samples of its grid has changed
 
@@ -170,7 +169,7 @@ class ResamplerCore(Core):
         samples = counts.get("grid_samples", 0) + counts.get("grid_samples_skipped", 0)
         share = 100 * counts.get("grid_samples_in_gaps", 0) / samples if samples else 0.0
         gaps = f"gaps longer than {self._timing.gap_limit_ns / NS_PER_S:g} s: {counts.get('gaps', 0)}"
-        return [f"grid of {self._timing.rate_hz:g} Hz{line}; {gaps}, {share:.1f} % of the time"]
+        return [f"grid of {self._timing.rate_hz:.3g} Hz{line}; {gaps}, {share:.1f} % of the time"]
 
     def problem(self) -> str:
         """Problem: no samples, those of another number of fans or other tachos, a line that does not fit the grid, or a
@@ -208,14 +207,16 @@ class ResamplerCore(Core):
         line_hz = newest.line_hz
         about = float(f"{line_hz:.1g}")  # a text that changes would be reported each time
         apart = f"samples arrive about {about:g} times a second"
+        if line_hz < 1.0:
+            apart = f"samples arrive about every {period_in_words(float(f'{1.0 / line_hz:.1g}'))}"
         if self._config.rate_hz is None and is_too_slow(line_hz):
-            return f"{apart}: too slow to be judged; let the device send at least {RATES_HZ[0]} a second"
+            return f"{apart}: too slow to be judged; let the device send one a minute"
         if leaves_gaps(line_hz, timing):
             what = "rate_hz and gap_limit_s" if self._config.rate_hz or self._config.gap_limit_s else ""
             todo = f"leave out {what} of [resampler], they follow from the line" if what else "restart the resampler"
             return f"{apart}, too few for gap_limit_s = {timing.gap_limit_ns / NS_PER_S:g}: {todo}"
         if self._config.rate_hz is None and grid_rate_hz(line_hz) >= FASTER * timing.rate_hz:
-            return f"{apart}, and the grid has {timing.rate_hz:g} Hz since they were fewer: restart the resampler"
+            return f"{apart}, and the grid has {timing.rate_hz:.3g} Hz since they were fewer: restart the resampler"
         return ""
 
     def _grid_of_line(self) -> Iterator[Grid]:

@@ -66,7 +66,7 @@ class TwinIntegratorCore(Core):
             ModelCard(
                 t_ns=started_t_ns,
                 twin=twin.card.name,
-                kind=twin.card.kind,
+                kind=twin.card.title,
                 sha256=twin.sha256,
                 sigma_rad_s=twin.sigma_rad_s,
                 card_json=twin.card_json,

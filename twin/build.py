@@ -9,7 +9,6 @@ from typing import get_args
 
 import numpy as np
 
-from fantwin.schemas.tacho import INSTANTANEOUS
 from fantwin.schemas.twin_card import DataCard, TrainingCard, TwinCard
 from fantwin.twin.errors import TwinError
 from fantwin.twin.evaluation.accuracy import (
@@ -28,13 +27,15 @@ from fantwin.twin.fitting.drive_fit import find_drive
 from fantwin.twin.fitting.identification import identify
 from fantwin.twin.fitting.model_fits import FitRequest, Trainer
 from fantwin.twin.fitting.model_uncertainty import model_uncertainty
-from fantwin.twin.fitting.reference_choice import behind_a_drive, identify_at_reference
+from fantwin.twin.fitting.reference_choice import AtReference, behind_a_drive, identify_at_reference
 from fantwin.twin.fitting.standstill import find_standstill
+from fantwin.twin.fitting.static_fit import StaticFit, as_read, static_at_reference, static_instead
 from fantwin.twin.fitting.training import MOST_NETWORKS
 from fantwin.twin.kinds import ModelKind, find_kind
 from fantwin.twin.models.fan_ode import NetworkOde
 from fantwin.twin.models.model import Model
 from fantwin.twin.models.physics import PARAMETER_NAMES
+from fantwin.twin.models.static import StaticModel
 from fantwin.twin.network_training import ForEachNetwork, one_after_another
 from fantwin.twin.progress import Progress, unreported, within
 from fantwin.twin.reference import at_reference
@@ -76,14 +77,13 @@ def train_twin(
     _require_possible(model_kind, trainer, networks)
     fans = common_fans([*runs, *validation_runs])
     numbers = tuple(range(fans) if fan_numbers is None else fan_numbers)
-    if model_kind.predicts == "readings":
-        # A model whose output is compared with the readings as they are.
-        runs, validation_runs = (
-            [replace(run, tacho=INSTANTANEOUS) for run in each] for each in (runs, validation_runs)
-        )
-    tacho = common_tacho([*runs, *validation_runs])
     started_s = time.monotonic()
-    found = identify_at_reference(runs, validation_runs, progress=progress)
+    found, static = _identified(model_kind, runs, validation_runs, progress)
+    if static is not None:
+        model_kind = find_kind(static.model.kind)
+    if model_kind.predicts == "readings":
+        runs, validation_runs = as_read(runs), as_read(validation_runs)
+    tacho = common_tacho([*runs, *validation_runs])
     conditions, identification, notes = found.conditions, found.identification, found.notes
     recorded, validation_recorded = at_reference(runs, None), at_reference(validation_runs, None)
     runs, validation_runs = at_reference(runs, conditions), at_reference(validation_runs, conditions)
@@ -109,6 +109,7 @@ def train_twin(
             drive,
             networks,
             each_network,
+            static,
         )
     )
     model, parameters = fitted.model, fitted.parameters
@@ -141,6 +142,7 @@ def train_twin(
         name=name,
         training=training,
         drive=drive,
+        static=static,
         uncertainty=uncertainty,
         standstill=standstill,
         conditions=conditions,
@@ -150,6 +152,26 @@ def train_twin(
         created=created,
         progress=progress,
     )
+
+
+def _identified(
+    kind: ModelKind, runs: Sequence[Run], validation_runs: Sequence[Run], progress: Progress
+) -> tuple[AtReference, StaticFit | None]:
+    """The physics of every fan; or the static model where that is wanted, or samples are too far apart for motion.
+
+    Raises TwinError when the data do not determine them.
+    """
+    if kind.name == StaticModel.kind:
+        return static_at_reference(runs, validation_runs)
+    if kind.predicts == "readings":
+        runs, validation_runs = as_read(runs), as_read(validation_runs)
+    try:
+        found = identify_at_reference(runs, validation_runs, progress=progress)
+    except TwinError:
+        if (static := static_instead(runs, validation_runs, None)) is None:
+            raise
+        return static
+    return static_instead(runs, validation_runs, found) or (found, None)
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,6 +19,7 @@ from fantwin.twin.errors import TwinError
 from fantwin.twin.evaluation.accuracy import (
     Evaluation,
     UnseenStd,
+    compared_readings,
     evaluation_pieces,
     figure_sums,
     free_run_of_piece,
@@ -29,6 +30,7 @@ from fantwin.twin.export.onnx_export import export_onnx
 from fantwin.twin.fitting.balance_fit import fit_balance
 from fantwin.twin.fitting.drive_fit import FoundDrive
 from fantwin.twin.fitting.identification import Identification
+from fantwin.twin.fitting.static_fit import StaticFit, typical_error_rad_s
 from fantwin.twin.models.drive import DRIVE_PARAMETERS
 from fantwin.twin.models.model import Model
 from fantwin.twin.models.physics import PARAMETER_NAMES
@@ -66,6 +68,7 @@ def finish_twin(
     name: str,
     training: TrainingCard,
     drive: FoundDrive | None,
+    static: StaticFit | None = None,
     uncertainty: ModelUncertainty | None,
     standstill: Standstill | None,
     conditions: ReferenceConditions | None,
@@ -85,6 +88,8 @@ def finish_twin(
     pieces = evaluation_pieces(judged)
     free_runs = [free_run_of_piece(model, parameters, piece) for piece in pieces]
     sigma_rad_s, healthy = healthy_residual(np.concatenate([each.residual_rad_s for each in free_runs]), pieces)
+    if static is not None:  # what it misses right after a change of the command, it is expected to miss
+        sigma_rad_s = typical_error_rad_s([compared_readings(each.piece) - each.expected_rad_s for each in free_runs])
     unmeasured = np.flatnonzero(sigma_rad_s == 0.0)
     if unmeasured.size:
         where = "held-out" if validation_runs else "training"
@@ -100,7 +105,9 @@ def finish_twin(
     sums = (figure_sums(model, parameters, sigma_rad_s, each, unseen_std) for each in free_runs)
     validation = reduce(add, sums).evaluation()
     progress("torque balance", 0, 0, np.nan)
-    if drive is None:
+    if static is not None:
+        balance = static.balance
+    elif drive is None:
         balance = fit_balance(runs, validation_runs, identification)
     else:
         balance = fit_balance(drive.raised(runs), drive.raised(validation_runs), identification)
@@ -117,7 +124,7 @@ def finish_twin(
         n_state=model.state_layout.size,
         state_layout=model.state_layout,
         fixed_rate=model.fixed_rate,
-        parameter_names=(*PARAMETER_NAMES, *(DRIVE_PARAMETERS if drive else ())),
+        parameter_names=model.used_parameters if static else (*PARAMETER_NAMES, *(DRIVE_PARAMETERS if drive else ())),
         used_parameters=(*model.used_parameters, *(DRIVE_PARAMETERS if drive else ())),
         parameters=_rows(parameters),
         identified_parameters=_rows(np.hstack((identification.parameters, settings))),
@@ -153,6 +160,7 @@ def finish_twin(
             reading_sigma_rad_s(model, parameters, sigma_rad_s, standstill, pieces).tolist() if counts else ()
         ),
         model_uncertainty=uncertainty,
+        steady_commands=tuple(static.model.knots.tolist()) if static else (),
     )
     return TrainedTwin(model, parameters, card, identification, validation)
 

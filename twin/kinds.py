@@ -10,12 +10,20 @@ from functools import partial
 from typing import Literal
 
 from fantwin.twin.errors import TwinError
-from fantwin.twin.fitting.model_fits import FitRequest, FittedModel, fit_narx, fit_network_ode, fit_physical
+from fantwin.twin.fitting.model_fits import (
+    FitRequest,
+    FittedModel,
+    fit_narx,
+    fit_network_ode,
+    fit_physical,
+    fit_static_model,
+)
 from fantwin.twin.models import hybrid, neural_ode
 from fantwin.twin.models.hybrid import Hybrid
 from fantwin.twin.models.narx import Narx
 from fantwin.twin.models.neural_ode import NeuralOde
 from fantwin.twin.models.physical import PhysicalModel
+from fantwin.twin.models.static import StaticModel
 
 
 @dataclass(frozen=True)
@@ -23,7 +31,8 @@ class ModelKind:
     """A kind of model.
 
     name: on the command line. title: for people. fit: from data to a model. predicts: the speed, which the tacho then
-    measures, or the readings themselves. knows_drives: it can be put behind a drive (twin.models.drive).
+    measures, or the readings themselves. knows_motion: its errors after a change of the command count; those of a kind
+    that does not are not comparable. knows_drives: it can be put behind a drive (twin.models.drive).
     has_ode_network: it has a network that adam can train as well, and that can be the mean of several trained ones
     (twin.fitting.mean_of_networks).
     """
@@ -32,6 +41,7 @@ class ModelKind:
     title: str
     fit: Callable[[FitRequest], FittedModel]
     predicts: Literal["speed", "readings"] = "speed"
+    knows_motion: bool = True
     knows_drives: bool = False
     has_ode_network: bool = False
 
@@ -46,6 +56,7 @@ KINDS = [
     ModelKind(NeuralOde.kind, "neural ODE", _neural_ode, knows_drives=True, has_ode_network=True),
     ModelKind(Hybrid.kind, "hybrid", _hybrid, knows_drives=True, has_ode_network=True),
     ModelKind("hybrid-w", "hybrid [w]", _hybrid_w, knows_drives=True, has_ode_network=True),
+    ModelKind(StaticModel.kind, "static", fit_static_model, predicts="readings", knows_motion=False),
 ]
 
 

@@ -77,7 +77,7 @@ class AcquisitionCore(Core):
         self._counts: Counter[str] = Counter()
         self._down_reason: str | None = None
         self._now_ns = started_t_ns
-        self._quality = InputQuality(started_t_ns)
+        self._quality = InputQuality(started_t_ns, getattr(tray.source, "period_s", 0.0))
         self._plausibility = Plausibility(limits_of(tray), tray.speed_unit, self._counts, self._quality, self._sequence)
 
     def step(self, item: Item) -> list[Raw]:

@@ -120,7 +120,8 @@ def _shortened(detail: str) -> str:
 WINDOW = 100
 """newest inputs from which the quality is computed"""
 SILENCE_S = 2.0
-"""a source without a valid sample for longer is a problem; twice the pause of the slowest line that can be judged"""
+"""a source without a valid sample for longer is a problem; and for so many of the steps between its inputs"""
+SILENT_STEPS, LONGEST_STEP_NS = 2.5, 60 * NS_PER_S
 JUDGED_FROM = WINDOW // 5
 """inputs needed for a judgement"""
 GOOD_AGAIN = 0.25
@@ -130,7 +131,8 @@ GOOD_AGAIN = 0.25
 class InputQuality:
     """The quality of one source's input. Times: host time, ns since the epoch."""
 
-    def __init__(self, started_t_ns: int) -> None:
+    def __init__(self, started_t_ns: int, period_s: float = 0.0) -> None:
+        """period_s: of a source that is polled."""
         self._input_t_ns = self._valid_t_ns = started_t_ns
         self._recent: deque[str] = deque()
         """kind of fault of each of the newest WINDOW inputs; empty: a valid sample"""
@@ -139,6 +141,8 @@ class InputQuality:
         self._examples: dict[str, Rejected] = {}
         """first rejected input of each kind since the source was last in order, so that a problem keeps one wording"""
         self._mostly_faulty = False
+        self._steps_ns = deque([round(period_s * NS_PER_S)], maxlen=3)
+        """newest steps between inputs"""
 
     def connection_changed(self) -> None:
         """The source was connected or disconnected: what came before says nothing about what follows."""
@@ -157,6 +161,7 @@ class InputQuality:
 
     def add_input(self, t_ns: int) -> None:
         """Note that input has arrived."""
+        self._steps_ns.append(min(t_ns - self._input_t_ns, LONGEST_STEP_NS))
         self._input_t_ns = t_ns
 
     def add_valid(self) -> None:
@@ -174,9 +179,10 @@ class InputQuality:
 
         settings: of the tray, to be checked where the fault does not say which one it is.
         """
-        if now_ns - self._input_t_ns > SILENCE_S * NS_PER_S:
-            return f"nothing received for {SILENCE_S:g} s; is the source running, connected and sending?"
-        has_valid = now_ns - self._valid_t_ns <= SILENCE_S * NS_PER_S
+        silence_s = max(SILENCE_S, SILENT_STEPS * max(self._steps_ns) / NS_PER_S)
+        if now_ns - self._input_t_ns > silence_s * NS_PER_S:
+            return f"nothing received for {silence_s:.3g} s; is the source running, connected and sending?"
+        has_valid = now_ns - self._valid_t_ns <= silence_s * NS_PER_S
         if has_valid and not self._mostly_faulty:
             return ""
         fault = self._fault()

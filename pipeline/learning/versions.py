@@ -35,7 +35,8 @@ class _Record(BaseModel):
 
 
 class Drop(_Record):
-    """Smallest drops from a speed that raise an alarm within 1, 10 and 60 s, for the fan whose readings vary most.
+    """Smallest drops from a speed that raise an alarm within 1, 10 and 60 s, for the fan whose readings vary most; of a
+    static twin also within 10 min.
 
     In the unit of the tray; None where not even standstill raises an alarm.
     """
@@ -44,10 +45,12 @@ class Drop(_Record):
     within_1_s: float | None
     within_10_s: float | None
     within_60_s: float | None
+    within_600_s: float | None = None
 
     def line(self, unit: str) -> str:
         """One line about the drops, for people."""
-        found = ((self.within_1_s, "1 s"), (self.within_10_s, "10 s"), (self.within_60_s, "60 s"))
+        times = ("1 s", "10 s", "60 s", "10 min")
+        found = zip((self.within_1_s, self.within_10_s, self.within_60_s, self.within_600_s), times, strict=True)
         parts = [f"{_two_digits(value)} {unit} within {time}" for value, time in found if value is not None]
         drops = f"a drop of {', '.join(parts)}" if parts else "no drop, not even standstill"
         return f"found at {_two_digits(self.speed)} {unit}: {drops}"

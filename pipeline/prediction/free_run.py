@@ -14,7 +14,7 @@ from fantwin.scoring.column_state import NEVER_NS, ColumnState
 from fantwin.scoring.expected_reading import ExpectedReading
 
 START_SAMPLES = 5
-"""a free run starts from the mean of so many readings: one alone has the noise of its tacho"""
+"""a free run starts from the mean of so many readings: one alone has its tacho's noise; a static twin starts at once"""
 MOST_STEPS = 1000
 """steps of the twin in a sample: 10 s of a twin that was trained at 100 Hz"""
 DIVERGED = 10.0
@@ -62,7 +62,7 @@ class FreeRun(ColumnState):
 
     def __init__(self, twin: TwinFile) -> None:
         self._twin = twin
-        fans = twin.fans
+        fans, self._curve = twin.fans, twin.card.steady_curve(twin.parameters)
         self._knows_density = twin.card.conditions is not None
         self._density = np.ones(fans)
         """density of the air, relative to the twin's reference"""
@@ -74,13 +74,15 @@ class FreeRun(ColumnState):
         self._readings = np.zeros(fans, np.int64)  # counted towards a start
         self._sum_rad_s = np.zeros(fans)
         self._state = twin.initial_state(np.zeros(fans), self.held_command)
+        self._moved_rad_s = np.zeros(fans)
+        """half range of the newest reading of a static twin"""
         self.set_period(NS_PER_S)
 
     def set_period(self, period_ns: int) -> None:
         """End all free runs; the next ones are on a grid of this period."""
         self.stop(np.ones_like(self.running))
         self._period_s = period_ns / NS_PER_S
-        self._steps = max(1, round(min(self._period_s * self._twin.card.rate_hz, MOST_STEPS)))
+        self._steps = 1 if self._curve else max(1, round(min(self._period_s * self._twin.card.rate_hz, MOST_STEPS)))
         """steps of the twin in a sample, each about as long as in training: on a slower grid, for example at 1 Hz, a
         single step could be unstable"""
         self._reading = ExpectedReading(self._twin.tachos, self._period_s)
@@ -102,6 +104,7 @@ class FreeRun(ColumnState):
             "sum_rad_s": self._sum_rad_s,
             "state": self._state.T,
             "density": self._density,
+            "moved_rad_s": self._moved_rad_s,
         }
 
     def hold(self, t_ns: Array, command: Array, known: Array) -> tuple[Array, Array]:
@@ -143,7 +146,7 @@ class FreeRun(ColumnState):
         usable = usable & ~self.running
         self._readings[usable] += 1
         self._sum_rad_s[usable] += speed_rad_s[usable]
-        return usable & (self._readings >= START_SAMPLES)
+        return usable & (self._readings >= (1 if self._curve else START_SAMPLES))
 
     def forget_readings(self, fans: Array) -> None:
         """Discard the readings of some fans that count towards a start."""
@@ -186,9 +189,22 @@ class FreeRun(ColumnState):
             if rows == 1 or not diverged.any():
                 break
             rows //= 2
+        half_range_of_static = self._of_static(command[:rows])
         self._state = np.where((self.running & ~diverged)[:, np.newaxis], state, self._state)
         if self._knows_density:
             speed_rad_s = speed_rad_s / self._density
         reading, half_range = self._reading.update(np.where(self.running & is_possible, speed_rad_s, np.nan))
         self.stop(diverged)
-        return reading, half_range, diverged
+        return reading, half_range + half_range_of_static, diverged
+
+    def _of_static(self, command: Array) -> Array | float:
+        """Half of the range of readings after changes of the command, of which a static twin does not know when they
+        were, (n, fans)."""
+        if self._curve is None:
+            return 0.0
+        steps_s = np.full(len(command), self._period_s)
+        found = self._curve.half_range_rad_s(np.vstack((self._state[:, 1], command)), steps_s, self._moved_rad_s)
+        if self._knows_density:
+            found = found / self._density
+        self._moved_rad_s = np.where(self.running, found[-1], 0.0)
+        return found

@@ -332,7 +332,7 @@ class TrayIntegrator:
             twin=self.twin.card.name,
             torque_balance_command=balance,
             torque_balance_sigma_command=self.twin.balance.sigma_command,
-            reading_range_rad_s=reading_range if self._averages else nothing,
+            reading_range_rad_s=reading_range if self._averages or self.twin.card.is_static else nothing,
             averaged_command=averaged_command if converts else nothing,
             reading_missing=grid.reading_missing,
             reading_repeated=grid.reading_repeated,

@@ -21,11 +21,11 @@ from fantwin.pipeline.sources.series.series_file import JoinedFile
 from fantwin.pipeline.sources.tables.clocks import SetBackError, time_in_words
 from fantwin.pipeline.sources.tables.fan_columns import FanColumns, used_fans, with_unit
 from fantwin.pipeline.sources.tables.layout import find_layout
-from fantwin.pipeline.sources.tables.measured_table import Table, period_in_words
+from fantwin.pipeline.sources.tables.measured_table import Table
 from fantwin.pipeline.sources.tables.profiles import profile_of
 from fantwin.pipeline.sources.tables.table_file import TableFile
 from fantwin.pipeline.sources.tables.units import ELECTRICAL, ELECTRICAL_HUNDREDS, SPEED_UNITS
-from fantwin.schemas.units import NS_PER_S
+from fantwin.schemas.units import NS_PER_S, period_in_words
 
 _START = 4096
 

@@ -36,8 +36,8 @@ from fantwin.pipeline.sources.source import (
 from fantwin.pipeline.timebase.device_clock import UINT32
 from fantwin.pipeline.timebase.host_clock import HOST_CLOCK
 
-SLOWEST_S = 1.0
-"""longest time between two samples that can be scored (resampler)"""
+SLOWEST_S = 60.0
+"""longest time between two samples that can be scored: the slowest grid (pipeline.timebase.grid_timing)"""
 MOST_FAILURES = 3
 """failures in a row after which the device is taken for lost"""
 RECONNECT_DELAY_S, RECONNECT_DELAY_MAX_S = 0.5, 10.0

@@ -15,14 +15,20 @@ import numpy as np
 
 from fantwin.schemas.units import NS_PER_S
 
-RATES_HZ = (1, 2, 5, 10, 20, 25, 50, 100)
+PERIODS_S = (60, 30, 20, 15, 10, 5, 3, 2)
+"""sample periods of grids slower than 1 Hz: how often systems of monitoring look"""
+RATES_HZ = (*(1 / period_s for period_s in PERIODS_S), 1, 2, 5, 10, 20, 25, 50, 100)
 """rates of a grid that follows from the line; a faster line gets the last one"""
+HELD_FROM_NS = 3 * NS_PER_S // 2
+"""grid period from which on readings are held until the next: between two, a fan has long reached its speed"""
 GAP_PERIODS = 5.0
 """length of a gap that is bridged, in sample periods"""
 FEWEST_PERIODS = 1.5  # of a gap limit: with fewer, samples that are a little late are gaps
 SHORTEST_GAP_S = 0.1
 WATERMARK_S = 0.5
 STALE_FOR_S = 5.0
+SLOWER = 1.2
+"""ratio by which the slowest line that can be judged may be slower than the slowest grid"""
 
 
 @dataclass(frozen=True)
@@ -58,7 +64,7 @@ def grid_timing(rate_hz: float, gap_limit_s: float | None, watermark_s: float | 
     )
 
 
-def grid_rate_hz(line_hz: float) -> int:
+def grid_rate_hz(line_hz: float) -> float:
     """The rate on the ladder that is nearest to that of a line, by ratio."""
     bounds = [math.sqrt(low * high) for low, high in pairwise(RATES_HZ)]
     return RATES_HZ[int(np.searchsorted(bounds, line_hz))]
@@ -66,7 +72,7 @@ def grid_rate_hz(line_hz: float) -> int:
 
 def is_too_slow(line_hz: float) -> bool:
     """Return whether a line is slower than the slowest grid can be."""
-    return line_hz < RATES_HZ[0] / math.sqrt(2.0)
+    return line_hz < RATES_HZ[0] / SLOWER
 
 
 def leaves_gaps(line_hz: float, timing: GridTiming) -> bool:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from fantwin.pipeline.timebase.device_clock import LARGEST_GAP, UINT32, DeviceClock
-from fantwin.pipeline.timebase.grid_timing import GridTiming
+from fantwin.pipeline.timebase.grid_timing import HELD_FROM_NS, GridTiming
 from fantwin.pipeline.timebase.interpolation import (
     NEVER_NS,
     LastReadings,
@@ -59,7 +59,7 @@ class SampleGrid:
         """tachos: one for each fan; readings that a tacho shows until the next one are held. link_wait_ns: how long a
         gap is not published because its samples may still come."""
         self._fans = fans = len(tachos)
-        self._is_held = np.array([tacho.held_s > 0.0 for tacho in tachos])
+        self._is_held = np.array([tacho.held_s > 0.0 or timing.period_ns >= HELD_FROM_NS for tacho in tachos])
         self._holds = bool(self._is_held.any())
         self._period_ns = timing.period_ns
         self._gap_limit_ns = timing.gap_limit_ns

@@ -61,6 +61,7 @@ def modelled_fans(twin: TrayTwin) -> Fans:
         float(np.ptp(twin.card.command_range)),
         has_own_drive,
         ~at_once & (drive is None),
+        np.full(twin.fans, not twin.card.is_static),
         at_once & (BALANCE_BETTER * of_balance < twin.sigma_rad_s),
     )
 

@@ -265,6 +265,7 @@ class HealthyFans(Saved):
         follows[:, 0], follows[:, 1] = -np.expm1(-decay), self._filters
         follows[:, 2] = 1.0 - follows[:, 0] / decay  # the mean over the bin
         self._ahead = -np.expm1(-decay * self._period_s / self._bin_s / math.sqrt(12.0))
+        self._ahead *= fans.may_be_ahead
         is_new = now.is_new
         self._holds = 1.0 - ((is_new | now.ends) & ~self._skips)
         begins = is_new & ~self._has_begun

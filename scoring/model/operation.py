@@ -55,6 +55,9 @@ class Fans:
     """true if it controls its speed by itself, so that the torque of the card is no torque of its motor"""
     may_have_plateau: Array
     """true if its speed may be constant below some command, of which the twin knows nothing"""
+    may_be_ahead: Array
+    """true if a rotor may be ahead of its twin after a movement of the command; the range of readings of a
+    static twin has that"""
     prefers_balance: Array
     """true if the torque balance is read, and not the speed, where both are known"""
 

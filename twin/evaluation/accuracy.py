@@ -4,8 +4,9 @@ The main figures are those of the free run: it starts from the first five measur
 is driven by the commands alone. Runs are split at long gaps and restarted after them. The one-step error, from measured
 speeds to the next one, is given for comparison and is a weak measure. Missing samples are ignored. What the tachos are
 expected to show of the free run is compared with what they showed (twin.tacho_readings), from when on a reading shows
-nothing of the time before the start. RMSE, maximum error
-and R2 are equations (32) to (34) of Peng and Chen, the band of two sigma (35) and (36).
+nothing of the time before the start. Of a static model, what a change of the command since the sample before may
+explain is no error. RMSE, maximum error and R2 are equations (32) to (34) of Peng and Chen, the band of two sigma (35)
+and (36).
 """
 
 import math
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 
 from fantwin.schemas.units import NS_PER_S
 from fantwin.twin.errors import TwinError
-from fantwin.twin.models.model import TwinModel
+from fantwin.twin.models.model import MayBeStatic, TwinModel
 from fantwin.twin.runs import Array, Run, common_fans, starting_samples, starting_speed_rad_s
 from fantwin.twin.tacho_readings import Measurement, measurement_of
 
@@ -200,7 +201,12 @@ def free_run_of_piece(model: TwinModel, parameters: Array, piece: Run) -> FreeRu
     """Run a model freely over a piece."""
     expected, measured = free_run_readings(model, parameters, piece), compared_readings(piece)
     diverged = np.isfinite(measured) & ~np.isfinite(expected)
-    return FreeRun(piece, expected, np.where(diverged, np.inf, measured - expected))
+    residual = measured - expected
+    if isinstance(model, MayBeStatic) and (curve := model.steady_curve(parameters)) is not None:
+        commands = np.vstack((piece.command[:1], piece.command))
+        may_be = curve.half_range_rad_s(commands, np.append(0.0, np.diff(piece.t_s)), np.zeros(piece.fans))
+        residual -= residual.clip(-may_be, may_be)
+    return FreeRun(piece, expected, np.where(diverged, np.inf, residual))
 
 
 def free_run_residuals(model: TwinModel, parameters: Array, pieces: Sequence[Run]) -> Array:

@@ -9,6 +9,7 @@ import numpy as np
 import onnx
 from onnx import numpy_helper
 
+from fantwin.schemas.steady_curve import SteadyCurve
 from fantwin.schemas.twin_card import CARD_PROPERTY, GRAPH_INPUTS, GRAPH_OUTPUTS, CardError, StateLayout, TwinCard
 from fantwin.twin.errors import TwinError
 from fantwin.twin.models.drive import Drive
@@ -89,6 +90,10 @@ class OnnxTwin:
     def state_layout(self) -> StateLayout:
         """What the state holds."""
         return self.card.state_layout
+
+    def steady_curve(self, parameters: Array) -> SteadyCurve | None:
+        """See model.MayBeStatic."""
+        return self.card.steady_curve(parameters)
 
     def advance(self, state: Array, command: Array, step_s: Array, parameters: Array) -> tuple[Array, Array]:
         """Free run over a block of samples; see model.TwinModel."""

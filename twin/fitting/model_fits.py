@@ -13,6 +13,7 @@ from fantwin.twin.fitting.cross_validation import choose_prior_std
 from fantwin.twin.fitting.drive_fit import FoundDrive
 from fantwin.twin.fitting.identification import Identification
 from fantwin.twin.fitting.initial_weights import initial_weights
+from fantwin.twin.fitting.static_fit import StaticFit
 from fantwin.twin.fitting.training import GRID_PRIOR_STD, MAX_ITERATIONS, data_scaling, train_network
 from fantwin.twin.models.fan_ode import FanOde, NetworkOde
 from fantwin.twin.models.model import Model
@@ -32,7 +33,7 @@ class FitRequest:
     """Data and settings of a fit. See build.train_twin; max_iterations None: the default of the fit.
 
     drive: what the commands of the runs have passed already; the model is put behind it. networks,
-    each_network: see training.train_network.
+    each_network: see training.train_network. static: of a static model, which is fitted before all else.
     """
 
     runs: Sequence[Run]
@@ -45,6 +46,7 @@ class FitRequest:
     drive: FoundDrive | None = None
     networks: int = 1
     each_network: ForEachNetwork = one_after_another
+    static: StaticFit | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,6 +68,12 @@ def fit_physical(request: FitRequest) -> FittedModel:
     found = request.identification
     model, parameters = _behind(request.drive, PhysicalModel(), found.parameters)
     return FittedModel(model, parameters, found.iterations, warnings=found.misfits)
+
+
+def fit_static_model(request: FitRequest) -> FittedModel:
+    """The static model, which was found in place of the physics."""
+    assert request.static is not None
+    return FittedModel(request.static.model, request.static.parameters, iterations=0)
 
 
 def fit_narx(request: FitRequest) -> FittedModel:

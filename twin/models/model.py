@@ -3,8 +3,9 @@
 A kind of model is one class in a file of its own in this package. twin.kinds lists the kinds.
 """
 
-from typing import ClassVar, Protocol
+from typing import ClassVar, Protocol, runtime_checkable
 
+from fantwin.schemas.steady_curve import SteadyCurve
 from fantwin.schemas.twin_card import NetworkCard, StateLayout
 from fantwin.twin.models.onnx_nodes import Nodes
 from fantwin.twin.runs import Array
@@ -25,6 +26,15 @@ class TwinModel(Protocol):
         (fans, 4), behind a drive (fans, 7). Returns speed_rad_s (n, fans), at each sample before its command acts, and
         the state after the last step. Two blocks with the state carried over give what one block gives.
         """
+        ...
+
+
+@runtime_checkable
+class MayBeStatic(Protocol):
+    """A model that may be one of the speed over the command alone."""
+
+    def steady_curve(self, parameters: Array) -> SteadyCurve | None:
+        """The curves of fans with these parameters; None where it knows the motion of the rotor."""
         ...
 
 

@@ -19,14 +19,14 @@ from fantwin.pipeline.errors import UsageError, UserError
 from fantwin.pipeline.recordings.raw_recordings import write_table
 from fantwin.pipeline.sources.imported_file import preview_of, read_files
 from fantwin.pipeline.sources.samples_of_file import Wanted
-from fantwin.pipeline.sources.tables.measured_table import Table, period_in_words
+from fantwin.pipeline.sources.tables.measured_table import Table
 from fantwin.pipeline.sources.tables.reading import Reading
 from fantwin.pipeline.sources.tables.tachos import parse_tachos
 from fantwin.pipeline.sources.tacho_evidence import tacho_hints
 from fantwin.schemas.channels import CHANNELS
 from fantwin.schemas.fan_names import FanNames, is_fan_name
 from fantwin.schemas.topics import RESERVED_TRAY_NAMES
-from fantwin.schemas.units import NS_PER_S
+from fantwin.schemas.units import NS_PER_S, period_in_words
 
 
 def import_table(

@@ -24,6 +24,7 @@ from fantwin.pipeline.cli.twins.data_options import (
 )
 from fantwin.pipeline.cli.twins.figures import sentence, shown
 from fantwin.pipeline.errors import UsageError
+from fantwin.pipeline.learning.drops_found import static_words
 from fantwin.pipeline.learning.evaluation import EXPECTED_COVERAGE, evaluated
 from fantwin.pipeline.learning.training_data import Part, twin_errors
 from fantwin.schemas.fan_names import fan_cell
@@ -60,8 +61,10 @@ def evaluate(
     pool = RecordingsInParallel(jobs, skip_bad)
     with interruptible("nothing was evaluated"), twin_errors(), pool:
         result, damage = evaluated(twin, recordings, part, pool.map, grids)
+        result["static"] = static_words(twin, result["speed_unit"])
     report_damage(damage)
-    lines = (result["headline"], sentence(result, result["speed_unit"]), _fan_table(result))
+    figures = sentence(result, result["speed_unit"])
+    lines = (*filter(None, (result["headline"], result["static"], figures)), _fan_table(result))
     grid_tables = [_grid_table(result)] if grids else []
     pool.end_with(result, *lines, *grid_tables, warnings=result["warnings"], json_output=json_output)
 

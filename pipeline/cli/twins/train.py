@@ -34,6 +34,7 @@ from fantwin.pipeline.cli.twins.side_by_side import Data, train_side_by_side
 from fantwin.pipeline.errors import UsageError
 from fantwin.pipeline.extras import require_torch
 from fantwin.pipeline.files import write_whole
+from fantwin.pipeline.learning.drops_found import static_words
 from fantwin.pipeline.learning.evaluation import figures_in
 from fantwin.pipeline.learning.fitting import DEFAULT_SETTINGS, NETWORKS, Trainer, TrainingSettings, fit_twin
 from fantwin.pipeline.learning.training_data import (
@@ -60,7 +61,8 @@ def train(
     model: Annotated[
         str,
         typer.Option(
-            help="Kind of model: physical, narx, neural-ode, hybrid, or hybrid-w, whose network sees no command. "
+            help="Kind of model: physical, narx, neural-ode, hybrid, hybrid-w (its network sees no command), static "
+            "(of samples too far apart to show the motion). "
             "Several with commas, or all: they are trained side by side."
         ),
     ] = DEFAULT_SETTINGS.model,
@@ -161,7 +163,7 @@ def train(
             else:
                 trained = fit_twin(training_data, held_out, named, settings, start(""), pool.each_network)
         write_whole(output, trained.onnx())
-    result = as_json(trained, training_data, output)
+    result = as_json(trained, training_data, output) | {"static": static_words(output, training_data.speed_unit)}
     if type_twin:
         result |= {"of_type": trained.card.training.of_type}
     lines = _lines(result, training_data, trained.card.conditions)
@@ -188,7 +190,8 @@ def _chosen(names: str) -> list[ModelKind]:
     from fantwin.twin.kinds import KINDS  # noqa: PLC0415  loads twin only when it is needed
 
     by_name = {kind.name: kind for kind in KINDS}
-    wanted = list(by_name) if names == "all" else [name.strip() for name in names.split(",")]
+    of_motion = [name for name, kind in by_name.items() if kind.knows_motion]
+    wanted = of_motion if names == "all" else [name.strip() for name in names.split(",")]
     for name in wanted:
         if name not in by_name:
             raise UsageError(f"--model {name}: no such model; known: {', '.join(by_name)}, all")
@@ -216,11 +219,11 @@ def _place(
 def _lines(
     result: dict[str, Any], training_data: TrainingData, conditions: ReferenceConditions | None
 ) -> Iterator[str]:
-    networks = f"{result['network_parameters']} network parameters"
+    networks = "speed over command" if result["static"] else f"{result['network_parameters']} network parameters"
     of = f"the type of {result['of_type']}" if "of_type" in result else networks
     yield f"{result['twin']}: {result['model']} of {result['fans']} fan(s), {of}"
     yield f"  {result['evaluated_on']} data, {sentence(result, training_data.speed_unit)}"
-    yield f"  {balance_sentence(result)}"
+    yield f"  {result['static'] or balance_sentence(result)}"
     if conditions:
         columns = f"column{'s' * (len(conditions.needed) > 1)} {' and '.join(conditions.needed)}"
         yield f"  allows for {conditions.in_words}, and needs the {columns}"

@@ -28,7 +28,7 @@ from fantwin.pipeline.timebase.device_clock import UINT32
 from fantwin.pipeline.timebase.grid_timing import GridTiming, grid_rate_hz, is_too_slow, leaves_gaps
 from fantwin.pipeline.timebase.line_rate import MAX_SAMPLES, SampleTimes
 from fantwin.schemas.messages import Array, Raw
-from fantwin.schemas.units import NS_PER_S, RAD_S_PER_UNIT, SpeedUnit
+from fantwin.schemas.units import NS_PER_S, RAD_S_PER_UNIT, SpeedUnit, period_in_words
 from fantwin.schemas.wire import DEVICE_COUNTERS
 
 FIRST_SAMPLE_S = 6.0
@@ -177,22 +177,22 @@ def _rate(times: SampleTimes, config: Config, twin: TrayTwin | None) -> Finding:
     if times.span_us == 0 or not np.isfinite(times.line_hz):
         return True, "one sample: the rate of the line is not known yet; --listen-s 10 listens for longer"
     line_hz = times.line_hz
-    apart = f"{line_hz:.3g} samples a second"
+    apart = f"{line_hz:.3g} samples a second" if line_hz >= 1.0 else f"a sample every {period_in_words(1.0 / line_hz)}"
     settings: Any = config.sections.get("resampler")
     if settings is None:
         return True, apart
     if settings.rate_hz is None and is_too_slow(line_hz):
-        return False, f"{apart}: too slow to be judged; let the device send at least 1 a second"
+        return False, f"{apart}: too slow to be judged; let the device send one a minute"
     timing: GridTiming = settings.timing(settings.rate_hz or grid_rate_hz(times.sent_hz))
     if leaves_gaps(line_hz, timing):
         limit = f"resampler.gap_limit_s = {timing.gap_limit_ns / NS_PER_S:g}"
         return False, f"{apart}, too few for {limit}: leave out rate_hz and gap_limit_s, they follow from the line"
     if twin and twin.card.fixed_rate and abs(timing.rate_hz / twin.card.rate_hz - 1) > RATE_TOLERANCE:
         return False, (
-            f"{apart} give a grid of {timing.rate_hz:g} Hz, and twin {twin.card.name} is valid at "
+            f"{apart}: a grid of {timing.rate_hz:g} Hz, and twin {twin.card.name} is valid at "
             f"{twin.card.rate_hz:.4g} Hz only: set resampler.rate_hz = {twin.card.rate_hz:.3g}"
         )
-    return True, f"{apart}: grid of {timing.rate_hz:g} Hz, gaps are longer than {timing.gap_limit_ns / NS_PER_S:g} s"
+    return True, f"{apart}: grid of {timing.rate_hz:.3g} Hz, gaps are longer than {timing.gap_limit_ns / NS_PER_S:g} s"
 
 
 def _ranges(

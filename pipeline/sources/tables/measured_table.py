@@ -17,7 +17,7 @@ from fantwin.pipeline.sources.column_file import NO_TIME
 from fantwin.pipeline.sources.tables.clocks import continued, goes_back, is_date
 from fantwin.pipeline.sources.tables.fan_columns import FanColumns
 from fantwin.schemas.messages import Array
-from fantwin.schemas.units import NS_PER_S
+from fantwin.schemas.units import NS_PER_S, period_in_words
 
 GAP_IN_MEDIAN_PERIODS = 5.0
 
@@ -113,15 +113,6 @@ class Table:
         if 2 * found.repeated > found.rows:
             notes.append("most times repeat: the time column is too coarse; choose another, or use --period")
         return tuple(notes)
-
-
-def period_in_words(seconds: float) -> str:
-    """A time between samples to three digits: 2 s, 12.5 ms."""
-    for unit, size in (("s", 1.0), ("ms", 1e-3)):
-        if seconds >= 0.9995 * size:
-            value = seconds / size
-            return f"{value:.0f} {unit}" if value >= 100 else f"{value:.3g} {unit}"
-    return f"{seconds * 1e6:.3g} us"
 
 
 def table_of(

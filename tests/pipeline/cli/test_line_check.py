@@ -108,7 +108,7 @@ def test_a_speed_that_is_shown_once_a_second_is_found_in_what_a_line_sends_twice
             {"rate_hz": 10, "resampler__rate_hz": 100},
             "too few for resampler.gap_limit_s = 0.1: leave out rate_hz",
         ),
-        ({"rate_hz": 0.2}, "0.2 samples a second: too slow to be judged; let the device send at least 1 a second"),
+        ({"rate_hz": 0.01}, "a sample every 100 s: too slow to be judged; let the device send one a minute"),
         ({"rate_hz": 10, "speed_rad_s": 9000.0}, 'speeds up to 9019 rad/s: is speed_unit "rpm"?'),
         ({"rate_hz": 10, "speed_rad_s": float("nan")}, "no speed of fans 0, 1: is its tacho connected?"),
         ({"rate_hz": 10, "fans": 3}, "samples of 3 fans, [[tray]] says fans = 2: correct one of them"),
