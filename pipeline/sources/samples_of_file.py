@@ -22,6 +22,10 @@ from fantwin.pipeline.sources.tables.units import SPEED_UNITS, in_unit_of, rad_s
 from fantwin.schemas.messages import Array
 
 _MOST_NAMED = 8
+_NO_READING = (-1, 65535, 4294967295)
+"""speeds that programs and chips give where they have none"""
+_FAR_BEYOND = 3.0
+"""times the largest other speed, above which one of these is no reading"""
 
 
 @dataclass(frozen=True)
@@ -57,10 +61,11 @@ def chosen_fans(path: Path, file: ColumnFile, wanted: Wanted, profile: Profile |
         raise UsageError("an import needs --command and --speed; --preview shows the columns")
     named = fan_columns(where, file.names, known.command, known.speed, wanted.channels)
     fans = zip(known.labels, known.command, known.speed, strict=True)
-    said = listed(
-        [f"{label or speed}: command {command!r}, speed {speed!r}" for label, command, speed in fans], _MOST_NAMED
-    )
-    return replace(known, others={**known.others, **named.others}, notes=(f"columns of {profile.title}: {said}",))
+    said = [f"{label or speed}: command {command!r}, speed {speed!r}" for label, command, speed in fans]
+    notes = [f"columns of {profile.title}: {listed(said, _MOST_NAMED)}"]
+    if unused := [name for name in profile.speeds_in(file) if name not in known.speed]:
+        notes.append(f"speeds without a command of their own, or second ones, left out: {listed(unused)}")
+    return replace(known, others={**known.others, **named.others}, notes=tuple(notes))
 
 
 def samples_of(path: Path, file: ColumnFile, wanted: Wanted) -> Table:
@@ -80,6 +85,7 @@ def samples_of(path: Path, file: ColumnFile, wanted: Wanted) -> Table:
             raise UserError(f"{path}: column {name!r} has no numbers{column.note and f', but {column.note}'}")
     columns, clocks = _continued(path, columns)
     t_ns, values = _at_times_of_speeds(columns, chosen)
+    no_reading = _without_error_codes(chosen, values)
     chosen = used_fans(path, chosen, values)
     stopped = _without_stops(chosen, columns, values, t_ns)
     unit, of_units = speed_unit(chosen, columns, profile)
@@ -96,6 +102,7 @@ def samples_of(path: Path, file: ColumnFile, wanted: Wanted) -> Table:
         *chosen.notes,
         *(f"{name!r}: {columns[name].note}" for name in chosen.names if columns[name].note),
         *_unmeasured_in_words(chosen, unmeasured),
+        *no_reading,
         *clocks,
         *stopped,
         *_rates(columns, chosen),
@@ -114,12 +121,12 @@ def speed_unit(chosen: FanColumns, columns: Mapping[str, Column], profile: Profi
     Raises:
         UsageError: the file has speeds in several.
     """
-    in_file = (unit if (unit := _unit(name, columns)) in SPEED_UNITS else "" for name in chosen.speed)
+    in_file = (unit if len(unit := _unit(name, columns)) > 1 or unit == "%" else "" for name in chosen.speed)
     units = [chosen.unit] if chosen.unit else list(dict.fromkeys(in_file))
-    if len(units) > 1:
+    if len(units) > 1 or units[0] not in ("", *SPEED_UNITS):
         raise UsageError(
-            f"speeds in {', '.join(unit or 'no unit' for unit in units)}, as the file says: give one unit, as in "
-            f"--speed {shlex.quote(f'{chosen.speed[0]}:rpm')}, or import them apart"
+            f"speeds in {', '.join(unit or 'no unit' for unit in units)}, as the file says: give one unit of a speed, "
+            f"as in --speed {shlex.quote(f'{chosen.speed[0]}:rpm')}, or import them apart"
         )
     return profile.unit_of(chosen.speed, units[0]) if profile else (units[0], [])
 
@@ -199,6 +206,19 @@ def _without_stops(
             counts |= {speed: int(np.count_nonzero(is_stopped))} if is_stopped.any() else {}
     why = "where their commands are NaN, as the motors were stopped"
     return [f"{_with_others(counts)}: {sum(counts.values())} values left out, {why}"] if counts else []
+
+
+def _without_error_codes(chosen: FanColumns, values: dict[str, Array]) -> list[str]:
+    """Take away speeds that are no readings: an error code beyond all others. Notes on that."""
+    notes: list[str] = []
+    for name in dict.fromkeys(chosen.speed):
+        for code in _NO_READING:
+            is_code = values[name] == code
+            others = values[name][np.isfinite(values[name]) & ~is_code]
+            if is_code.any() and len(others) and (code < 0 <= others.min() or code > _FAR_BEYOND * others.max() > 0):
+                values[name] = np.where(is_code, np.nan, values[name])
+                notes.append(f"{name!r}: {np.count_nonzero(is_code)} values of {code:.0f} left out, an error code")
+    return notes
 
 
 def _with_others(names: Collection[str]) -> str:

@@ -33,6 +33,8 @@ _LEAST_ALIKE = 0.6
 _LONGEST_SENTENCE = 6
 """words of a cell; a longer one is a sentence, not a name"""
 _RULER = re.compile(r"[-=+:|\s,;]*[-=][-=+:|\s,;]*")
+_END_OF_HEAD = "***End_of_Header***"
+"""before the names in files of LabVIEW"""
 _SEP_LINE = re.compile(r"\s*\"?sep=(.)\"?\s*", re.IGNORECASE)
 _BOMS = {codecs.BOM_UTF8: "utf-8-sig", codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16"}
 _ENCODINGS = {"utf-8": "UTF-8", "utf-8-sig": "UTF-8", "utf-16": "UTF-16", "utf-16-le": "UTF-16"}
@@ -136,6 +138,8 @@ def find_layout(path: Path) -> Layout:
     delimiter = ""
     if lines and (found := _SEP_LINE.fullmatch(lines[0])):
         delimiter, skipped = found[1], 1
+    ends = [k for k, line in enumerate(lines) if line.startswith(_END_OF_HEAD)]
+    skipped = ends[-1] + 1 if ends else skipped
     if "".join(lines[skipped:]).strip() == "":
         raise UserError(f"{path}: a line must name the columns, but the file is empty")
     delimiter = delimiter or _delimiter(lines)

@@ -75,6 +75,10 @@ class Profile:
             labels=tuple(labels),
         )
 
+    def speeds_in(self, file: ColumnFile) -> list[str]:
+        """All columns of speeds."""
+        return [name for name in file.names if any(re.fullmatch(each, name) for each in self.speed)]
+
     def unit_of(self, speeds: Sequence[str], given: str) -> tuple[str, list[str]]:
         """The unit of these speeds, if the user or the file gives this one, and a note on it."""
         if not self.unit or not all(any(re.fullmatch(each, name) for each in self.speed) for name in speeds):

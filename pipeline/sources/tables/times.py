@@ -115,8 +115,9 @@ class TimeColumn:
         value = self._numbers.number(self._first)
         if math.isnan(value):
             return DATE_UNIT
-        if self._unit:
-            return self._unit
+        if self._unit or self._numbers.unit in NS_PER_UNIT:
+            self._by_file = True
+            return self._unit or self._numbers.unit
         if abs(value) * NS_PER_S < FURTHEST_T_NS:
             self._by_file = value * NS_PER_S > _YEAR_2000_NS  # since 1970
             return "s"
@@ -202,7 +203,7 @@ def usual_time(layout: Layout) -> str:
             return "+".join(names[k] for k in dated)
     if len(dated) == 1:
         return names[dated[0]]
-    usual = ("time", "timestamp", "t", "date", "datetime", "zeit", "_time", "datum", "elapsed", "ts")
+    usual = ("time", "timestamp", "t", "date", "datetime", "zeit", "_time", "datum", "elapsed", "ts", "x_value")
     for word in usual:
         for k, name in enumerate(lower):
             if kinds[k] and (name == word or name.split()[:1] == [word] or name.startswith((f"{word}_", f"{word}("))):

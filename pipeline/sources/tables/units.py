@@ -46,7 +46,7 @@ CHANNEL_SCALES = {
     "temperature_c": {
         **dict.fromkeys(("c", "°c", "ºc", "degc", "celsius"), Scale()),
         **dict.fromkeys(("f", "°f", "ºf", "degf", "fahrenheit"), Scale(5 / 9, -160 / 9)),
-        "m°c": Scale(1e-3),
+        **dict.fromkeys(("m°c", "mc"), Scale(1e-3)),
         "k": Scale(1.0, -273.15),
     },
 }
@@ -63,7 +63,9 @@ _KNOWN = {
 _AT_END = re.compile(r"(?:[\[(]\s*(?P<in>[^\[\]()]*?)\s*[\])]|(?:_|\s-\s|,\s|\s/\s)(?P<last>[^\s_,\[\]()]+))\s*$")
 _LETTERS_IN_NAMES = {"f", "n", "w"}
 """no units behind an underscore"""
-_RPM_IN_NAME = re.compile(r"(?:(?<![A-Za-z])|(?<=[a-z])(?=RPM))([eE]?)(?:[Rr]pm|RPM)(?![a-z])")
+_SPEED_IN_NAME = re.compile(
+    r"(?:(?<![A-Za-z])|(?<=[a-z])(?=RPM))(?P<e>[eE]?)(?:[Rr]pm|RPM)(?![a-z])|(?P<angle>rad|deg)(?:[_/]|_?per_?)s(?:ec)?$"
+)
 _TAGS = re.compile(r"\{.*\}$")
 
 
@@ -80,16 +82,15 @@ def is_unit(text: str) -> bool:
 
 
 def unit_in_name(name: str) -> str:
-    """The unit that the name of a column or series has at its end, as in `Fan1 [RPM]`, `time (us)` or `speed_rpm{a=b}`,
-    or rpm anywhere; empty: none."""
+    """The unit in the name of a column or series: rpm anywhere, else at its end, as in `time (us)`, `duty_pct{a=b}` or
+    `speed_rad_s`; empty: none."""
     name = _TAGS.sub("", name)
+    if speed := _SPEED_IN_NAME.search(name):
+        return f"{speed['angle']}/s" if speed["angle"] else ELECTRICAL if speed["e"] else "rpm"
     if found := _AT_END.search(name):
         text = found["in"] if found["in"] is not None else found["last"]
         is_letter = found["in"] is None and text.lower() in _LETTERS_IN_NAMES
-        if unit := "K" if found["in"] == "K" else "" if is_letter else known_unit(text):
-            return unit
-    if of_rpm := _RPM_IN_NAME.search(name):
-        return ELECTRICAL if of_rpm[1] else "rpm"
+        return "K" if found["in"] == "K" else "" if is_letter else known_unit(text)
     return ""
 
 
