@@ -12,7 +12,7 @@ from fantwin.pipeline.errors import UserError
 EXTRAS: dict[str, tuple[str, ...]] = {
     "view": ("rerun",),
     "report": ("matplotlib", "jinja2"),
-    "devices": ("paho", "pymodbus"),
+    "devices": ("paho", "pymodbus", "pysnmp"),
     "outputs": ("apprise", "asyncua", "paho"),
     "logs": ("pyarrow", "pyulog", "rosbags", "ruamel"),
     "remote": ("distributed", "fsspec", "s3fs"),

@@ -94,24 +94,30 @@ def page() -> str:
 
 
 def _sources() -> Iterator[str]:
+    shown: dict[str, str] = {}
     for kind, row in SOURCE_KINDS.items():
         module, _, name = row.config.partition(":")
         model: type[BaseModel] = getattr(import_module(module), name)
         has_keys = set(model.model_fields) > {"kind"}
         yield f'### `source = {{ kind = "{kind}"{", ..." if has_keys else ""} }}`\n'
         yield table(model, but=("kind",)) if has_keys else "It has no other keys.\n"
-        yield from tables_within(model)
+        yield from tables_within(model, shown, f" of `{kind}`")
 
 
-def tables_within(model: type[BaseModel]) -> Iterator[str]:
-    """The keys of the tables that are values of keys of a source or a stage, each kind of table once."""
+def tables_within(model: type[BaseModel], shown: dict[str, str] | None = None, of: str = "") -> Iterator[str]:
+    """The keys of the tables that are values of keys of a source or a stage, each kind of table once.
+
+    shown: those that were shown before, and of what, which is `of` from here on.
+    """
     schema = model.model_json_schema()
-    waiting, shown = [schema], set[str]()
+    waiting, shown = [schema], {} if shown is None else shown
     while waiting:
         for key, value in waiting.pop(0)["properties"].items():
             name = next(_models_in(value), None)
-            if name is not None and name not in shown:
-                shown.add(name)
+            if name is not None and shown.get(name, of) != of:
+                yield f"`{key}` is such a table as that{shown[name]}.\n"
+            elif name is not None and name not in shown:
+                shown[name] = of
                 inner = schema["$defs"][name]
                 waiting.append(inner)
                 yield f"A table such as `{key}`: {inner['description'].splitlines()[0]}\n"

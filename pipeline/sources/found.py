@@ -59,4 +59,6 @@ def as_toml(value: object) -> str:
         return f"{{ {', '.join(f'{key} = {as_toml(each)}' for key, each in value.items())} }}"
     if isinstance(value, list):
         return f"[{', '.join(map(as_toml, value))}]"
+    if isinstance(value, str) and '"' in value and "'" not in value and value.isprintable():
+        return f"'{value}'"
     return json.dumps(value, ensure_ascii=False)  # texts, numbers and booleans are alike in both

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ipaddress
 import re
+from urllib.parse import urlsplit
 
 MOST_HOSTS = 4096
 _RANGE = re.compile(r"\[([0-9][0-9,-]*)\]")
@@ -39,3 +40,15 @@ def hosts_of(text: str) -> list[str]:
     if len(found) * len(rests) > MOST_HOSTS:
         raise ValueError(f"{text}: more than {MOST_HOSTS:,} hosts")
     return [f"{text[: match.start()]}{number}{rest}" for number in found for rest in rests]
+
+
+def host_and_port(text: str, default_port: int) -> tuple[str, int]:
+    """Host and port of `plc1`, `plc1:1502` or `[fe80::1]`.
+
+    Raises:
+        ValueError: it is no such address.
+    """
+    parts = urlsplit(f"//{text}")
+    if not parts.hostname or parts.port == 0 or parts.netloc != text or set(text) & set("@ "):
+        raise ValueError("no address")
+    return parts.hostname, parts.port or default_port

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
-from fantwin.pipeline.sources.own_json import OwnJson, number_of, of_fan, value_at
+from fantwin.pipeline.sources.own_json import OwnSamples, number_of, of_fan, value_at
 from fantwin.pipeline.sources.source import Reading, ReadingBatch, Rejected
 from fantwin.pipeline.timebase.device_clock import NS_PER_US, UINT32
 from fantwin.pipeline.timebase.receipt_times import ReceiptTimes
@@ -39,24 +39,17 @@ class TimedReading:
     t_ns: int | None
 
 
-def parse_samples(text: bytes) -> list[TimedReading | Rejected]:
-    """Parse each of the samples in a text.
+def parse_samples(
+    text: bytes, own: OwnSamples | None = None, fans: int = 0, speed_unit: str = ""
+) -> list[TimedReading | Rejected]:
+    """Parse each of the samples in a text. own: where the values of the fans are in JSON of the device's own.
 
     Raises:
         JsonSamplesError: it is no JSON, too long, or neither a sample nor a list of samples.
     """
-    return _timed(_listed(text), _timed_reading)
-
-
-def parse_own_samples(
-    text: bytes, own: OwnJson, time_key: str, fans: int, speed_unit: str
-) -> list[TimedReading | Rejected]:
-    """Parse samples in a form that is the device's own: where the values of its fans are says `own`.
-
-    Raises:
-        JsonSamplesError: it is no JSON, or too long.
-    """
-    return _timed(_listed(text), lambda sample: _own_reading(sample, own, time_key, fans, speed_unit))
+    if own is None or not own.speed_key:
+        return _timed(_listed(text), _timed_reading)
+    return _timed(_listed(text), lambda sample: _own_reading(sample, own, fans, speed_unit))
 
 
 def _listed(text: bytes) -> list[Any]:
@@ -112,6 +105,12 @@ def batches_of(
     ]
 
 
+def command_json(command: Sequence[float], set_point: Sequence[float]) -> str:
+    """A command, or set-points, as a program gets them: null leaves a fan as it is."""
+    given = {"command": command, "set_point": set_point}
+    return json.dumps({name: [None if math.isnan(x) else x for x in each] for name, each in given.items() if each})
+
+
 def _timed_reading(sample: Mapping[str, Any]) -> TimedReading:
     unknown = [key for key in sample if key not in _OF_SAMPLE]
     if unknown:
@@ -130,7 +129,7 @@ def _timed_reading(sample: Mapping[str, Any]) -> TimedReading:
     return TimedReading(reading, t_ns)
 
 
-def _own_reading(sample: Mapping[str, Any], own: OwnJson, time_key: str, fans: int, speed_unit: str) -> TimedReading:
+def _own_reading(sample: Mapping[str, Any], own: OwnSamples, fans: int, speed_unit: str) -> TimedReading:
     def values(key: str, **how: Any) -> tuple[float, ...]:
         found: list[float] = []
         for fan in range(fans):
@@ -141,7 +140,7 @@ def _own_reading(sample: Mapping[str, Any], own: OwnJson, time_key: str, fans: i
             found.append(number)
         return tuple(found)
 
-    t_ns = _time_ns(value_at(sample, time_key)) if time_key else None
+    t_ns = _time_ns(value_at(sample, own.time_key)) if own.time_key else None
     clock_us = None if t_ns is None else (t_ns + NS_PER_US // 2) // NS_PER_US % UINT32
     return TimedReading(Reading(values(own.command_key), values(own.speed_key, speed_unit=speed_unit), clock_us), t_ns)
 

@@ -12,7 +12,7 @@ from typing import Any
 from fantwin.pipeline.plugins import SourceKind, loaded, rows_of_others
 from fantwin.pipeline.sources.source import SampleSource, SourceConfig, SourceContext
 
-_OWN = ("serial", "mqtt", "http", "push", "hwmon", "modbus", "redfish")
+_OWN = ("serial", "mqtt", "http", "push", "hwmon", "modbus", "redfish", "exec", "prometheus", "ipmi", "snmp")
 """of each a folder beside this file: `config` has its settings, MqttConfig, and `source` its source, MqttSource"""
 SOURCE_KINDS = {
     kind: SourceKind(

@@ -6,10 +6,11 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
-from typing import Any
+from typing import Any, Self
 
-from pydantic import BaseModel, Field
+from pydantic import BaseModel, Field, model_validator
 
+from fantwin.pipeline.errors import UserError
 from fantwin.schemas.units import RAD_S_PER_UNIT
 
 LONGEST_NUMBER = 40
@@ -30,6 +31,27 @@ class OwnJson(BaseModel, frozen=True):
         default="", pattern="^(/.*)?$", description="where the speed is in the device's own JSON (JSON pointer)"
     )
     command_key: str = Field(default="", pattern="^(/.*)?$", description="where its command is")
+
+
+class OwnSamples(OwnJson, frozen=True):
+    """Whole samples in such JSON."""
+
+    time_key: str = Field(
+        default="",
+        pattern="^(/.*)?$",
+        description="where its time is, s since 1970 or a date; without it, that of receipt",
+    )
+
+    @model_validator(mode="after")
+    def _has_speed_and_command(self) -> Self:
+        if bool(self.speed_key) != bool(self.command_key) or (self.time_key and not self.speed_key):
+            raise ValueError("give speed_key and command_key, or neither, and time_key only with them")
+        return self
+
+    def require_each_fan(self, fans: int) -> None:
+        """Raises UserError if one speed would be that of several fans."""
+        if fans > 1 and self.speed_key and not is_of_each_fan(self.speed_key):
+            raise UserError(f"speed_key has one speed for {fans} fans: number them in braces, as in /fans/{{0}}/rpm")
 
 
 def of_fan(text: str, fan: int) -> str:

@@ -16,9 +16,9 @@ import math
 import threading
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 from pydantic import Field
 
@@ -53,6 +53,14 @@ class PolledConfig(SourceConfig, frozen=True):
 
     period_s: float = Field(default=0.5, gt=0, le=SLOWEST_S, description="time between two readings")
 
+    @property
+    def longest_silence_s(self) -> float:
+        """Some readings may fail."""
+        return max(super().longest_silence_s, MOST_FAILURES * self.period_s)
+
+
+Polled: TypeAlias = Reading | Rejected | Sequence[ReadingBatch]
+
 
 class DeviceError(UserError):
     """A request that failed: one line that says why, and what to do. is_lost: there is no connection any more."""
@@ -86,7 +94,7 @@ class PollingSource(ABC):
     """A `SampleSource` that asks a device. A kind says how to connect, read and write, all called in one thread."""
 
     def __init__(self, config: SourceConfig, period_s: float) -> None:
-        """period_s: time between two readings."""
+        """period_s: time between two readings; 0 if `read` waits for the next one itself."""
         self._period_s = period_s
         self._why_no_commands = config.why_no_commands
         self._deliver: Callable[[SourceEvent], None] = lambda _event: None
@@ -114,8 +122,10 @@ class PollingSource(ABC):
         """Find the device, or open a connection. Raises DeviceError."""
 
     @abstractmethod
-    def read(self) -> Reading | Rejected:
+    def read(self) -> Polled:
         """Read once, NaN for a value that cannot be read; what cannot be used is `Rejected`, with the reason.
+
+        A device that says when it measured gives what is new, maybe nothing, with those times.
 
         Raises DeviceError where nothing can be read.
         """
@@ -207,15 +217,15 @@ class PollingSource(ABC):
         except Exception as error:  # noqa: BLE001
             self._count("failed_writes", f"it could not be left as it was found: {_reason(error)}")
 
-    def _read(self) -> Reading | Rejected:
+    def _read(self) -> Polled:
         """A reading with the time of the middle of its request."""
         began_s = time.monotonic()
         reading = self.read()
-        if isinstance(reading, Rejected):
+        if not isinstance(reading, Reading):
             return reading
         return replace(reading, clock_us=round((began_s + time.monotonic()) / 2.0 * 1e6) % UINT32)
 
-    def _poll_until_lost(self, first: Reading | Rejected) -> str:
+    def _poll_until_lost(self, first: Polled) -> str:
         """Deliver readings until the device is lost, or `stop` is called; returns why it is lost."""
         with self._wake:
             self._is_connected = True
@@ -242,6 +252,8 @@ class PollingSource(ABC):
     def _next_due_s(self, due_s: float) -> float:
         """Time of the poll after the one at due_s. Polls whose time is over are left out, and counted."""
         late_s = time.monotonic() - due_s
+        if not self._period_s:
+            return due_s + late_s
         skipped = max(0, math.ceil(late_s / self._period_s) - 1)
         self._sequence += skipped
         if skipped:
@@ -276,7 +288,11 @@ class PollingSource(ABC):
         if failure and not is_known:
             self._count("failed_writes", failure)
 
-    def _deliver_reading(self, reading: Reading | Rejected) -> None:
+    def _deliver_reading(self, reading: Polled) -> None:
+        if isinstance(reading, Sequence):
+            for batch in reading:
+                self._deliver(batch)
+            return
         item = replace(reading, sequence=self._sequence % UINT32) if isinstance(reading, Reading) else reading
         self._sequence += 1
         self._deliver(ReadingBatch(HOST_CLOCK.now_ns(), (item,)))

@@ -14,6 +14,7 @@ from fantwin.pipeline.sources.http import source as http_source
 from fantwin.pipeline.sources.kinds import SOURCE_KINDS, build_source, parse_source
 from fantwin.pipeline.sources.mqtt import client as broker_client
 from fantwin.pipeline.sources.serial import port as serial_port
+from fantwin.pipeline.sources.snmp import source as snmp_source
 from fantwin.pipeline.sources.source import (
     LinkDown,
     LinkUp,
@@ -64,6 +65,7 @@ def made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[
         (polling, ("RECONNECT_DELAY_S", "RECONNECT_DELAY_MAX_S")),
         (serial_port, ("REOPEN_DELAY_S", "REOPEN_DELAY_MAX_S")),
         (http_source, ("RETRY_S",)),
+        (snmp_source, ("TIMEOUT_S",)),
     ):
         for name in names:
             monkeypatch.setattr(module, name, 0.02)

@@ -162,6 +162,14 @@ source = {{ kind = "modbus", line = "127.0.0.1", fan = [{{ speed = {{ address = 
 name = "server"
 fans = 1
 source = {{ kind = "redfish", url = "https://127.0.0.1" }}
+[[tray]]
+name = "switch"
+fans = 1
+[tray.source]
+kind = "snmp"
+host = "127.0.0.1"
+community_file = "community"
+fan = [{{ speed = "1.3.6" }}]
 [opcua]
 [mqtt]
 url = "mqtt://127.0.0.1"
@@ -176,7 +184,7 @@ def test_doctor_prints_what_each_source_and_stage_lacks(capsys, monkeypatch):
     Path("fantwin.toml").write_text(CONFIGURATION.format(folder=Path.cwd(), launcher=NAMED))
     lines = printed_by("doctor --listen-s 0", capsys, monkeypatch)
     for what, extra in {
-        **{f"source {kind}": "devices" for kind in ("mqtt", "modbus")},
+        **{f"source {kind}": "devices" for kind in ("mqtt", "modbus", "snmp")},
         **{f"stage {stage}": "outputs" for stage in ("opcua", "mqtt")},
         "target mail: apprise": "outputs",
         "stage viewer": "view",

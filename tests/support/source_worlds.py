@@ -22,6 +22,7 @@ import paho.mqtt.client as paho
 from paho.mqtt.enums import CallbackAPIVersion
 from pymodbus.constants import ExcCodes
 
+from fantwin.pipeline.sources.ipmi import source as ipmi_source
 from fantwin.pipeline.sources.push.source import PushSource
 from fantwin.pipeline.sources.source import SampleSource, SourceEvent
 from fantwin.schemas.header import Header
@@ -30,10 +31,12 @@ from fantwin.schemas.units import RAD_S_PER_UNIT
 from fantwin.schemas.wire import Sample, encode
 from tests.support.hwmon_trees import add_chip
 from tests.support.made_messages import filled
+from tests.support.metrics_server import Metrics, metrics_server
 from tests.support.modbus_server import modbus_server
 from tests.support.mqtt_broker import MqttBroker
 from tests.support.ports import free_port
 from tests.support.redfish_server import Controller, redfish_server
+from tests.support.snmp_agent import COMMUNITY, Agent, snmp_agent
 
 COMMAND = 0.5
 POLLED = {"period_s": 0.02}
@@ -265,6 +268,130 @@ class RedfishWorld(World):
         self.controller.percent = [None, None]
 
 
+class ExecWorld(World):
+    """A program that prints what comes through a pipe."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder)
+        self.settings = {"program": ["./fans", "--of", "tray 1"]}
+        self.pipe = folder / "pipe"
+        os.mkfifo(self.pipe)
+
+    def plug_in(self) -> None:
+        program = self.folder / "fans"
+        program.write_text("#!/bin/sh\nsed 's/^/ /' first\nexec cat pipe\n")
+        program.chmod(0o755)
+        (self.folder / "first").write_bytes(json_sample(0) + b"\n")
+        self.far = os.open(self.pipe, os.O_RDWR)
+        for undo in (program.unlink, lambda: os.close(self.far)):
+            self.stack.callback(undo)
+
+    def unplug(self) -> None:
+        (self.folder / "fans").chmod(0)
+        super().unplug()
+
+    def show(self, number: int, source: SampleSource, deliver: Callable[[SourceEvent], None]) -> None:
+        os.write(self.far, json_sample(number) + b"\n")
+
+    def garble(self, source: SampleSource, deliver: Callable[[SourceEvent], None]) -> None:
+        os.write(self.far, b"Traceback (most recent call last):\n")
+
+
+class PrometheusWorld(World):
+    """A Prometheus, which is gone while it refuses every query."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder)
+        self.metrics = Metrics()
+        self.metrics.status = 503
+        url = self.stack.enter_context(metrics_server(self.metrics))
+        fans = [{"speed": f'rpm{{fan="{fan}"}}', "command": f'pwm{{fan="{fan}"}}'} for fan in "ab"]
+        self.settings = {"url": url, "fan": fans, **POLLED}
+        self._show(0)
+
+    def plug_in(self) -> None:
+        self.metrics.status = 200
+
+    def unplug(self) -> None:
+        self.metrics.status = 503
+
+    def _show(self, number: int) -> None:
+        self.metrics.series = [
+            ({"__name__": name, "fan": fan}, [(1_790_000_000.5 + number, str(value))])
+            for fan, rpm in zip("ab", speeds_of(number), strict=True)
+            for name, value in (("rpm", rpm), ("pwm", COMMAND))
+        ]
+
+    def show(self, number: int, source: SampleSource, deliver: Callable[[SourceEvent], None]) -> None:
+        self.metrics.text = ""
+        self._show(number)
+
+    def garble(self, source: SampleSource, deliver: Callable[[SourceEvent], None]) -> None:
+        self.metrics.text = "<html>"
+
+
+class IpmiWorld(World):
+    """An ipmitool of our own, in the place of the real one."""
+
+    command = 40.0
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder)
+        self.program = folder / "ipmitool"
+        self.stack.callback(setattr, ipmi_source, "PROGRAM", ipmi_source.PROGRAM)
+        ipmi_source.PROGRAM = str(self.program)
+        self.settings = {"fan": [{"speed": name, "command": "PWM1"} for name in ("FAN1", "FAN2")], **POLLED}
+        self._show(speeds_of(0), "RPM")
+
+    def plug_in(self) -> None:
+        new = self.folder / "new"
+        new.write_text("#!/bin/sh\nexec cat sensors\n".replace("sensors", str(self.folder / "sensors")))
+        new.chmod(0o755)
+        new.rename(self.program)
+
+    def unplug(self) -> None:
+        self.program.unlink()
+
+    def _show(self, speeds: tuple[float, float], unit: str) -> None:
+        new = self.folder / "new-sensors"
+        lines = [f"FAN{n} | 4{n}h | ok | 29.{n} | {rpm:.0f} {unit}" for n, rpm in enumerate(speeds, 1)]
+        new.write_text("\n".join([*lines, "PWM1 | 50h | ok | 7.1 | 40 percent\n"]))
+        new.rename(self.folder / "sensors")
+
+    def show(self, number: int, source: SampleSource, deliver: Callable[[SourceEvent], None]) -> None:
+        self._show(speeds_of(number), "RPM")
+
+    def garble(self, source: SampleSource, deliver: Callable[[SourceEvent], None]) -> None:
+        self._show(speeds_of(1), "percent")
+
+
+class SnmpWorld(World):
+    """An agent; what is no sample are objects that are not there."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder)
+        self.port, self.agent = free_port(), Agent()
+        (folder / "community").write_text(f"{COMMUNITY}\n")
+        (folder / "community").chmod(0o600)
+        command = {"name": ".1.3.6.1.4.2", "scale": 0.01}
+        fans = [{"speed": f"1.3.6.1.4.1.{fan}", "command": command} for fan in (0, 1)]
+        self.settings = {"host": f"127.0.0.1:{self.port}", "community_file": "community", "fan": fans, **POLLED}
+        self._show(0)
+
+    def plug_in(self) -> None:
+        self.stack.enter_context(snmp_agent(self.agent, self.port))
+
+    def _show(self, number: int) -> None:
+        speeds = {f"1.3.6.1.4.1.{fan}": round(rpm) for fan, rpm in enumerate(speeds_of(number))}
+        self.agent.objects = {**speeds, "1.3.6.1.4.2": 50}
+
+    def show(self, number: int, source: SampleSource, deliver: Callable[[SourceEvent], None]) -> None:
+        self._show(number)
+
+    def garble(self, source: SampleSource, deliver: Callable[[SourceEvent], None]) -> None:
+        self.agent.objects = {}
+
+
 WORLDS: dict[str, type[World]] = {
     "serial": SerialWorld,
     "mqtt": MqttWorld,
@@ -273,4 +400,8 @@ WORLDS: dict[str, type[World]] = {
     "hwmon": HwmonWorld,
     "modbus": ModbusWorld,
     "redfish": RedfishWorld,
+    "exec": ExecWorld,
+    "prometheus": PrometheusWorld,
+    "ipmi": IpmiWorld,
+    "snmp": SnmpWorld,
 }

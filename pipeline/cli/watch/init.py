@@ -21,6 +21,7 @@ from fantwin.pipeline.sources.found import Found, free_name
 from fantwin.pipeline.sources.hwmon.config import ROOT
 from fantwin.pipeline.sources.hwmon.discovery import discover_hwmon
 from fantwin.pipeline.sources.logs.discovery import discover_logs
+from fantwin.pipeline.sources.prometheus.discovery import discover_metrics
 from fantwin.pipeline.sources.redfish.discovery import discover_controllers
 from fantwin.pipeline.sources.serial.discovery import discover_device, serial_ports
 
@@ -34,7 +35,8 @@ class Chosen:
         writable: fantwin may command them.
         serial: ports.
         redfish: addresses of controllers.
-        password_file: of the controllers' user.
+        prometheus: addresses of Prometheus servers or exporters.
+        password_file: of the user in these addresses.
         logs: a folder of logs or tables; None: none.
     """
 
@@ -42,6 +44,7 @@ class Chosen:
     writable: bool = False
     serial: tuple[str, ...] = ()
     redfish: tuple[str, ...] = ()
+    prometheus: tuple[str, ...] = ()
     password_file: Path | None = None
     logs: Path | None = None
 
@@ -66,6 +69,10 @@ def init(
             help="Watch the fans of a server by its controller: https://USER@HOST, or of a range: "
             "https://bmc[001-400]. Repeatable.",
         ),
+    ] = None,
+    prometheus: Annotated[
+        list[str] | None,
+        typer.Option(metavar="URL", help="Watch the fans in a Prometheus, or of an exporter: URL/metrics. Repeatable."),
     ] = None,
     password_file: Annotated[
         Path | None,
@@ -93,14 +100,14 @@ def init(
     Example: fantwin init --redfish "https://ann@bmc[001-400].hall" --password-file bmc.secret
     """
     root = root.absolute() if root != ROOT else root
-    chosen = Chosen(hwmon or writable, writable, tuple(serial or ()), tuple(redfish or ()), password_file, logs)
-    if chosen.password_file and not chosen.redfish:
-        raise UsageError("--password-file is for --redfish: name the address of a controller")
+    addresses = tuple(redfish or ()), tuple(prometheus or ())
+    chosen = Chosen(hwmon or writable, writable, tuple(serial or ()), *addresses, password_file, logs)
+    if chosen.password_file and not any(addresses):
+        raise UsageError("--password-file is for --redfish and --prometheus: name an address")
     if chosen == Chosen():
         if json_output or not _is_terminal():
-            raise UsageError(
-                f"say what to watch: --hwmon, --serial PORT, --redfish URL or --logs FOLDER; {_seen(root)}"
-            )
+            options = "--hwmon, --serial PORT, --redfish URL, --prometheus URL or --logs FOLDER"
+            raise UsageError(f"say what to watch: {options}; {_seen(root)}")
         chosen = _asked(root)
     found_logs = discover_logs(chosen.logs) if chosen.logs else []
     found = list(_discovered(chosen, root, config.parent))
@@ -134,6 +141,8 @@ def _discovered(chosen: Chosen, root: Path, folder: Path) -> Iterator[Found]:
         found += [discover_device(port) for port in chosen.serial]
         for url in chosen.redfish:
             found += discover_controllers(url, chosen.password_file, folder)
+        for url in chosen.prometheus:
+            found += discover_metrics(url, chosen.password_file, folder)
     for each in found:
         has_name = "name" in each.tray
         yield replace(each, tray={**each.tray, "name": free_name(each.tray["name"], names)}) if has_name else each
@@ -181,6 +190,7 @@ def _asked(root: Path) -> Chosen:
         writable,
         tuple(serial),
         (url,) if url else (),
+        (),
         Path(password) if password else None,
         Path(logs) if logs else None,
     )

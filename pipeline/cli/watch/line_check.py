@@ -110,6 +110,8 @@ def _from_source(context: Context, seconds: float) -> _Heard:
     finally:
         source.stop()
     problem = core.problem().replace("; waiting for it", "")  # the doctor does not
+    if not samples:  # what was refused is the reason, also where the source is asked so rarely that it seems silent
+        problem = "; ".join(dict.fromkeys(filter(None, (problem, *core.notes()))))
     device = source.source if isinstance(source, SampleBlocks) else source
     if not isinstance(device, PollingSource):
         return _Heard(samples, problem or refusal(core.counters()))

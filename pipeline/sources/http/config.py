@@ -8,11 +8,11 @@ from typing import ClassVar, Literal, Self
 from pydantic import Field, model_validator
 
 from fantwin.pipeline.sources.host_address import is_of_this_host_only
-from fantwin.pipeline.sources.own_json import OwnJson
+from fantwin.pipeline.sources.own_json import OwnSamples
 from fantwin.pipeline.sources.source import SourceConfig
 
 
-class HttpConfig(SourceConfig, OwnJson, frozen=True):
+class HttpConfig(SourceConfig, OwnSamples, frozen=True):
     """An HTTP server for one tray, in its acquisition: docs/how-to/sources.md, docs/reference/json-samples.md."""
 
     takes_port: ClassVar[bool] = True
@@ -28,12 +28,6 @@ class HttpConfig(SourceConfig, OwnJson, frozen=True):
     )
     certificate: Path | None = Field(default=None, description="certificate of the server, for https")
     key: Path | None = Field(default=None, description="private key of that certificate")
-
-    time_key: str = Field(
-        default="",
-        pattern="^(/.*)?$",
-        description="where its time is, s since 1970 or a date; without it, that of receipt",
-    )
 
     @property
     def is_local(self) -> bool:
@@ -53,6 +47,4 @@ class HttpConfig(SourceConfig, OwnJson, frozen=True):
             )
         if bool(self.certificate) != bool(self.key):
             raise ValueError("give certificate and key, or neither")
-        if bool(self.speed_key) != bool(self.command_key) or (self.time_key and not self.speed_key):
-            raise ValueError("give speed_key and command_key, or neither, and time_key only with them")
         return self

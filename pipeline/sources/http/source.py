@@ -23,10 +23,8 @@ from fantwin.pipeline.sources.json_samples import (
     JsonSamplesError,
     TimedReading,
     batches_of,
-    parse_own_samples,
     parse_samples,
 )
-from fantwin.pipeline.sources.own_json import is_of_each_fan
 from fantwin.pipeline.sources.secret_file import read_secret
 from fantwin.pipeline.sources.source import LinkDown, LinkUp, ReadingBatch, Rejected, SourceContext, SourceEvent
 from fantwin.pipeline.timebase.host_clock import HOST_CLOCK
@@ -57,10 +55,7 @@ class HttpSource:
         Raises:
             UserError: the token cannot be read, or a pointer is not of each fan.
         """
-        if context.fans > 1 and config.speed_key and not is_of_each_fan(config.speed_key):
-            raise UserError(
-                f"speed_key has one speed for {context.fans} fans: number them in braces, as in /fans/{{0}}/rpm"
-            )
+        config.require_each_fan(context.fans)
         self._config = config
         self._context = context
         self._token = read_secret(context.folder / config.token_file) if config.token_file else ""
@@ -140,10 +135,7 @@ class HttpSource:
         body = await request.body()
         config, context = self._config, self._context
         try:
-            if config.speed_key:
-                found = parse_own_samples(body, config, config.time_key, context.fans, context.speed_unit)
-            else:
-                found = parse_samples(body)
+            found = parse_samples(body, config, context.fans, context.speed_unit)
         except JsonSamplesError as error:
             return _answer(400, {"error": str(error)})
         return self._take(found, len(body))

@@ -5,13 +5,14 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from typing import Any, ClassVar, Literal, Self
-from urllib.parse import urlsplit
 
-from pydantic import BaseModel, ConfigDict, Field, create_model, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
+from fantwin.pipeline.sources.host_address import host_and_port
 from fantwin.pipeline.sources.modbus.models import MODELS
+from fantwin.pipeline.sources.named_values import of_each_channel
 from fantwin.pipeline.sources.polling import PolledConfig
-from fantwin.schemas.channels import CHANNELS, Channel
+from fantwin.schemas.channels import Channel
 
 TCP_PORT = 502
 MOST_REGISTERS = 120
@@ -45,8 +46,7 @@ class Register(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
         return self
 
 
-_CHANNEL_FIELDS: Any = {each.key: (Register | None, Field(default=None, description=each.label)) for each in CHANNELS}
-_Channels: Any = create_model("_Channels", __doc__="A register for each channel.", **_CHANNEL_FIELDS)
+_Channels: Any = of_each_channel(Register)
 
 
 class ModbusFan(_Channels):
@@ -112,14 +112,11 @@ class ModbusConfig(PolledConfig, frozen=True):
         if "/" in value:
             return value
         try:
-            parts = urlsplit(f"//{value}")
-            is_address = parts.hostname and parts.port != 0 and parts.netloc == value and not set(value) & set("@ ")
-        except ValueError:
-            is_address = False
-        if not is_address:
+            host_and_port(value, TCP_PORT)
+        except ValueError as error:
             raise ValueError(
                 "give plc1, plc1:1502 or [fe80::1] for Modbus TCP, or a path, /dev/ttyUSB0, for Modbus RTU"
-            )
+            ) from error
         return value
 
     @field_validator("serial")
@@ -151,8 +148,7 @@ class ModbusConfig(PolledConfig, frozen=True):
     @property
     def address(self) -> tuple[str, int]:
         """Host and port, for Modbus TCP."""
-        parts = urlsplit(f"//{self.line}")
-        return parts.hostname or "", parts.port or TCP_PORT
+        return host_and_port(self.line, TCP_PORT)
 
     @property
     def most_fans(self) -> int:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.extras import require
-from fantwin.pipeline.sources.json_samples import JsonSamplesError, batches_of, parse_samples
+from fantwin.pipeline.sources.json_samples import JsonSamplesError, batches_of, command_json, parse_samples
 from fantwin.pipeline.sources.mqtt.client import NOT_REACHED, connection_problems, new_client, refusal
 from fantwin.pipeline.sources.mqtt.config import MqttConfig, are_of_each_fan, topic_of
 from fantwin.pipeline.sources.mqtt.connection import KEEPALIVE_S
@@ -124,9 +124,7 @@ class MqttSource:
         if not self._is_up:
             return f"{self.name} is not connected"
         if not are_of_each_fan(topic):
-            given = {"command": command, "set_point": set_point}
-            values = {name: [None if math.isnan(x) else x for x in each] for name, each in given.items() if each}
-            is_sent = self._publish(str(topic), json.dumps(values))
+            is_sent = self._publish(str(topic), command_json(command, set_point))
         elif not all(map(math.isnan, set_point)):
             return f"{topic} takes commands, no set-points"
         else:

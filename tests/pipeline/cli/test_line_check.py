@@ -186,3 +186,14 @@ def test_while_a_site_runs_pushed_samples_are_listened_to(endpoint: str, tmp_pat
             stop.set()
             sender.join()
     assert [line for ok, line in lines if not ok] == ["tray1: no speed of fan 1: is its tacho connected?"]
+
+
+def test_a_source_whose_samples_are_all_refused_is_said_with_the_reason(tmp_path: Path) -> None:
+    """One that is asked so rarely that its health has no problem yet."""
+    (tmp_path / "fans").write_text('#!/bin/sh\necho \'{"command": [null, null], "speed": [1, 2]}\'; exec sleep 100\n')
+    (tmp_path / "fans").chmod(0o755)
+    text = '[[tray]]\nname = "a"\nfans = 2\nsource = { kind = "exec", program = ["./fans"] }\n'
+    config = parse_config(text, tmp_path / "fantwin.toml", stages=("acquisition",))
+    context = Context(SITE, config.trays, config.sections["acquisition"], tmp_path, tmp_path, 0)
+    ((is_fine, line),) = check_line(context, config, 0.2, is_running=False)
+    assert not is_fine and "the command of no fan is known" in line

@@ -15,10 +15,9 @@ from fantwin.pipeline.sources.json_samples import (
     JsonSamplesError,
     TimedReading,
     batches_of,
-    parse_own_samples,
     parse_samples,
 )
-from fantwin.pipeline.sources.own_json import OwnJson
+from fantwin.pipeline.sources.own_json import OwnSamples
 from fantwin.pipeline.sources.source import Reading, Rejected
 from fantwin.pipeline.timebase.receipt_times import ReceiptTimes
 from fantwin.schemas.channels import CURRENT, SUPPLY_VOLTAGE, TEMPERATURE
@@ -153,15 +152,14 @@ TELEGRAF = (
 
 
 def test_json_of_a_device_is_read_by_pointers() -> None:
-    own = OwnJson(speed_key="/fields/rpm", command_key="/fields/pwm")
-    first, second, other = parse_own_samples(TELEGRAF % b"40 %", own, "/timestamp", 1, "rpm")
+    own = OwnSamples(speed_key="/fields/rpm", command_key="/fields/pwm", time_key="/timestamp")
+    first, second, other = parse_samples(TELEGRAF % b"40 %", own, 1, "rpm")
     assert isinstance(first, TimedReading) and isinstance(second, TimedReading)
     assert (first.reading.command, first.reading.speed, first.t_ns) == ((40.0,), (1206.0,), 1458229140 * NS_PER_S)
     assert second.reading.speed[0] == pytest.approx(190.99, abs=0.01)
     assert isinstance(other, Rejected) and other.detail == "nothing at /fields/pwm; there is: usage_idle"
-    (wrong, *_) = parse_own_samples(TELEGRAF % b"fast", own, "", 1, "rpm")
+    (wrong, *_) = parse_samples(TELEGRAF % b"fast", own, 1, "rpm")
     assert isinstance(wrong, Rejected) and wrong.detail == "/fields/pwm has 'fast', which is no number"
-    (both,) = parse_own_samples(
-        b'{"a": [[1, 2], [3, null]]}', OwnJson(speed_key="/a/{0}/1", command_key="/a/{0}/0"), "", 2, "rpm"
-    )
+    own = OwnSamples(speed_key="/a/{0}/1", command_key="/a/{0}/0")
+    (both,) = parse_samples(b'{"a": [[1, 2], [3, null]]}', own, 2, "rpm")
     assert isinstance(both, TimedReading) and both.reading.command == (1.0, 3.0) and math.isnan(both.reading.speed[1])

@@ -1,0 +1,1 @@
+"""Samples that a program prints, which acquisition runs."""

@@ -1,0 +1,1 @@
+"""Fans that a baseboard controller shows by IPMI, read by ipmitool."""

@@ -1,0 +1,1 @@
+"""Fans whose values a Prometheus has, or an exporter shows."""

@@ -1,0 +1,1 @@
+"""Fans of switches, cooling units and power units by SNMP."""
