@@ -95,12 +95,13 @@ def page() -> str:
 
 def _sources() -> Iterator[str]:
     shown: dict[str, str] = {}
+    rows: dict[str, str] = {}
     for kind, row in SOURCE_KINDS.items():
         module, _, name = row.config.partition(":")
         model: type[BaseModel] = getattr(import_module(module), name)
         has_keys = set(model.model_fields) > {"kind"}
         yield f'### `source = {{ kind = "{kind}"{", ..." if has_keys else ""} }}`\n'
-        yield table(model, but=("kind",)) if has_keys else "It has no other keys.\n"
+        yield _table_of_new(table(model, but=("kind",)), rows, kind) if has_keys else "It has no other keys.\n"
         yield from tables_within(model, shown, f" of `{kind}`")
 
 
@@ -122,6 +123,18 @@ def tables_within(model: type[BaseModel], shown: dict[str, str] | None = None, o
                 waiting.append(inner)
                 yield f"A table such as `{key}`: {inner['description'].splitlines()[0]}\n"
                 yield _rows(inner)
+
+
+def _table_of_new(text: str, known: dict[str, str], kind: str) -> str:
+    """The table of a kind, where keys that are the same as those of former kinds are only named. known: kind by row."""
+    heads, rows = text.splitlines()[:2], text.splitlines()[2:]
+    same: dict[str, list[str]] = {}
+    for row in rows:
+        if known.setdefault(row, kind) != kind:
+            same.setdefault(known[row], []).append(row.split(" | ")[0].removeprefix("| "))
+    also = "; ".join(f"{', '.join(keys)} as of `{of}`" for of, keys in same.items())
+    new = [row for row in rows if known[row] == kind]
+    return "\n".join([*heads, *new, *([f"\nAnd {also}."] if also else []), ""])
 
 
 def table(model: type[BaseModel], but: Iterable[str] = ()) -> str:
