@@ -60,6 +60,8 @@ class NamedFan(_Channels):
 class NamedFansConfig(PolledConfig, frozen=True):
     """Base of the settings of such a device."""
 
+    shares_process: ClassVar[bool] = True
+
     fan: tuple[NamedFan, ...] = Field(min_length=1, description="one [[tray.source.fan]] for each fan, in their order")
 
     @property
