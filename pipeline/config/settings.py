@@ -173,7 +173,7 @@ class LauncherConfig(Section):
         description="number of processes that share the trays of a stage: one number for all stages but "
         f"{', '.join(name for name, row in STAGES.items() if not row.has_common_shards)}; or a table, such as "
         "{ scorer = 4, recorder = 2 }; without it, one process for the site, of acquisition one for each tray, but one "
-        "for all of kind redfish",
+        "for all of kinds redfish, prometheus, ipmi and snmp",
     )
     watchdog_s: float = Field(
         default=10.0,

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
+
+from fantwin.pipeline.sources.host_address import by_numbers, ranges_of
 
 
 @dataclass(frozen=True)
@@ -40,6 +43,43 @@ class Found:
             return ""
         lines = [f"# {line}" for line in (self.title, *self.notes, *self.missing)]
         return "\n".join(["[[tray]]", *lines, *(f"{key} = {as_toml(value)}" for key, value in self.tray.items()), ""])
+
+
+def alike(found: Sequence[Found], host_of: Callable[[Mapping[str, Any]], str]) -> Iterator[Found]:
+    """One tray with `hosts` for all that differ in nothing else; the others as they are.
+
+    host_of: host of a tray, which stands in its name, and in `url` and `labels` of its source.
+    """
+    groups: dict[str, list[Found]] = {}
+    for each in found:
+        if each.tray:
+            groups.setdefault(json.dumps(_template(each.tray, host_of(each.tray))), []).append(each)
+    taken: Counter[str] = Counter()
+    for template, group in groups.items():
+        if len(group) == 1:
+            yield group[0]
+            continue
+        hosts = sorted((host_of(each.tray) for each in group), key=by_numbers)
+        taken.update(hosts)
+        number = max(taken[host] for host in hosts)
+        name = {} if number == 1 else {"name": f"{{name}}-{number}"}
+        title = f"{len(group)} devices, {hosts[0]} to {hosts[-1]}"
+        notes = tuple(re.sub(r": .*", "", note) for note in group[0].notes)
+        tray = {"hosts": ranges_of(hosts), **name, **json.loads(template)}
+        yield Found(group[0].kind, title, tray, notes, group[0].missing)
+    yield from (each for each in found if not each.tray)
+
+
+def _template(tray: Mapping[str, Any], host: str) -> dict[str, Any]:
+    def placed(value: Any) -> Any:
+        return (
+            {key: placed(each) for key, each in value.items()}
+            if isinstance(value, dict)
+            else (value.replace(host, "{host}") if isinstance(value, str) else value)
+        )
+
+    source = {key: placed(each) if key in ("url", "labels") else each for key, each in tray["source"].items()}
+    return {key: value for key, value in tray.items() if key != "name"} | {"source": source}
 
 
 def free_name(wanted: str, names: set[str]) -> str:

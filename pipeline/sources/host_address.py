@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ipaddress
 import re
+from collections.abc import Iterable
 from urllib.parse import urlsplit
 
 MOST_HOSTS = 4096
@@ -52,3 +53,26 @@ def host_and_port(text: str, default_port: int) -> tuple[str, int]:
     if not parts.hostname or parts.port == 0 or parts.netloc != text or set(text) & set("@ "):
         raise ValueError("no address")
     return parts.hostname, parts.port or default_port
+
+
+def by_numbers(text: str) -> tuple[tuple[bool, int | str], ...]:
+    """What sorts names as people do: fan2 before fan10."""
+    return tuple((part.isdecimal(), int(part) if part.isdecimal() else part) for part in re.split(r"(\d+)", text))
+
+
+def ranges_of(hosts: Iterable[str]) -> list[str]:
+    """Hosts as ranges, which `hosts_of` takes apart again: those in a row that differ in one number, by 1."""
+    runs: list[tuple[list[str], list[str], int]] = []
+    for host in sorted(hosts, key=by_numbers):
+        parts = re.split(r"(\d+)", host)
+        first, last, place = runs[-1] if runs else ([], [], 0)
+        other = [at for at, pair in enumerate(zip(last, parts, strict=False)) if pair[0] != pair[1]]
+        at = other[0] if len(other) == 1 and len(last) == len(parts) else 0
+        if at % 2 and place in (0, at) and parts[at] == f"{int(last[at]) + 1:0{len(first[at])}}":
+            runs[-1] = first, parts, at
+        else:
+            runs.append((parts, parts, 0))
+    return [
+        "".join([*first[:at], f"[{first[at]}-{last[at]}]", *first[at + 1 :]] if at else first)
+        for first, last, at in runs
+    ]

@@ -144,12 +144,12 @@ def _discovered(chosen: Chosen, root: Path, folder: Path) -> Iterator[Found]:
         for url in chosen.prometheus:
             found += discover_metrics(url, chosen.password_file, folder)
     for each in found:
-        has_name = "name" in each.tray
-        yield replace(each, tray={**each.tray, "name": free_name(each.tray["name"], names)}) if has_name else each
+        is_one = each.tray and "hosts" not in each.tray
+        yield replace(each, tray={**each.tray, "name": free_name(each.tray["name"], names)}) if is_one else each
 
 
 def _called(found: Found) -> str:
-    return f"tray {found.tray['name']}" if "name" in found.tray else f"trays of {found.title}"
+    return f"trays of {found.title}" if "hosts" in found.tray else f"tray {found.tray['name']}"
 
 
 def _is_terminal() -> bool:

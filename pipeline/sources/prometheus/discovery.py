@@ -12,7 +12,8 @@ from typing import Any, NamedTuple
 from pydantic import ValidationError
 
 from fantwin.pipeline.errors import UserError
-from fantwin.pipeline.sources.found import Found
+from fantwin.pipeline.sources.found import Found, alike
+from fantwin.pipeline.sources.host_address import by_numbers
 from fantwin.pipeline.sources.named_values import HIGHEST_RPM
 from fantwin.pipeline.sources.prometheus.config import NAME, Labels, PrometheusConfig, labels_of
 from fantwin.pipeline.sources.prometheus.server import Samples, quoted, server_of
@@ -83,14 +84,15 @@ def discover_metrics(url: str, password_file: Path | None, folder: Path) -> list
     except UserError as error:
         raise UserError(f"{url}: {error}") from error
     series = [(labels, samples) for labels, samples in found if samples]
-    trays = [tray for metric in METRICS for tray in _trays(metric, series, config, asked)]
+    asked |= _period(samples for _, samples in series)
+    trays = [tray for metric in METRICS for tray in _trays(metric, series, config.host, asked)]
     if not trays:
         raise UserError(f"{url}: no fans: none of {', '.join(speeds)} in rpm; write source.fan by hand")
-    return trays
+    return list(alike(trays, lambda tray: _host(tray["source"]["labels"], config.host)))
 
 
 def _trays(
-    metric: Metric, series: Sequence[tuple[Labels, Samples]], config: PrometheusConfig, asked: Mapping[str, Any]
+    metric: Metric, series: Sequence[tuple[Labels, Samples]], server: str, asked: Mapping[str, Any]
 ) -> Iterator[Found]:
     """A tray of each device of one kind of exporter."""
     wanted = labels_of(metric.speed)
@@ -108,7 +110,8 @@ def _trays(
             commands.add((device, fan))
         elif labels[NAME] == _CALLED:
             called[device, fan] = labels.get("label", "")
-    for device, fans in devices.items():
+    for device, unsorted in devices.items():
+        fans = {fan: unsorted[fan] for fan in sorted(unsorted, key=by_numbers)}
         labels = dict(sorted(device))
         rows: list[dict[str, str]] = []
         missing: list[str] = []
@@ -119,26 +122,26 @@ def _trays(
                 rows[-1]["command"] = f"{metric.command}{{{by}={quoted(drive)}}}"
             else:
                 missing.append(fan)
-        instance = labels.get("instance", config.host)
         keys = {
-            "name": instance.rpartition(":")[0] or instance,
+            "name": _host(labels, server),
             "fans": _fans([called.get((device, fan), "") for fan in fans], list(fans)),
             "speed_unit": "rpm",
             "speed_max": HIGHEST_RPM,
             "command_max": metric.command_max,
-            "source": {
-                "kind": "prometheus",
-                **asked,
-                **_period(samples for _, samples in fans.values()),
-                "labels": labels,
-                "fan": rows,
-            },
+            "source": {"kind": "prometheus", **asked, "labels": labels, "fan": rows},
         }
         notes = [
             f"fan {number} is {fan}: {each[-1][1]:.0f} rpm" for number, (fan, (_, each)) in enumerate(fans.items())
         ]
         lacking = f"no command is known of {', '.join(missing)}: name its series by command of source.fan"
-        yield Found("prometheus", f"{wanted[NAME]} of {instance}", keys, tuple(notes), (lacking,) if missing else ())
+        yield Found(
+            "prometheus", f"{wanted[NAME]} of {keys['name']}", keys, tuple(notes), (lacking,) if missing else ()
+        )
+
+
+def _host(labels: Labels, server: str) -> str:
+    """The host of a device: the target without its port; of an exporter that is read itself, that."""
+    return re.sub(r":\d+$", "", labels.get("instance", server))
 
 
 def _fans(labels: Sequence[str], own: Sequence[str]) -> list[str] | int:

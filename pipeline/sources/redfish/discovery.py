@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -13,13 +12,13 @@ from typing import Any
 from pydantic import ValidationError
 
 from fantwin.pipeline.errors import UserError
-from fantwin.pipeline.sources.found import Found
+from fantwin.pipeline.sources.found import Found, alike
 from fantwin.pipeline.sources.host_address import hosts_of
+from fantwin.pipeline.sources.named_values import HIGHEST_RPM
 from fantwin.pipeline.sources.redfish.config import RedfishConfig
 from fantwin.pipeline.sources.redfish.source import RedfishSource
 from fantwin.pipeline.sources.source import SourceContext
 
-HIGHEST_RPM = 50_000
 AT_ONCE = 32
 """controllers that are asked at the same time"""
 
@@ -46,32 +45,11 @@ def discover_controllers(url: str, password_file: Path | None, folder: Path) -> 
             return Found("redfish", f"controller {each}", {}, missing=(str(error).removeprefix(f"{each}: "),))
 
     with ThreadPoolExecutor(AT_ONCE) as pool:
-        return list(_alike(url, list(pool.map(found, urls))))
-
-
-def _alike(url: str, found: Sequence[Found]) -> Iterator[Found]:
-    """One tray with hosts for all controllers whose trays differ in nothing else; and those that are none."""
-    groups: dict[str, list[Found]] = {}
-    for each in found:
-        if each.tray:
-            groups.setdefault(json.dumps(_template(each.tray)), []).append(each)
-    for template, group in groups.items():
-        hosts = [_host(each.tray) for each in group]
-        of_range = re.sub(r"^[a-z]+://(?:.*@)?|/.*$", "", url)
-        names = [of_range] if len(group) == len(found) else hosts
-        title = f"{len(group)} controllers, {hosts[0]} to {hosts[-1]}"
-        notes = tuple(re.sub(r": .*", "", note) for note in group[0].notes)
-        yield Found("redfish", title, {"hosts": names, **json.loads(template)}, notes, group[0].missing)
-    yield from (each for each in found if not each.tray)
+        return list(alike(list(pool.map(found, urls)), _host))
 
 
 def _host(tray: Mapping[str, Any]) -> str:
     return RedfishConfig.model_validate(tray["source"]).parts.netloc.rpartition("@")[2]
-
-
-def _template(tray: Mapping[str, Any]) -> dict[str, Any]:
-    source = {**tray["source"], "url": tray["source"]["url"].replace(_host(tray), "{host}")}
-    return {key: value for key, value in tray.items() if key != "name"} | {"source": source}
 
 
 def discover_controller(url: str, password_file: Path | None, folder: Path) -> Found:

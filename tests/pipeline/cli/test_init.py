@@ -142,7 +142,7 @@ def test_a_range_of_controllers_is_one_tray_with_hosts_and_one_that_does_not_ans
     ]
     assert file.read_text().count("[[tray]]") == 1
     assert f"left out: controller http://127.0.0.1:{gone}: does not answer within 5 s, or cannot" in done.stdout
-    assert f"trays of 2 controllers, 127.0.0.1:{ports[0]} to 127.0.0.1:{ports[1]}, fans 2" in done.stdout
+    assert f"trays of 2 devices, 127.0.0.1:{ports[0]} to 127.0.0.1:{ports[1]}, fans 2" in done.stdout
     assert error_of("init", "--redfish", "https://bmc[9-1]", "-c", "x.toml").startswith(
         "--redfish https://bmc[9-1]: a r"
     )

@@ -14,6 +14,8 @@ from typing import Any
 import pytest
 
 from fantwin.pipeline.config.loading import load_config
+from fantwin.pipeline.config.registry import STAGES
+from fantwin.pipeline.config.shards import process_list
 from fantwin.pipeline.sources.kinds import build_source
 from fantwin.pipeline.sources.polling import DeviceError
 from fantwin.pipeline.sources.prometheus import server
@@ -264,6 +266,53 @@ def test_init_writes_a_tray_of_each_device_with_its_fans_and_their_commands(
     assert none.startswith(f"{url}/metrics: no fans: none of node_hwmon_fan_rpm, ipmi_fan_speed_rpm, idrac_sensors")
     gone = error_of("init", "--prometheus", url, "-c", "new.toml")
     assert gone == f"{url}: does not answer within 5 s, or cannot be reached: check source.url; waiting for it"
+
+
+def hall(nodes: int) -> list[tuple[dict[str, str], list[tuple[float, str]]]]:
+    """Samples of nodes with two chips each, the second without commands."""
+    series: list[tuple[dict[str, str], list[tuple[float, str]]]] = []
+    for node in range(1, nodes + 1):
+        rest = {"instance": f"node{node:03}:9100", "job": "node"}
+        for chip, name, sensor in ((CHIP, "fan_rpm", "fan1"), (CHIP, "pwm", "pwm1"), ("drm_card0", "fan_rpm", "fan1")):
+            labels = {"__name__": f"node_hwmon_{name}", "chip": chip, "sensor": sensor, **rest}
+            series.append((labels, [(T0, f"{1000 + node}"), (T0 + 15.0, f"{1000 + node}")]))
+    return series
+
+
+def test_a_hall_is_a_tray_with_hosts_for_each_kind_of_device_and_one_query_for_all(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(server, "SHARED_FOR", 0.5)
+    metrics = Metrics()
+    metrics.series = hall(20)
+    with metrics_server(metrics) as url:
+        done = fantwin("init", "--prometheus", url)
+        assert done.exit_code == 0, done.output
+        text = Path("fantwin.toml").read_text()
+        assert text.count("[[tray]]") == 2 and text.count('hosts = ["node[001-020]"]') == 2
+        config = load_config(tmp_path / "fantwin.toml", stages=STAGES.keys() & {"acquisition"})
+        assert [tray.name for tray in config.trays][18:22] == ["node019", "node020", "node001-2", "node002-2"]
+        assert [len(row.shard.trays) for row in process_list(config) if row.stage == "acquisition"] == [40]
+        sources = [build_source(tray.source, SourceContext(1, "rpm", tmp_path)) for tray in config.trays]
+        metrics.queries.clear()
+        for tray, source in zip(config.trays, sources, strict=True):
+            assert isinstance(source, PrometheusSource)
+            source.connect()
+            ((_, speed, command),) = read(source)
+            node = 1000 + int(tray.name[4:7])
+            assert speed == (node,) and json.dumps(command) == ("[NaN]" if "-" in tray.name else f"[{node}.0]")
+        assert len(metrics.queries) == 1
+        metrics.queries.clear()
+        metrics.status = 503
+        monkeypatch.setattr(server, "SHARED_FOR", 1e-3)
+        with pytest.raises(DeviceError):
+            sources[0].read()  # type: ignore[attr-defined]
+        monkeypatch.setattr(server, "SHARED_FOR", 0.5)
+        for source in sources:
+            with pytest.raises(DeviceError, match="refused with HTTP status 503"):
+                source.read()  # type: ignore[attr-defined]
+        assert len(metrics.queries) == 1, "a server that is away is not asked by each tray"
 
 
 @pytest.fixture
