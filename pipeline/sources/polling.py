@@ -53,11 +53,6 @@ class PolledConfig(SourceConfig, frozen=True):
 
     period_s: float = Field(default=0.5, gt=0, le=SLOWEST_S, description="time between two readings")
 
-    @property
-    def longest_silence_s(self) -> float:
-        """Some readings may fail."""
-        return max(super().longest_silence_s, MOST_FAILURES * self.period_s)
-
 
 Polled: TypeAlias = Reading | Rejected | Sequence[ReadingBatch]
 

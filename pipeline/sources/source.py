@@ -54,12 +54,6 @@ class SourceConfig(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
         return ""
 
     @property
-    def longest_silence_s(self) -> float:
-        """Time without a valid sample after which something is wrong: twice the pause of the slowest line that can be
-        judged."""
-        return 2.0
-
-    @property
     def stated_tachos(self) -> tuple[Tacho, ...]:
         """Tachos of this source, one for all fans or one for each; empty if the kind of source does not determine them.
         `tacho` of the [[tray]] overrides them."""
