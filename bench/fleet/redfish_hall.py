@@ -9,7 +9,6 @@ The controllers are simulated in another process (`redfish_controllers.py`); acq
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
 import tempfile
@@ -24,6 +23,7 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
+from bench.fleet.halls import cpu_s, free_port, received, run_fantwin, samples_by_kind
 from bench.fleet.redfish_controllers import SHAPES, Hall, Plan
 from bench.printing import JsonOption, progress, show
 from bench.runtime.stage_memory import free_endpoint, memory_mb
@@ -36,7 +36,6 @@ from fantwin.schemas.codec import decode
 from fantwin.schemas.enums import Transition
 from fantwin.schemas.messages import Alarm
 from fantwin.schemas.topics import tray_key
-from fantwin.schemas.units import NS_PER_S
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
@@ -61,7 +60,7 @@ def main(
     json_output: JsonOption = False,
 ) -> None:
     """Print what acquisition takes, and by kind of controller which of the due samples came, and when."""
-    plan = Plan(_free_port(), controllers)
+    plan = Plan(free_port(), controllers)
     for number, kind in enumerate(_BAD * bad):
         getattr(plan, kind).append((7 + 11 * number) % controllers)
     plan.faulty = [(3 + 17 * number) % controllers for number in range(faulty)]
@@ -106,10 +105,10 @@ def _measured(
             process = next(
                 view.health.process_id for view in watcher.stages() if view.alive and view.health.stage == "acquisition"
             )
-            cpu_s = [_cpu_s(process), _cpu_s(server)]
+            before_s = [cpu_s(process), cpu_s(server)]
             progress(f"{len(seen)} controllers after {started_s:.0f} s; measuring for {seconds:g} s")
-            times_ns, delays_s = _received(arriving, seconds)
-            used_s = [_cpu_s(process) - cpu_s[0], _cpu_s(server) - cpu_s[1]]
+            times_ns, delays_s = received(arriving, seconds)
+            used_s = [cpu_s(process) - before_s[0], cpu_s(server) - before_s[1]]
             about = {
                 "controllers": plan.controllers,
                 "period, s": period_s,
@@ -155,31 +154,10 @@ def _twin(plan: Plan, folder: Path, period_s: float) -> Path:
         rows = [f"{t:g},{u:g},{y:g}" for t, (u, y) in ((t, hall.fan(fan + 1, 0, float(t))) for t in at_s)]
         (folder / f"{fan}.csv").write_text("\n".join(["t,u,y", *rows, ""]), encoding="ascii")
         table = f"import {folder}/{fan}.csv --time t:s --command u --speed y:rpm -o {folder}/{fan}.mcap"
-        _run(table)
-    _run(f"train {folder}/0.mcap --validate {folder}/1.mcap --model physical -o {twin}")
-    _run(f"calibrate {twin} {folder}/1.mcap {folder}/2.mcap --false-alarms-per-day 1 --extrapolate")
+        run_fantwin(table)
+    run_fantwin(f"train {folder}/0.mcap --validate {folder}/1.mcap --model physical -o {twin}")
+    run_fantwin(f"calibrate {twin} {folder}/1.mcap {folder}/2.mcap --false-alarms-per-day 1 --extrapolate")
     return twin
-
-
-def _run(words: str) -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", "fantwin", *words.split()], capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, done.stderr
-
-
-def _received(arriving: RawSamples, seconds: float) -> tuple[Mapping[str, list[int]], list[float]]:
-    """Times of the samples by tray, and how long after its reading each was received."""
-    times_ns: dict[str, list[int]] = defaultdict(list)
-    delays_s: list[float] = []
-    until_s = time.monotonic() + seconds
-    arriving.take()
-    while (left_s := until_s - time.monotonic()) > 0:
-        for raw in arriving.take(left_s):
-            now_ns = time.time_ns()
-            times_ns[raw.header.tray] += raw.host_receive_t_ns.tolist()
-            delays_s += [(now_ns - t_ns) / NS_PER_S for t_ns in raw.host_receive_t_ns.tolist()]
-    return times_ns, delays_s
 
 
 def _rows(plan: Plan, config: Config, times_ns: Mapping[str, list[int]], due: float) -> Iterator[dict[str, Any]]:
@@ -189,17 +167,7 @@ def _rows(plan: Plan, config: Config, times_ns: Mapping[str, list[int]], due: fl
     for tray in config.trays:
         number = names[tray.name]
         groups[bad.get(number, f"{ORDINARY}: {list(SHAPES)[number % len(SHAPES)]}")].append(tray.name)
-    for kind, trays in sorted(groups.items(), key=lambda each: not each[0].startswith(ORDINARY)):
-        shares = [len(times_ns[tray]) / due for tray in trays]
-        apart_s = np.concatenate([np.diff(sorted(times_ns[tray])) for tray in trays]) / NS_PER_S
-        yield {
-            "controllers": kind,
-            "number": len(trays),
-            "of the due samples, %": 100.0 * float(np.mean(shares)),
-            "least": 100.0 * min(shares),
-            "apart, s (99 %)": float(np.quantile(apart_s, 0.99)) if len(apart_s) else float("nan"),
-            "at most": float(apart_s.max()) if len(apart_s) else float("nan"),
-        }
+    yield from samples_by_kind(groups, times_ns, due, first=ORDINARY)
 
 
 def _configuration(plan: Plan, period_s: float, twin: Path | None) -> str:
@@ -242,15 +210,6 @@ def _certificate(plan: Plan, folder: Path) -> str:
     own.private_key_and_cert_chain_pem.write_to_path(str(path))
     authority.cert_pem.write_to_path(str(path), append=True)
     return str(path)
-
-
-def _free_port() -> int:
-    return int(free_endpoint().rpartition(":")[2])
-
-
-def _cpu_s(process: int) -> float:
-    words = Path(f"/proc/{process}/stat").read_text(encoding="ascii").rpartition(")")[2].split()
-    return sum(map(int, words[11:13])) / os.sysconf("SC_CLK_TCK")
 
 
 if __name__ == "__main__":
