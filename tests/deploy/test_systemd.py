@@ -31,6 +31,7 @@ name = "line"
 fans = 1
 port = "/dev/ttyACM7"
 """
+IPMI = '[[tray]]\nname = "host"\nfans = 1\nsource = { kind = "ipmi", fan = [{ speed = "FAN1" }] }\n'
 WATCHED = HWMON.replace("writable = true", "writable = false")
 
 
@@ -54,7 +55,9 @@ def analyze(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
     )
 
 
-@pytest.mark.parametrize("text", [HWMON, SERIAL, WATCHED, HWMON + SERIAL], ids=["hwmon", "serial", "watched", "both"])
+@pytest.mark.parametrize(
+    "text", [HWMON, SERIAL, WATCHED, HWMON + SERIAL + IPMI], ids=["hwmon", "serial", "watched", "all"]
+)
 @pytest.mark.parametrize("folder", ["/etc/fantwin", "/home/ann/the fans"])
 def test_systemd_accepts_the_units_which_may_do_little(text: str, folder: str, tmp_path: Path) -> None:
     made = service(text, Path(folder))
@@ -79,13 +82,16 @@ def test_only_what_a_source_needs_is_open() -> None:
         "hwmon": settings(service(HWMON)),
         "serial": settings(service(SERIAL)),
         "watched": settings(service(WATCHED)),
+        "ipmi": settings(service(IPMI)),
     }
     assert {name: each["ProtectKernelTunables"] for name, each in found.items()} == {
-        "hwmon": "no", "serial": "yes", "watched": "yes"
+        "hwmon": "no", "serial": "yes", "watched": "yes", "ipmi": "yes"
     }  # fmt: skip
     assert {name: each["PrivateDevices"] for name, each in found.items()} == {
-        "hwmon": "yes", "serial": "no", "watched": "yes"
+        "hwmon": "yes", "serial": "no", "watched": "yes", "ipmi": "no"
     }  # fmt: skip
+    assert found["ipmi"]["DeviceAllow"] == "char-ipmidev rw"
+    assert service(IPMI).files()[RULES] == 'SUBSYSTEM=="ipmi", GROUP="fantwin", MODE="0660"\n'
     assert found["serial"]["DeviceAllow"] == "char-ttyACM rw" and found["serial"]["SupplementaryGroups"] == "dialout"
     assert RULES not in service(SERIAL + WATCHED).files()
     rule = service(HWMON).files()[RULES]

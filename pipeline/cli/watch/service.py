@@ -119,7 +119,8 @@ def _install(config: Path, user: str | None, *, is_dry: bool, json_output: bool)
     folder = made.run_folder
     commands = [["systemd-sysusers", str(SYSTEM / USERS / "fantwin.conf")]]
     if RULES in files:
-        commands += [["udevadm", "control", "--reload"], ["udevadm", "trigger", "--subsystem-match=hwmon", "--settle"]]
+        subsystems = [f"--subsystem-match={name}" for name in ("hwmon", "ipmi")]
+        commands += [["udevadm", "control", "--reload"], ["udevadm", "trigger", *subsystems, "--settle"]]
     commands += [
         ["mkdir", "-p", str(folder)],
         ["chown", "-R", f"{made.user}:{made.group}", str(folder), *map(str, closed_files)],

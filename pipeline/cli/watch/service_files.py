@@ -19,6 +19,7 @@ from pydantic import BaseModel
 from fantwin.pipeline.config.settings import Config
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.sources.hwmon.config import ROOT, HwmonConfig
+from fantwin.pipeline.sources.ipmi.config import HERE, IpmiConfig
 from fantwin.pipeline.sources.modbus.config import ModbusConfig
 from fantwin.pipeline.sources.serial.config import SerialConfig
 
@@ -29,6 +30,9 @@ STATE_FOLDER = Path("/var/lib/fantwin")
 UNITS, RULES, USERS = Path("etc/systemd/system"), Path("etc/udev/rules.d/60-fantwin.rules"), Path("etc/sysusers.d")
 _HOMES = ("/home/", "/root/", "/run/user/")
 _USB_PORTS = ("ttyUSB", "ttyACM")
+_IPMI = "ipmidev"
+"""devices of the driver by which a controller of this host is read, as /proc/devices names them"""
+_IPMI_RULE = f'SUBSYSTEM=="ipmi", GROUP="{USER}", MODE="0660"\n'
 
 
 @dataclass(frozen=True)
@@ -44,7 +48,7 @@ class Service:
         user: who runs it.
         group: the primary group of that user.
         chips: names of the hwmon chips whose fans it commands.
-        ports: kinds of serial ports that it opens, such as ttyUSB; groups: those whose members may open them.
+        ports: kinds of devices that it opens, such as ttyUSB; groups: those whose members may open them.
         written: other folders that it writes.
     """
 
@@ -68,6 +72,8 @@ class Service:
         lines = [
             each.port for each in sources if isinstance(each, SerialConfig | ModbusConfig) and _is_device(each.port)
         ]
+        ports = [kind for port in lines for kind in _kinds(port)]
+        ports += [_IPMI for each in sources if isinstance(each, IpmiConfig) and each.url == HERE]
         group = grp.getgrgid(pwd.getpwnam(user).pw_gid).gr_name if user != USER else USER
         return cls(
             config=config.path.resolve(),
@@ -78,7 +84,7 @@ class Service:
             user=user,
             group=group,
             chips=tuple(dict.fromkeys(each.chip_name for each in commanded if each.root == ROOT)),
-            ports=tuple(dict.fromkeys(kind for port in lines for kind in _kinds(port))),
+            ports=tuple(dict.fromkeys(ports)),
             groups=tuple(dict.fromkeys(map(_group_of, lines))),
             written=tuple(dict.fromkeys(each.root for each in commanded if each.root != ROOT)),
         )
@@ -88,9 +94,8 @@ class Service:
         command = [*self.program, "up", "-c", str(self.config)]
         found = {UNITS / UNIT: self._unit("the fans of a site, and the operators' page", command, is_notifying=True)}
         found[USERS / "fantwin.conf"] = "".join(self._sysusers())
-        if self.chips:
-            found[RULES] = "".join(map(_rule, self.chips))
-        return found
+        rules = [*map(_rule, self.chips), *([_IPMI_RULE] if _IPMI in self.ports else [])]
+        return found | ({RULES: "".join(rules)} if rules else {})
 
     def router(self, listen: str = "tls/0.0.0.0:7447") -> dict[Path, str]:
         """The unit of the router at which several hosts meet."""
@@ -132,7 +137,8 @@ class Service:
             yield from (f"DeviceAllow=char-{kind} rw" for kind in self.ports)
         else:
             yield "PrivateDevices=yes"
-        groups = [*self.groups, *([USER] if self.chips and self.group != USER else [])]
+        has_rules = self.chips or _IPMI in self.ports
+        groups = [*self.groups, *([USER] if has_rules and self.group != USER else [])]
         if groups:
             yield f"SupplementaryGroups={' '.join(groups)}"
         if self.chips:
