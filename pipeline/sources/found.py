@@ -6,10 +6,15 @@ import json
 import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
-from fantwin.pipeline.sources.host_address import by_numbers, ranges_of
+from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.sources.host_address import by_numbers, hosts_of, ranges_of
+
+AT_ONCE = 32
+"""devices that are asked at the same time"""
 
 
 @dataclass(frozen=True)
@@ -43,6 +48,33 @@ class Found:
             return ""
         lines = [f"# {line}" for line in (self.title, *self.notes, *self.missing)]
         return "\n".join(["[[tray]]", *lines, *(f"{key} = {as_toml(value)}" for key, value in self.tray.items()), ""])
+
+
+def found_at(
+    option: str, url: str, discover: Callable[[str], Found], host_of: Callable[[Mapping[str, Any]], str]
+) -> list[Found]:
+    """The device at a URL, or those of a range: one tray for all that are alike. host_of: see `alike`.
+
+    Of a range, a device that cannot be asked is one that can be no tray.
+
+    Raises:
+        UserError: the address or the range is none, or its only device cannot be asked, or has no fans.
+    """
+    try:
+        urls = hosts_of(url)
+    except ValueError as error:
+        raise UserError(f"{option} {error}") from error
+    if urls == [url]:
+        return [discover(url)]
+
+    def found(each: str) -> Found:
+        try:
+            return discover(each)
+        except UserError as error:
+            return Found("", each, {}, missing=(str(error).removeprefix(f"{each}: "),))
+
+    with ThreadPoolExecutor(AT_ONCE) as pool:
+        return list(alike(list(pool.map(found, urls)), host_of))
 
 
 def alike(found: Sequence[Found], host_of: Callable[[Mapping[str, Any]], str]) -> Iterator[Found]:

@@ -81,12 +81,15 @@ class LogIn(BaseModel, frozen=True):
         Raises:
             UserError: it cannot be read.
         """
-        if not self.password_file:
-            return None
-        path = folder / self.password_file
-        if path.is_dir():
-            path = path / (self.host if (path / self.host).exists() else "default")
-        return read_secret(path)
+        path = self.password_path(folder)
+        return read_secret(path) if path else None
+
+    def password_path(self, folder: Path) -> Path | None:
+        """The file with the password; None: there is none."""
+        path = folder / self.password_file if self.password_file else None
+        if path and path.is_dir():
+            return path / (self.host if (path / self.host).exists() else "default")
+        return path
 
 
 def read_secret(path: Path) -> str:

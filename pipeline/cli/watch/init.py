@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -20,10 +20,13 @@ from fantwin.pipeline.launch.this_host import load_for_any_host
 from fantwin.pipeline.sources.found import Found, free_name
 from fantwin.pipeline.sources.hwmon.config import ROOT
 from fantwin.pipeline.sources.hwmon.discovery import discover_hwmon
+from fantwin.pipeline.sources.ipmi.discovery import discover_ipmi
 from fantwin.pipeline.sources.logs.discovery import discover_logs
 from fantwin.pipeline.sources.prometheus.discovery import discover_metrics
 from fantwin.pipeline.sources.redfish.discovery import discover_controllers
 from fantwin.pipeline.sources.serial.discovery import discover_device, serial_ports
+
+_BY_URL = {"redfish": discover_controllers, "ipmi": discover_ipmi, "prometheus": discover_metrics}
 
 
 @dataclass(frozen=True)
@@ -34,8 +37,7 @@ class Chosen:
         hwmon: the fans of this computer.
         writable: fantwin may command them.
         serial: ports.
-        redfish: addresses of controllers.
-        prometheus: addresses of Prometheus servers or exporters.
+        urls: addresses of controllers and servers, by kind of source.
         password_file: of the user in these addresses.
         logs: a folder of logs or tables; None: none.
     """
@@ -43,8 +45,7 @@ class Chosen:
     hwmon: bool = False
     writable: bool = False
     serial: tuple[str, ...] = ()
-    redfish: tuple[str, ...] = ()
-    prometheus: tuple[str, ...] = ()
+    urls: Mapping[str, Sequence[str]] = field(default_factory=dict[str, Sequence[str]])
     password_file: Path | None = None
     logs: Path | None = None
 
@@ -74,6 +75,10 @@ def init(
         list[str] | None,
         typer.Option(metavar="URL", help="Watch the fans in a Prometheus, or of an exporter: URL/metrics. Repeatable."),
     ] = None,
+    ipmi: Annotated[
+        list[str] | None,
+        typer.Option(metavar="URL", help="The same by IPMI: ipmi://USER@HOST, ipmi://localhost. Repeatable."),
+    ] = None,
     password_file: Annotated[
         Path | None,
         typer.Option(
@@ -100,13 +105,14 @@ def init(
     Example: fantwin init --redfish "https://ann@bmc[001-400].hall" --password-file bmc.secret
     """
     root = root.absolute() if root != ROOT else root
-    addresses = tuple(redfish or ()), tuple(prometheus or ())
-    chosen = Chosen(hwmon or writable, writable, tuple(serial or ()), *addresses, password_file, logs)
-    if chosen.password_file and not any(addresses):
-        raise UsageError("--password-file is for --redfish and --prometheus: name an address")
+    urls = {"redfish": redfish, "ipmi": ipmi, "prometheus": prometheus}
+    given = {kind: each for kind, each in urls.items() if each}
+    chosen = Chosen(hwmon or writable, writable, tuple(serial or ()), given, password_file, logs)
+    if chosen.password_file and not given:
+        raise UsageError(f"--password-file is for {', '.join(f'--{kind}' for kind in urls)}: name an address")
     if chosen == Chosen():
         if json_output or not _is_terminal():
-            options = "--hwmon, --serial PORT, --redfish URL, --prometheus URL or --logs FOLDER"
+            options = "--hwmon, --serial PORT, --redfish URL, --ipmi URL, --prometheus URL or --logs FOLDER"
             raise UsageError(f"say what to watch: {options}; {_seen(root)}")
         chosen = _asked(root)
     found_logs = discover_logs(chosen.logs) if chosen.logs else []
@@ -139,10 +145,9 @@ def _discovered(chosen: Chosen, root: Path, folder: Path) -> Iterator[Found]:
     with working("reading the devices"):
         found = [*discover_hwmon(root, writable=chosen.writable)] if chosen.hwmon else []
         found += [discover_device(port) for port in chosen.serial]
-        for url in chosen.redfish:
-            found += discover_controllers(url, chosen.password_file, folder)
-        for url in chosen.prometheus:
-            found += discover_metrics(url, chosen.password_file, folder)
+        for kind, urls in chosen.urls.items():
+            for url in urls:
+                found += _BY_URL[kind](url, chosen.password_file, folder)
     for each in found:
         is_one = each.tray and "hosts" not in each.tray
         yield replace(each, tray={**each.tray, "name": free_name(each.tray["name"], names)}) if is_one else each
@@ -189,8 +194,7 @@ def _asked(root: Path) -> Chosen:
         hwmon,
         writable,
         tuple(serial),
-        (url,) if url else (),
-        (),
+        {"redfish": (url,)} if url else {},
         Path(password) if password else None,
         Path(logs) if logs else None,
     )

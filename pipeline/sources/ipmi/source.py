@@ -105,9 +105,8 @@ class IpmiSource(NamedValuesSource):
         config = self._config
         line = [PROGRAM, "-I", "open"]
         if config.url != HERE:
-            assert config.password_file
             line = [PROGRAM, "-I", "lanplus", "-H", config.host, "-p", str(config.port), "-U", config.username]
-            line += ["-N", "1", "-R", "2", "-f", str(self._folder / config.password_file), "-L", "USER"]
+            line += ["-N", "1", "-R", "2", "-f", str(config.password_path(self._folder)), "-L", "USER"]
             line += ["-C", str(config.cipher)] if config.cipher is not None else []
         line += ["-S", str(self._descriptions)] if self._descriptions.exists() else []
         try:

@@ -5,47 +5,22 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 from pydantic import ValidationError
 
 from fantwin.pipeline.errors import UserError
-from fantwin.pipeline.sources.found import Found, alike
-from fantwin.pipeline.sources.host_address import hosts_of
+from fantwin.pipeline.sources.found import Found, found_at
 from fantwin.pipeline.sources.named_values import HIGHEST_RPM
 from fantwin.pipeline.sources.redfish.config import RedfishConfig
 from fantwin.pipeline.sources.redfish.source import RedfishSource
 from fantwin.pipeline.sources.source import SourceContext
 
-AT_ONCE = 32
-"""controllers that are asked at the same time"""
-
 
 def discover_controllers(url: str, password_file: Path | None, folder: Path) -> list[Found]:
-    """The [[tray]] of a controller, or of those of a range: one for all that have the same fans.
-
-    Of a range, a controller that cannot be asked is one that can be no tray.
-
-    Raises:
-        UserError: the address or the range is none, or its only controller cannot be asked, or has no fans.
-    """
-    try:
-        urls = hosts_of(url)
-    except ValueError as error:
-        raise UserError(f"--redfish {error}") from error
-    if urls == [url]:
-        return [discover_controller(url, password_file, folder)]
-
-    def found(each: str) -> Found:
-        try:
-            return discover_controller(each, password_file, folder)
-        except UserError as error:
-            return Found("redfish", f"controller {each}", {}, missing=(str(error).removeprefix(f"{each}: "),))
-
-    with ThreadPoolExecutor(AT_ONCE) as pool:
-        return list(alike(list(pool.map(found, urls)), _host))
+    """The [[tray]] of a controller, or of those of a range; see `found_at`."""
+    return found_at("--redfish", url, lambda each: discover_controller(each, password_file, folder), _host)
 
 
 def _host(tray: Mapping[str, Any]) -> str:

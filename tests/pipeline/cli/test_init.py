@@ -141,7 +141,7 @@ def test_a_range_of_controllers_is_one_tray_with_hosts_and_one_that_does_not_ans
         f"http://127.0.0.1:{port}" for port in ports
     ]
     assert file.read_text().count("[[tray]]") == 1
-    assert f"left out: controller http://127.0.0.1:{gone}: does not answer within 5 s, or cannot" in done.stdout
+    assert f"left out: http://127.0.0.1:{gone}: does not answer within 5 s, or cannot" in done.stdout
     assert f"trays of 2 devices, 127.0.0.1:{ports[0]} to 127.0.0.1:{ports[1]}, fans 2" in done.stdout
     assert error_of("init", "--redfish", "https://bmc[9-1]", "-c", "x.toml").startswith(
         "--redfish https://bmc[9-1]: a r"
@@ -167,7 +167,7 @@ def test_on_a_terminal_it_asks_and_elsewhere_it_says_what_it_takes_and_what_is_t
     port = ListPortInfo("/dev/ttyUSB9")
     port.description, port.hwid = "FT232R USB UART", "USB VID:PID=0403:6001"
     monkeypatch.setattr(list_ports, "comports", lambda: [port, ListPortInfo("/dev/ttyS9")])
-    options = "say what to watch: --hwmon, --serial PORT, --redfish URL, --prometheus URL or --logs FOLDER"
+    options = "say what to watch: --hwmon, --serial PORT, --redfish URL, --ipmi URL, --prometheus URL or --logs FOLDER"
     there = "nct6798 (hwmon2, 1-002f), thinkpad (hwmon8, thinkpad_hwmon), /dev/ttyUSB9"
     assert usage_error_of("init", "--root", root) == f"{options}; here: {there}"
     monkeypatch.setattr(module, "_is_terminal", lambda: True)

@@ -10,13 +10,16 @@ from typing import Any
 
 import pytest
 
+from fantwin.pipeline.config.loading import load_config
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.sources.ipmi import source as module
 from fantwin.pipeline.sources.ipmi.config import IpmiConfig
 from fantwin.pipeline.sources.ipmi.source import IpmiSource
+from fantwin.pipeline.sources.kinds import build_source
 from fantwin.pipeline.sources.polling import DeviceError
 from fantwin.pipeline.sources.source import Reading, SourceContext
 from fantwin.schemas.channels import TEMPERATURE
+from tests.support.fantwin_command import error_of, fantwin
 
 SUPERMICRO = """\
 FAN1             | 41h | ok  | 29.1 | 3400 RPM
@@ -141,6 +144,33 @@ def test_what_keeps_ipmitool_from_reading_says_what_to_do(made: Made, monkeypatc
         source.connect()
     monkeypatch.setattr(module, "PROGRAM", "no-such-ipmitool")
     assert source.check() == ["source ipmi needs the program ipmitool: install the package ipmitool of the system"]
+
+
+def test_init_writes_a_tray_of_the_fans_in_rpm_and_names_what_may_be_their_command(
+    made: Made, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "secret").write_text("correct-horse\n")
+    (tmp_path / "secret").chmod(0o600)
+    made(SUPERMICRO + OPENBMC, ["FAN1"])
+    done = fantwin("init", "--ipmi", "ipmi://ann@bmc[8-11]", "--password-file", "secret")
+    assert done.exit_code == 0, done.output
+    assert "name a sensor in per cent by command of source.fan (FAN0_PWM)" in done.stdout
+    text = Path("fantwin.toml").read_text()
+    assert text.count("[[tray]]") == 1 and 'hosts = ["bmc[8-11]"]' in text
+    trays = load_config(tmp_path / "fantwin.toml", stages=()).trays
+    assert [tray.name for tray in trays] == ["bmc8", "bmc9", "bmc10", "bmc11"]
+    assert trays[3].names.names == ("FAN1", "FAN2", "FANA", "FAN0_TACH")
+    source = build_source(trays[3].source, SourceContext(4, "rpm", tmp_path))
+    assert isinstance(source, IpmiSource) and reading(source).speed == (3400.0, 0.0, 3500.0, 7154.0)
+    made(REPEATED, ["01h"])
+    assert fantwin("init", "--ipmi", "ipmi://localhost", "-c", "own.toml").exit_code == 0
+    (own,) = load_config(tmp_path / "own.toml", stages=()).trays
+    assert (own.fans, [fan.speed.name for fan in own.source.fan]) == (2, ["01h", "02h"])  # type: ignore[attr-defined]
+    made(HPE, ["Fan 1"])
+    none = "no fans in rpm; its sensors of fans: Fan 1 (percent), Fan 2 (no number), Fans (no number)"
+    assert error_of("init", "--ipmi", "ipmi://localhost", "-c", "x.toml") == f"ipmi://localhost: {none}"
+    assert "needs a user in url" in error_of("init", "--ipmi", "ipmi://bmc7", "-c", "x.toml")
 
 
 def test_a_controller_in_the_network_needs_a_user_and_a_password() -> None:
