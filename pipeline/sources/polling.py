@@ -225,7 +225,7 @@ class PollingSource(ABC):
         with self._wake:
             self._is_connected = True
         self._deliver(LinkUp())
-        due_s = time.monotonic()
+        due_s = self._began_s()
         self._deliver_reading(first)
         failures = 0
         while True:
@@ -243,6 +243,10 @@ class PollingSource(ABC):
             else:
                 failures = 0
                 self._deliver_reading(reading)
+
+    def _began_s(self) -> float:
+        """The time from which polls are due each period, not later than now."""
+        return time.monotonic()
 
     def _next_due_s(self, due_s: float) -> float:
         """Time of the poll after the one at due_s. Polls whose time is over are left out, and counted."""
