@@ -24,11 +24,10 @@ class SnmpConfig(NamedFansConfig, frozen=True):
     user: str = Field(default="", max_length=32, description="version 3: the user")
     password_file: Path | None = Field(default=None, description="version 3: authentication password")
     privacy_file: Path | None = Field(default=None, description="version 3: privacy password")
-    authentication: Literal["MD5", "SHA", "SHA-224", "SHA-256", "SHA-384", "SHA-512"] = Field(
-        default="SHA", description="version 3: of password_file"
-    )
-    privacy: Literal["DES", "AES", "AES-192", "AES-256"] = Field(
-        default="AES", description="version 3: of privacy_file"
+    protocols: str = Field(
+        default="SHA AES",
+        pattern=r"^(MD5|SHA|SHA-224|SHA-256|SHA-384|SHA-512)( (DES|AES|AES-192|AES-256))?$",
+        description="version 3: of password_file and privacy_file, from MD5 DES to SHA-512 AES-256",
     )
     period_s: float = Field(default=1.0, gt=0, le=60, description="time between two readings")
 

@@ -111,12 +111,13 @@ class SnmpSource(NamedValuesSource):
         if config.community_file:
             return snmp.CommunityData(self._secret(config.community_file), mpModel=1)
         privacy = self._secret(config.privacy_file)
+        authentication, _, encryption = config.protocols.partition(" ")
         return snmp.UsmUserData(
             config.user,
             authKey=self._secret(config.password_file),
             privKey=privacy,
-            authProtocol=getattr(snmp, _AUTHENTICATION[config.authentication]),
-            privProtocol=getattr(snmp, _PRIVACY[config.privacy]) if privacy else snmp.usmNoPrivProtocol,
+            authProtocol=getattr(snmp, _AUTHENTICATION[authentication]),
+            privProtocol=getattr(snmp, _PRIVACY[encryption or "AES"]) if privacy else snmp.usmNoPrivProtocol,
         )
 
     def _asked(self, oids: Sequence[str]) -> dict[str, float]:
