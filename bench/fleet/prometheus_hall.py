@@ -11,11 +11,13 @@ acquisition runs as `fantwin up` starts it.
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 import tempfile
 import time
 import tomllib
+import urllib.request
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -86,8 +88,8 @@ def _measured(plan: Plan, folder: Path, period_s: float, seconds: float) -> tupl
                 )
                 (folder / "bad").touch()
                 time.sleep(4.0 * period_s)  # until Prometheus has left out what is dead
-                before_s = [cpu_s(process), cpu_s(prometheus.pid)]
-                progress(f"measuring for {seconds:g} s")
+                before_s, queries = [cpu_s(process), cpu_s(prometheus.pid)], _queries(url)
+                progress(f"{queries:g} queries so far; measuring for {seconds:g} s")
                 times_ns, delays_s = received(arriving, seconds)
                 used_s = [cpu_s(process) - before_s[0], cpu_s(prometheus.pid) - before_s[1]]
                 about = {
@@ -97,6 +99,7 @@ def _measured(plan: Plan, folder: Path, period_s: float, seconds: float) -> tupl
                     "init, s": init_s,
                     "processes": 1,
                     "threads": len(list(Path(f"/proc/{process}/task").iterdir())),
+                    "queries a period": (_queries(url) - queries) * period_s / seconds,
                     "core, %": 100.0 * used_s[0] / seconds,
                     "us a node and scrape": 1e6 * used_s[0] / (plan.controllers * seconds / period_s),
                     "RSS, MB": memory_mb(process)[1],
@@ -152,6 +155,13 @@ def _configuration(plan: Plan, folder: Path, url: str) -> tuple[Path, dict[str, 
     ]
     path.write_text("\n".join([head, *lines, ""]), encoding="utf-8")
     return path, {"[[tray]]": len(trays), "fans found": plan.controllers * FANS}, took_s
+
+
+def _queries(url: str) -> float:
+    """How often this Prometheus was asked so far."""
+    with urllib.request.urlopen(f"{url}/metrics") as answer:
+        found = re.findall(r'^prometheus_http_requests_total{.*/api/v1/query".*} (\S+)', answer.read().decode(), re.M)
+    return sum(map(float, found))
 
 
 def _exporters(plan: Plan, folder: Path) -> list[str]:

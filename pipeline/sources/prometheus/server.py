@@ -36,8 +36,6 @@ LARGEST_ANSWER = 64 << 20
 """bytes"""
 LONGEST_BACK_S = 3600.0
 """time before now of which samples are asked for, after Prometheus was away"""
-SHARED_FOR = 0.5
-"""share of a period in which an answer is given again to others"""
 
 Samples: TypeAlias = Sequence[tuple[int, float]]
 """times, ns since 1970, and values, by rising time"""
@@ -47,8 +45,13 @@ Answer: TypeAlias = Mapping[Series, Sequence[Samples]]
 """what was found for each: none, one, or several where the labels do not tell them apart"""
 
 
+def period_number(period_s: float) -> int:
+    """Which period it is, counted by the monotonic clock."""
+    return math.floor(time.monotonic() / period_s)
+
+
 class Server:
-    """Requests to one server. Trays of several threads share it: who asks soon after gets the same answer."""
+    """Requests to one server. Trays of several threads share it: it is asked once in each period."""
 
     def __init__(self, config: PrometheusConfig, folder: Path) -> None:
         """folder: relative paths start here."""
@@ -59,7 +62,7 @@ class Server:
         self._lock = threading.Lock()
         self._wanted: dict[tuple[str, ...], dict[Series, None]] = {}
         """by the names of their labels"""
-        self._asked_s, self._answered_s = -math.inf, time.monotonic()
+        self._asked_in, self._answered_s = -1, time.monotonic()
         self._outcome: Answer | UserError = {}
 
     def connect(self) -> None:
@@ -84,14 +87,15 @@ class Server:
         with self._lock:
             for each in series:
                 self._wanted.setdefault(tuple(name for name, _ in each), {})[each] = None
-            self._asked_s = -math.inf
+            self._asked_in = -1
 
     def answer(self) -> Answer:
         """The newest samples of all that is wanted. Raises UserError."""
         with self._lock:
-            now_s = time.monotonic()
-            if now_s - self._asked_s > SHARED_FOR * self._config.period_s:
-                self._asked_s = now_s
+            number = period_number(self._config.period_s)
+            if number != self._asked_in:
+                self._asked_in = number
+                now_s = time.monotonic()
                 try:
                     self._outcome = self._asked_for_all(now_s)
                     self._answered_s = now_s

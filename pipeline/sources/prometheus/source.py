@@ -9,7 +9,6 @@ shows has the time of the request, unless the exporter gives one.
 from __future__ import annotations
 
 import math
-import time
 from bisect import bisect_right
 from collections.abc import Iterator, Sequence
 
@@ -17,11 +16,13 @@ from fantwin.pipeline.errors import refusals
 from fantwin.pipeline.sources.named_values import SPEED, NamedValuesSource
 from fantwin.pipeline.sources.polling import MOST_FAILURES, DeviceError
 from fantwin.pipeline.sources.prometheus.config import PrometheusConfig, labels_of
-from fantwin.pipeline.sources.prometheus.server import Samples, Series, server_of
+from fantwin.pipeline.sources.prometheus.server import Samples, Series, period_number, server_of
 from fantwin.pipeline.sources.source import Noted, ReadingBatch, Rejected, SourceContext
 from fantwin.pipeline.timebase.host_clock import HOST_CLOCK
 from fantwin.schemas.units import NS_PER_S
 
+LATER = 0.01
+"""part of a period after its begin at which a poll is due"""
 LATE = Rejected(
     "late_sample",
     "a speed comes after those of other fans that were measured later: make a tray of the fans of each target",
@@ -88,9 +89,9 @@ class PrometheusSource(NamedValuesSource):
         return refusals(self._server.connect)
 
     def _began_s(self) -> float:
-        """A multiple of the period, so that all trays get one answer while it is new."""
-        now_s = time.monotonic()
-        return now_s - now_s % self._config.period_s
+        """The begin of a period, a little later: all trays get one answer while it is new."""
+        period_s = self._config.period_s
+        return (period_number(period_s) + LATER) * period_s
 
     def _found(self) -> dict[str, Samples]:
         """The samples of each series. Raises DeviceError: two series for one."""

@@ -8,6 +8,7 @@ import shutil
 import subprocess
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -61,7 +62,8 @@ def fan(number: int) -> dict[str, str]:
 @pytest.fixture(autouse=True)
 def nothing_is_shared(monkeypatch: pytest.MonkeyPatch) -> None:
     """An answer is not kept for those who ask soon after."""
-    monkeypatch.setattr(server, "SHARED_FOR", 0.0)
+    numbers = count()
+    monkeypatch.setattr(server, "period_number", lambda _period_s: next(numbers))
 
 
 @contextmanager
@@ -283,7 +285,7 @@ def test_a_hall_is_a_tray_with_hosts_for_each_kind_of_device_and_one_query_for_a
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(server, "SHARED_FOR", 0.5)
+    monkeypatch.setattr(server, "period_number", lambda _period_s: 1)
     metrics = Metrics()
     metrics.series = hall(20)
     with metrics_server(metrics) as url:
@@ -305,10 +307,7 @@ def test_a_hall_is_a_tray_with_hosts_for_each_kind_of_device_and_one_query_for_a
         assert len(metrics.queries) == 1
         metrics.queries.clear()
         metrics.status = 503
-        monkeypatch.setattr(server, "SHARED_FOR", 1e-3)
-        with pytest.raises(DeviceError):
-            sources[0].read()  # type: ignore[attr-defined]
-        monkeypatch.setattr(server, "SHARED_FOR", 0.5)
+        monkeypatch.setattr(server, "period_number", lambda _period_s: 2)
         for source in sources:
             with pytest.raises(DeviceError, match="refused with HTTP status 503"):
                 source.read()  # type: ignore[attr-defined]
