@@ -10,6 +10,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from pydantic import Field, model_validator
 
 from fantwin.pipeline.sources.named_values import NamedFansConfig
+from fantwin.pipeline.sources.polling import SLOWEST_S
 from fantwin.pipeline.sources.secret_file import LogIn
 
 NAME = "__name__"
@@ -32,7 +33,9 @@ class PrometheusConfig(NamedFansConfig, LogIn, frozen=True):
     )
     token_file: Path | None = Field(default=None, description="file with a bearer token, instead of a user")
     ca: Path | None = Field(default=None, description="certificate of the authority that signed the server's")
-    period_s: float = Field(default=15.0, gt=0, le=300, description="time between two requests: the scrape interval")
+    period_s: float = Field(
+        default=15.0, gt=0, le=SLOWEST_S, description="time between two requests: the scrape interval"
+    )
     labels: dict[str, str] = Field(default={}, description="labels of all its series")
 
     @model_validator(mode="after")

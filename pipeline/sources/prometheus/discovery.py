@@ -15,6 +15,7 @@ from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.sources.found import Found, alike
 from fantwin.pipeline.sources.host_address import by_numbers
 from fantwin.pipeline.sources.named_values import HIGHEST_RPM
+from fantwin.pipeline.sources.polling import SLOWEST_S
 from fantwin.pipeline.sources.prometheus.config import NAME, Labels, PrometheusConfig, labels_of
 from fantwin.pipeline.sources.prometheus.server import Samples, quoted, server_of
 from fantwin.schemas.fan_names import is_fan_name
@@ -154,4 +155,8 @@ def _fans(labels: Sequence[str], own: Sequence[str]) -> list[str] | int:
 def _period(scraped: Iterable[Samples]) -> dict[str, float]:
     """The scrape interval, where it shows."""
     spacings_ns = [later - t_ns for samples in scraped for (t_ns, _), (later, _) in pairwise(samples)]
-    return {"period_s": max(round(statistics.median(spacings_ns) / NS_PER_S, 1), 0.1)} if spacings_ns else {}
+    return (
+        {"period_s": min(max(round(statistics.median(spacings_ns) / NS_PER_S, 1), 0.1), SLOWEST_S)}
+        if spacings_ns
+        else {}
+    )

@@ -43,7 +43,7 @@ def take(made: AcquisitionCore, after_s: float, command: float) -> int:
 def test_silence_is_measured_by_the_period_of_the_source() -> None:
     made = core()
     assert take(made, 1, 50.0) == 1
-    made.tick(START_NS + 40 * NS_PER_S)
+    made.tick(START_NS + 38 * NS_PER_S)
     assert made.problem() == ""
-    made.tick(START_NS + 47 * NS_PER_S)
-    assert "nothing received for 45 s" in made.problem()
+    made.tick(START_NS + 39 * NS_PER_S)
+    assert "nothing received for 37.5 s" in made.problem()
