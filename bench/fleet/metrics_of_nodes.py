@@ -8,6 +8,7 @@ Five exporters in turn, with the names that they really use. From a time on some
 from __future__ import annotations
 
 import json
+import math
 import sys
 import time
 from collections.abc import Callable
@@ -23,12 +24,12 @@ SILENT_S = 60.0
 
 
 class Exporter(NamedTuple):
-    """Lines of a page: of the speed and of the command of a fan. command, command_max: what `init` does not find."""
+    """Lines of a page: of the speed and of the command of a fan, in per cent times `scale`. command: its series where
+    `init` cannot know it."""
 
     speed: str
     value: str
     command: str = ""
-    command_max: float = 100.0
     scale: float = 1.0
 
 
@@ -36,14 +37,12 @@ EXPORTERS = {
     "node_exporter": Exporter(
         'node_hwmon_fan_rpm{{chip="platform_nct6775_656",sensor="fan{0}"}}',
         'node_hwmon_pwm{{chip="platform_nct6775_656",sensor="pwm{0}"}}',
-        command_max=255.0,
         scale=2.55,
     ),
     "ipmi_exporter": Exporter(
         'ipmi_fan_speed_rpm{{id="{0}",name="FAN{0}_TACH"}}',
         'ipmi_fan_speed_ratio{{id="1{0}",name="FAN{0}_PWM"}}',
         'ipmi_fan_speed_ratio{{name="FAN{0}_PWM"}}',
-        command_max=1.0,
         scale=0.01,
     ),
     "idrac_exporter": Exporter(
@@ -78,7 +77,7 @@ def page(hall: Hall, number: int, *, is_bad: Callable[[str], bool]) -> str:
 
 
 def serve(plan: Plan, bad_from: Path) -> None:
-    """Serve all nodes, `/metrics?node=7`. bad_from: the bad ones are bad once this file exists."""
+    """Serve all nodes, `/metrics?node=7`. bad_from: the bad and faulty ones are so once this file exists."""
     hall = Hall(plan)
 
     class Handler(BaseHTTPRequestHandler):
@@ -86,6 +85,7 @@ def serve(plan: Plan, bad_from: Path) -> None:
 
         def do_GET(self) -> None:
             number = int(self.path.rpartition("=")[2])
+            plan.fault_at = 0.0 if bad_from.exists() else math.inf
 
             def is_bad(kind: str) -> bool:
                 return number in getattr(plan, kind) and bad_from.exists()

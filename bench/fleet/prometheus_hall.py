@@ -28,7 +28,7 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from bench.fleet.halls import cpu_s, free_port, received, run_fantwin, samples_by_kind
+from bench.fleet.halls import cpu_s, free_port, received, run_fantwin, samples_by_kind, twin_of_hall
 from bench.fleet.metrics_of_nodes import BAD, EXPORTERS
 from bench.fleet.redfish_controllers import FANS, Plan
 from bench.printing import JsonOption, progress, show
@@ -38,6 +38,11 @@ from fantwin.pipeline.bus.session import join_bus
 from fantwin.pipeline.config.loading import load_config
 from fantwin.pipeline.site.site_watcher import SiteWatcher
 from fantwin.pipeline.sources.found import as_toml
+from fantwin.schemas.codec import decode
+from fantwin.schemas.enums import Transition
+from fantwin.schemas.messages import Alarm, Score
+from fantwin.schemas.topics import tray_key
+from fantwin.schemas.units import NS_PER_S
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
@@ -45,6 +50,7 @@ from tests.support.running_chain import RunningCommand, eventually
 
 STARTS_S = 300.0
 ORDINARY = "ordinary"
+LEARNED_PERIODS = 960
 
 
 def main(
@@ -52,26 +58,35 @@ def main(
     bad: Annotated[int, typer.Option(help="Nodes of each kind that become dead, silent, broken and lying.")] = 4,
     period_s: Annotated[float, typer.Option(help="Between two scrapes, and between two queries.")] = 15.0,
     seconds: Annotated[float, typer.Option(help="That are measured.")] = 300.0,
+    scored: Annotated[bool, typer.Option("--scored", help="Let a static twin judge the fans.")] = False,
+    faulty: Annotated[int, typer.Option(help="Nodes with a fan that becomes 15 % slower, with --scored.")] = 0,
     json_output: JsonOption = False,
 ) -> None:
     """Print what acquisition takes, and by kind of node which of the due samples came, and when."""
     plan = Plan(free_port(), controllers)
     for number, kind in enumerate(BAD * bad):
         getattr(plan, kind).append((7 + 11 * number) % controllers)
+    plan.faulty = [(3 + 17 * number) % controllers for number in range(faulty)]
     with tempfile.TemporaryDirectory() as folder:
-        about, rows = _measured(plan, Path(folder), period_s, seconds)
+        twin = twin_of_hall(plan, Path(folder), period_s, LEARNED_PERIODS * period_s, "") if scored else None
+        about, rows = _measured(plan, Path(folder), period_s, seconds, twin)
     show({"acquisition": [about], "samples by kind of node": rows}, [], as_json=json_output)
 
 
-def _measured(plan: Plan, folder: Path, period_s: float, seconds: float) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+def _measured(
+    plan: Plan, folder: Path, period_s: float, seconds: float, twin: Path | None
+) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     words = _prometheus(plan, folder, period_s)
     with _running(_exporters(plan, folder)), _running(words) as prometheus:
         url = f"http://127.0.0.1:{words[-1].rpartition(':')[2]}"
-        path, found, init_s = _configuration(plan, folder, url)
+        path, found, init_s = _configuration(plan, folder, url, twin)
         config = load_config(path, stages=())
         names = [tray.name for tray in config.trays]
         with join_bus(config) as bus:
             watcher, arriving = SiteWatcher(bus, config.site), RawSamples(bus, config.site, names)
+            alarms, scored_s = list[Alarm](), list[float]()
+            bus.subscribe(tray_key(config.site, "*", "alarm"), lambda _, payload: alarms.append(decode(Alarm, payload)))
+            bus.subscribe(tray_key(config.site, "*", "score"), lambda _, payload: scored_s.append(_age_s(payload)))
             up = RunningCommand(["up", "-c", path, "--json"])
             try:
                 seen: set[str] = set()
@@ -90,6 +105,7 @@ def _measured(plan: Plan, folder: Path, period_s: float, seconds: float) -> tupl
                 time.sleep(4.0 * period_s)  # until Prometheus has left out what is dead
                 before_s, queries = [cpu_s(process), cpu_s(prometheus.pid)], _queries(url)
                 progress(f"{queries:g} queries so far; measuring for {seconds:g} s")
+                scored_s.clear()
                 times_ns, delays_s = received(arriving, seconds)
                 used_s = [cpu_s(process) - before_s[0], cpu_s(prometheus.pid) - before_s[1]]
                 about = {
@@ -108,6 +124,15 @@ def _measured(plan: Plan, folder: Path, period_s: float, seconds: float) -> tupl
                     "Prometheus' core, %": 100.0 * used_s[1] / seconds,
                     "its RSS, MB": memory_mb(prometheus.pid)[0],
                 }
+                if twin:
+                    raised = {(each.header.tray, each.fan) for each in alarms if each.transition == Transition.RAISED}
+                    wanted = {(f"node{number:03}", 0) for number in plan.faulty}
+                    about |= {
+                        "scrape to score, s": float(np.median(scored_s)),
+                        "score 99 %, s": float(np.quantile(scored_s, 0.99)),
+                        "faults found": f"{len(raised & wanted)} of {len(wanted)}",
+                        "other alarms": ", ".join(f"{tray}/{fan}" for tray, fan in sorted(raised - wanted)) or "none",
+                    }
                 up.end()
             finally:
                 up.kill()
@@ -119,7 +144,12 @@ def _measured(plan: Plan, folder: Path, period_s: float, seconds: float) -> tupl
     return about, list(samples_by_kind(groups, times_ns, seconds / period_s, first=ORDINARY))
 
 
-def _configuration(plan: Plan, folder: Path, url: str) -> tuple[Path, dict[str, int], float]:
+def _age_s(payload: bytes) -> float:
+    """How old the newest sample of a score is."""
+    return time.time() - int(decode(Score, payload).t_ns[-1]) / NS_PER_S
+
+
+def _configuration(plan: Plan, folder: Path, url: str, twin: Path | None) -> tuple[Path, dict[str, int], float]:
     """What `init` writes once all fans are there, with the commands that it cannot know."""
     path = folder / "site.toml"
     trays: list[dict[str, Any]] = []
@@ -146,10 +176,12 @@ def _configuration(plan: Plan, folder: Path, url: str) -> tuple[Path, dict[str, 
         metric = source["fan"][0]["speed"].partition("{")[0]
         exporter = next(each for each in EXPORTERS.values() if each.speed.startswith(f"{metric}{{"))
         for number, fan in enumerate(source["fan"], 1):
-            fan.setdefault("command", exporter.command.format(number))
-        tray["command_max"] = exporter.command_max
-    stages = 'launcher = { stages = ["acquisition"] }'
-    head = f'run_folder = "runs"\nbus = {{ endpoint = "{free_endpoint()}" }}\n{stages}\n'
+            series = fan.get("command", exporter.command.format(number))
+            fan["command"] = {"name": series, "scale": 1.0 / exporter.scale}  # per cent
+        tray |= {"command_max": 101.0, **({"twin": str(twin)} if twin else {})}
+    stages = ["acquisition", *(("resampler", "twin_integrator", "scorer") if twin else ())]
+    launcher = f"launcher = {{ stages = {json.dumps(stages)} }}"
+    head = f'run_folder = "runs"\nbus = {{ endpoint = "{free_endpoint()}" }}\n{launcher}\n'
     lines = [
         line for tray in trays for line in ("[[tray]]", *(f"{key} = {as_toml(each)}" for key, each in tray.items()))
     ]

@@ -23,8 +23,8 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from bench.fleet.halls import cpu_s, free_port, received, run_fantwin, samples_by_kind
-from bench.fleet.redfish_controllers import SHAPES, Hall, Plan
+from bench.fleet.halls import cpu_s, free_port, received, samples_by_kind, twin_of_hall
+from bench.fleet.redfish_controllers import SHAPES, Plan
 from bench.printing import JsonOption, progress, show
 from bench.runtime.stage_memory import free_endpoint, memory_mb
 from fantwin.pipeline.acquisition.raw_samples import RawSamples
@@ -66,7 +66,7 @@ def main(
     plan.faulty = [(3 + 17 * number) % controllers for number in range(faulty)]
     plan.fault_at = time.time() + FAULT_AFTER_S
     with tempfile.TemporaryDirectory() as folder:
-        twin = _twin(plan, Path(folder), period_s) if faulty else None
+        twin = twin_of_hall(plan, Path(folder), period_s, LEARNED_S, "--model physical") if faulty else None
         plan.fault_at = time.time() + FAULT_AFTER_S
         if tls:
             plan.certificate = _certificate(plan, Path(folder))
@@ -143,21 +143,6 @@ def _alarms(plan: Plan, raised: Sequence[tuple[str, int]]) -> dict[str, Any]:
         "found": len(faulty & set(raised)),
         "other alarms": len([each for each in raised if each not in faulty]),
     }
-
-
-def _twin(plan: Plan, folder: Path, period_s: float) -> Path:
-    """A calibrated twin of the fans, from tables of what three of them did, sampled like the hall."""
-    progress("learning the twin")
-    hall, twin = Hall(plan), folder / "twin.onnx"
-    for fan in range(3):
-        at_s = np.arange(0.0, LEARNED_S, period_s)
-        rows = [f"{t:g},{u:g},{y:g}" for t, (u, y) in ((t, hall.fan(fan + 1, 0, float(t))) for t in at_s)]
-        (folder / f"{fan}.csv").write_text("\n".join(["t,u,y", *rows, ""]), encoding="ascii")
-        table = f"import {folder}/{fan}.csv --time t:s --command u --speed y:rpm -o {folder}/{fan}.mcap"
-        run_fantwin(table)
-    run_fantwin(f"train {folder}/0.mcap --validate {folder}/1.mcap --model physical -o {twin}")
-    run_fantwin(f"calibrate {twin} {folder}/1.mcap {folder}/2.mcap --false-alarms-per-day 1 --extrapolate")
-    return twin
 
 
 def _rows(plan: Plan, config: Config, times_ns: Mapping[str, list[int]], due: float) -> Iterator[dict[str, Any]]:
