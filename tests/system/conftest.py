@@ -1,4 +1,4 @@
-"""Chains and commands in processes, which end with the test that has started them."""
+"""Chains, commands and a browser in processes, which end with the test that has started them."""
 
 from __future__ import annotations
 
@@ -8,7 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from playwright.sync_api import Browser
 
+from tests.support.page_browser import running_browser
 from tests.support.running_chain import Chain, RunningCommand
 
 
@@ -41,3 +43,17 @@ def start_command(ends: ExitStack) -> Callable[..., RunningCommand]:
         return running
 
     return start
+
+
+@pytest.fixture(scope="module")
+def _browser_of_module() -> Iterator[Browser]:
+    with running_browser() as running:
+        yield running
+
+
+@pytest.fixture
+def browser(_browser_of_module: Browser) -> Iterator[Browser]:
+    """A browser whose pages are closed after the test: they would go on asking for a gateway that has ended."""
+    yield _browser_of_module
+    for context in _browser_of_module.contexts:
+        context.close()

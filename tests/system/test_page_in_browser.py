@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from playwright.sync_api import Browser, expect
+from playwright.sync_api import expect
 
 from fantwin.schemas.enums import Action, FanState, Feedback, Transition
 from fantwin.schemas.messages import Alarm, Diagnosis, Request
-from tests.support.page_browser import inaccessible, opened, running_browser
+from tests.support.page_browser import inaccessible, opened
 from tests.support.running_core import FANS, TRAY
 from tests.support.running_gateway import RunningGateway
 from tests.support.site_messages import NOW_NS, alarm, golden_twin, marked, score
@@ -55,12 +55,6 @@ def gateway(tmp_path: Path, never_silent: None) -> Iterator[RunningGateway]:
         yield running
     finally:
         running.close()
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    with running_browser() as running:
-        yield running
 
 
 def test_a_fan_is_shown_by_its_name_first_on_every_view_and_a_name_is_text(tmp_path, never_silent, browser):

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from playwright.sync_api import Browser, Page, expect
+from playwright.sync_api import Page, expect
 
 from fantwin.pipeline.site import site_model
 from fantwin.schemas.enums import Action, FanState, InvalidReason, Transition
@@ -19,7 +19,7 @@ from fantwin.schemas.health import FanLearning, Health, Learning, Sweep
 from fantwin.schemas.messages import Alarm, Diagnosis, Request, Score
 from fantwin.schemas.units import RAD_S_PER_UNIT
 from tests.support.made_messages import health
-from tests.support.page_browser import inaccessible, opened, running_browser
+from tests.support.page_browser import inaccessible, opened
 from tests.support.running_core import TRAY
 from tests.support.running_gateway import RunningGateway
 from tests.support.site_messages import NOW_NS, alarm, score
@@ -62,12 +62,6 @@ def gateway(tmp_path: Path) -> Iterator[RunningGateway]:
         yield running
     finally:
         running.close()
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    with running_browser() as running:
-        yield running
 
 
 def shown_s(page: Page) -> tuple[int, int]:
