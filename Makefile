@@ -116,7 +116,7 @@ $(VENV)/.development: requirements-dev.lock pyproject.toml | $(VENV)/.runtime
 	@echo "installing what the tests need into $(VENV), the viewer and PyTorch among it (once)"
 	@$(PIP) install --require-hashes -r requirements-dev.lock
 	@$(PIP) install $(TORCH)
-	@$(PIP) install --editable '.[dev]'
+	@$(PIP) check
 	@touch $@
 
 $(VENV)/.benches: requirements-bench.lock | $(VENV)/.development
