@@ -13,17 +13,14 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
-from io import BytesIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import BinaryIO, NamedTuple
 
-from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
-from mcap.opcode import Opcode
 from mcap.reader import SeekingReader
 from mcap.records import Channel, Chunk, Header, McapRecord, Message, Metadata, Schema
-from mcap.stream_reader import StreamReader, get_chunk_data_stream
+from mcap.stream_reader import StreamReader, breakup_chunk
 from zstandard import ZstdDecompressor, ZstdError
 
 from fantwin.pipeline.sources.column_file import LogError, in_one_line
@@ -31,12 +28,9 @@ from fantwin.pipeline.sources.column_file import LogError, in_one_line
 MCAP_START, SQLITE_START, ROS_1_START = b"\x89MCAP0\r\n", b"SQLite format 3\0", b"#ROSBAG V2.0"
 ZSTD_START = b"\x28\xb5\x2f\xfd"
 METADATA_FILE = "metadata.yaml"
+_DIGITS = re.compile(r"(\d+)")
 _SUFFIXES = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
 _RECORD_LIMIT = 256 << 20
-_RECORD = struct.Struct("<BQ")
-"""before each record of a chunk: opcode, length of its content"""
-_MESSAGE = struct.Struct("<HIQQ")
-"""before the data of a message: channel, sequence, time of receipt, time of sending"""
 _DAMAGED = (McapError, ZstdError, struct.error, ValueError, EOFError, OverflowError, MemoryError, RuntimeError)
 
 
@@ -94,10 +88,10 @@ class BagFiles:
                 for record in StreamReader(stream, emit_chunks=True, record_size_limit=_RECORD_LIMIT).records:
                     for each in _records_in(record, lost):
                         match each:
-                            case (number, t_ns, data) if number in topics:
+                            case Message() if each.channel_id in topics:
                                 found += 1
-                                yield topics[number], t_ns, data
-                            case tuple():
+                                yield topics[each.channel_id], each.log_time, each.data
+                            case Message():
                                 lost["messages of topics that are described in these"] += 1
                             case Header():
                                 profile = each.profile
@@ -167,12 +161,7 @@ def files_in(folder: Path) -> list[Path]:
     """The files of bags in a folder, part 2 before part 10; not a compressed one beside itself."""
     found = [each for each in folder.iterdir() if each.is_file() and each.name.endswith(_SUFFIXES)]
     found = [each for each in found if each.suffix != ".zstd" or each.with_suffix("") not in found]
-    return sorted(found, key=lambda each: [int(part) if part.isdigit() else part for part in _numbers(each.name)])
-
-
-def _numbers(name: str) -> list[str]:
-    """Text and digits by turns."""
-    return re.split(r"(\d+)", name)
+    return sorted(found, key=lambda each: [int(part) if part.isdigit() else part for part in _DIGITS.split(each.name)])
 
 
 def _bag_name(path: Path) -> str:
@@ -195,15 +184,11 @@ def _listed(folder: Path) -> BagFiles:
     except (YAMLError, OSError, LookupError, TypeError, ValueError) as error:
         return BagFiles([], notes=[f"{METADATA_FILE} cannot be read ({in_one_line(error)})"])
     bag = BagFiles([], counts)
-    files: list[Path] = []
     for name in names:
         either = (folder / name, folder / f"{name}.zstd", folder / name.removesuffix(".zstd"))
-        there = next((each for each in either if each.is_file()), None)
-        if there is None:
-            bag.notes.append(f"{name}, which {METADATA_FILE} lists, is missing")
-        else:
-            files.append(there)
-    bag.files = files
+        there = [each for each in either if each.is_file()][:1]
+        bag.files = [*bag.files, *there]
+        bag.notes += [] if there else [f"{name}, which {METADATA_FILE} lists, is missing"]
     return bag
 
 
@@ -221,29 +206,15 @@ def _described_at_the_end(stream: BinaryIO) -> tuple[dict[int, Schema], dict[int
     }
 
 
-def _records_in(record: McapRecord, lost: Counter[str]) -> Iterator[McapRecord | tuple[int, int, bytes]]:
-    """The records of a chunk, or the record itself; a message as its channel, time of receipt and data. lost: counts
-    damaged chunks."""
-    if isinstance(record, Message):
-        yield record.channel_id, record.log_time, record.data
-    elif not isinstance(record, Chunk):
-        yield record
-    else:
-        try:
-            data = get_chunk_data_stream(record, validate_crc=True)[0].read(record.uncompressed_size)
-        except _DAMAGED:
-            lost["damaged chunks"] += 1
-            return
-        at = 0
-        while at < len(data):
-            opcode, length = _RECORD.unpack_from(data, at)
-            at += _RECORD.size
-            if opcode == Opcode.MESSAGE:
-                number, _, t_ns, _ = _MESSAGE.unpack_from(data, at)
-                yield number, t_ns, data[at + _MESSAGE.size : at + length]
-            elif kind := {Opcode.SCHEMA: Schema, Opcode.CHANNEL: Channel}.get(opcode):
-                yield kind.read(ReadDataStream(BytesIO(data[at : at + length])))
-            at += length
+def _records_in(record: McapRecord, lost: Counter[str]) -> Sequence[McapRecord]:
+    """The records of a chunk, or the record itself. lost: counts damaged chunks."""
+    if not isinstance(record, Chunk):
+        return [record]
+    try:
+        return breakup_chunk(record, validate_crc=True)
+    except _DAMAGED:
+        lost["damaged chunks"] += 1
+        return []
 
 
 @contextmanager

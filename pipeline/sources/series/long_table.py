@@ -10,6 +10,7 @@ import re
 from array import array
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import zip_longest
 
 import numpy as np
 
@@ -167,67 +168,38 @@ def _few_whole(layout: Layout, name: str) -> bool:
 
 
 def _of_influx(layout: Layout) -> _Columns:
-    heads = list(_heads(layout))
-    names = tuple(dict.fromkeys(name for head, _ in heads for name in head))
-    if _VALUE in names:
-        values: tuple[str, ...] = (_VALUE,)
-    else:
-        values = tuple(
-            dict.fromkeys(
-                name
-                for head, types in heads
-                for name, kind in zip(head, types, strict=False)
-                if kind in _NUMBER_TYPES and name not in _NOT_TAGS
-            )
-        )
-        values = values or tuple(
-            name
-            for name, kind in zip(layout.names, layout.kinds, strict=True)
-            if kind == "number" and name not in _NOT_TAGS
-        )
-    field = (_FIELD,) if _FIELD in names else ()
-    tags = tuple(name for name in names if name not in _NOT_TAGS and name not in values)
-    return _Columns(names, _TIME, (*field, *tags), values)
-
-
-def _heads(layout: Layout) -> Iterator[tuple[list[str], list[str]]]:
-    """The lines of names of an annotated table, each with the types of its columns if it says them."""
-    yield list(layout.written), []
-    for head, types, _ in _blocks(layout):
-        yield head, types
+    types_of = dict.fromkeys(layout.written, "")
+    last: list[str] = []
+    for head, types, _ in _annotated(layout):
+        if head is not last:
+            last = head
+            types_of |= dict(zip_longest(head, types[: len(head)], fillvalue=""))
+    typed = [name for name, kind in types_of.items() if kind in _NUMBER_TYPES and name not in _NOT_TAGS]
+    kinds = zip(layout.names, layout.kinds, strict=True)
+    numbers = [name for name, kind in kinds if kind == "number" and name not in _NOT_TAGS]
+    values = [_VALUE] if _VALUE in types_of else typed or numbers
+    tags = (name for name in types_of if name not in _NOT_TAGS and name not in values)
+    field = (_FIELD,) if _FIELD in types_of else ()
+    return _Columns(tuple(types_of), _TIME, (*field, *tags), tuple(values))
 
 
 def _annotated_rows(layout: Layout, names: Sequence[str]) -> Iterator[list[str]]:
-    for head, _, rows in _blocks(layout):
-        place = [head.index(name) if name in head else -1 for name in names]
-        for row in rows:
-            yield [row[k] if 0 <= k < len(row) else "" for k in place]
+    last: list[str] = []
+    place: list[int] = []
+    for head, _, row in _annotated(layout):
+        if head is not last:
+            last, place = head, [head.index(name) if name in head else len(head) for name in names]
+        yield [row[k] if k < len(row) else "" for k in place]
 
 
-def _blocks(layout: Layout) -> Iterator[tuple[list[str], list[str], Iterator[list[str]]]]:
-    """Names, types and rows of each result. The rows of one are read before the next is asked for."""
-    rows = all_rows_of(layout)
+def _annotated(layout: Layout) -> Iterator[tuple[list[str], list[str], list[str]]]:
+    """Each row of an annotated table, with the names and types above it."""
+    head: list[str] = []
     types: list[str] = []
-    pending = next(rows, None)
-    while pending is not None:
-        if pending and pending[0].startswith(_ANNOTATION):
-            types = pending if pending[0].startswith("#datatype") else types
-            pending = next(rows, None)
-        elif _TIME in pending:
-            last: list[list[str] | None] = [None]
-
-            def of_result(last: list[list[str] | None] = last) -> Iterator[list[str]]:
-                for row in rows:
-                    if any(row) and (row[0].startswith(_ANNOTATION) or _TIME in row):
-                        last[0] = row
-                        return
-                    if any(row):
-                        yield row
-
-            of_this = of_result()
-            yield pending, types, of_this
-            for _ in of_this:
-                pass
-            pending = last[0]
-        else:
-            pending = next(rows, None)
+    for row in all_rows_of(layout):
+        if row and row[0].startswith(_ANNOTATION):
+            types = row if row[0].startswith("#datatype") else types
+        elif _TIME in row:
+            head = row
+        elif head and any(row):
+            yield head, types, row
