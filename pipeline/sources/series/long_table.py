@@ -17,8 +17,7 @@ import numpy as np
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.sources.column_file import NO_TIME
 from fantwin.pipeline.sources.series.series_file import Label, SeriesFile, named
-from fantwin.pipeline.sources.tables.layout import Layout, all_rows_of, rows_of
-from fantwin.pipeline.sources.tables.numbers import Marks
+from fantwin.pipeline.sources.tables.layout import Heading, Layout, all_rows_of, rows_of
 from fantwin.pipeline.sources.tables.reading import AS_FOUND, Reading
 from fantwin.pipeline.sources.tables.table_file import read_cells
 from fantwin.pipeline.sources.tables.times import time_names, usual_time
@@ -110,15 +109,9 @@ def long_table(layout: Layout, time: str | None = None, reading: Reading = AS_FO
 
 def _with_names(layout: Layout, names: Sequence[str]) -> Layout:
     """A layout of rows with these columns, in this order."""
-    at = {name: layout.names.index(name) for name in names if name in layout.names}
-    return replace(
-        layout,
-        names=tuple(names),
-        second_names=(),
-        units=tuple(layout.units[at[name]] if name in at else "" for name in names),
-        kinds=tuple(layout.kinds[at[name]] if name in at else "" for name in names),
-        marks=tuple(layout.marks[at[name]] if name in at else Marks() for name in names),
-    )
+    known = {each.name: each for each in layout.columns}
+    columns = (replace(known.get(name, Heading(k, name)), index=k, second="") for k, name in enumerate(names))
+    return replace(layout, columns=tuple(columns))
 
 
 def _label(columns: _Columns, key: Sequence[str], value_column: str) -> Label:
@@ -150,21 +143,18 @@ def _of_any(layout: Layout, time: str | None) -> _Columns | None:
     of_time = time_names(layout, time)[0] if time else []
     if not time or not all(name in layout.all_names for name in of_time):
         return None
-    kinds = dict(zip(layout.names, layout.kinds, strict=True))
-    numbers, keys = (
-        [name for name, kind in kinds.items() if name and name not in of_time and kind == wanted]
-        for wanted in ("number", "text")
-    )
-    likely = [name for name in numbers if _LIKE_A_KEY.fullmatch(name) and len(numbers) > 1 and _few_whole(layout, name)]
-    values = [name for name in numbers if name not in likely]
-    return _Columns(layout.names, time, (*keys, *likely), tuple(values)) if values and (keys or likely) else None
+    others = [each for each in layout.columns if each.name and each.name not in of_time]
+    numbers = [each for each in others if each.kind == "number"]
+    likely = [each.name for each in numbers if len(numbers) > 1 and _is_number_of_fan(each)]
+    keys = [*(each.name for each in others if each.kind == "text"), *likely]
+    values = [each.name for each in numbers if each.name not in likely]
+    return _Columns(tuple(layout.names), time, tuple(keys), tuple(values)) if values and keys else None
 
 
-def _few_whole(layout: Layout, name: str) -> bool:
-    """Whether a column of numbers has few whole ones in the sample, as numbers of fans are."""
-    k = layout.names.index(name)
-    cells = [row[k] for row in layout.sample if k < len(row) and row[k]]
-    return all(cell.isdecimal() for cell in cells) and len(set(cells)) <= max(1, len(cells) // 2)
+def _is_number_of_fan(column: Heading) -> bool:
+    """Whether a column has few whole numbers in the sample, and the name of a key."""
+    few = len(set(column.cells)) <= max(1, len(column.cells) // 2)
+    return few and all(map(str.isdecimal, column.cells)) and bool(_LIKE_A_KEY.fullmatch(column.name))
 
 
 def _of_influx(layout: Layout) -> _Columns:
@@ -175,8 +165,7 @@ def _of_influx(layout: Layout) -> _Columns:
             last = head
             types_of |= dict(zip_longest(head, types[: len(head)], fillvalue=""))
     typed = [name for name, kind in types_of.items() if kind in _NUMBER_TYPES and name not in _NOT_TAGS]
-    kinds = zip(layout.names, layout.kinds, strict=True)
-    numbers = [name for name, kind in kinds if kind == "number" and name not in _NOT_TAGS]
+    numbers = [each.name for each in layout.columns if each.kind == "number" and each.name not in _NOT_TAGS]
     values = [_VALUE] if _VALUE in types_of else typed or numbers
     tags = (name for name in types_of if name not in _NOT_TAGS and name not in values)
     field = (_FIELD,) if _FIELD in types_of else ()

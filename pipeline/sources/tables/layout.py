@@ -13,6 +13,7 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import islice
 from pathlib import Path
 
@@ -51,6 +52,29 @@ codecs.register_error(_AS_WINDOWS, _as_windows)
 
 
 @dataclass(frozen=True)
+class Heading:
+    """A column as the first lines of a table show it.
+
+    Attributes:
+        index: of its cells in a row.
+        name: once in a table: a second `Fan` is `Fan [2]`.
+        second: its name in another line of names above; empty without one.
+        unit: as its name or a line of units says; empty if neither does.
+        kind: `number`, `time`, `text`, or empty where the sample has no cell.
+        decimal: the mark of its numbers: what they show, else those of the file; empty: neither does.
+        cells: of the sample, those that are filled.
+    """
+
+    index: int
+    name: str
+    second: str = ""
+    unit: str = ""
+    kind: str = ""
+    decimal: str = ""
+    cells: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
 class Layout:
     """Where the names and the rows of a table are.
 
@@ -59,14 +83,8 @@ class Layout:
         title: of the encoding, for people.
         head: the line of the names, counted from 1; 0: there is none.
         first_row: the line of the first row.
-        names: of the columns, each once: a second `Fan` is `Fan [2]`.
-        second_names: those of another line of names above, where it is as wide; else empty.
         written: the names as they are in the file.
-        units: of each column, as its name or a line of units says; empty if neither does.
         about: keys and values in the lines before the names, such as `debug_mode`.
-        kinds: of each column: `number`, `time`, `text`, or empty where the sample has no cell.
-        marks: of the numbers in each column of the sample.
-        decimal: the decimal mark of the numbers of the file; empty: they do not show it.
     """
 
     path: Path
@@ -75,38 +93,24 @@ class Layout:
     delimiter: str
     head: int
     first_row: int
-    names: tuple[str, ...]
-    second_names: tuple[str, ...]
+    columns: tuple[Heading, ...]
     written: tuple[str, ...]
-    units: tuple[str, ...]
     about: Mapping[str, str]
-    kinds: tuple[str, ...]
-    marks: tuple[Marks, ...]
-    decimal: str
-    sample: tuple[tuple[str, ...], ...]
 
-    @property
+    @cached_property
+    def names(self) -> list[str]:
+        """The names of the columns."""
+        return [each.name for each in self.columns]
+
+    @cached_property
     def all_names(self) -> list[str]:
         """What columns can be called: names, then second names."""
-        return [*self.names, *(name for name in self.second_names if name and name not in self.names)]
+        return list(filter(None, dict.fromkeys((*self.names, *(each.second for each in self.columns)))))
 
-    def index(self, name: str) -> int:
+    def column(self, name: str) -> Heading:
         """The column of a name or a second name."""
-        return (self.names if name in self.names else self.second_names).index(name)
-
-    def unit(self, name: str) -> str:
-        """The unit that the file gives for a column."""
-        return self.units[self.index(name)]
-
-    def decimal_of(self, name: str) -> str:
-        """The decimal mark of a column: what its own numbers show in the sample, else those of the file."""
-        marks = self.marks[self.index(name)]
-        return marks.decimal or ("" if marks.point and marks.comma else self.decimal)
-
-    def second_name(self, name: str) -> str:
-        """What a column is called in another line of names; empty without one."""
-        k = self.index(name)
-        return self.second_names[k] if self.second_names and self.second_names[k] != name else ""
+        either = (self.names if name in self.names else [each.second for each in self.columns]).index(name)
+        return self.columns[either]
 
     @property
     def in_words(self) -> str:
@@ -131,18 +135,13 @@ def find_layout(path: Path) -> Layout:
     lines = list(islice(io.StringIO(text, newline=""), _SAMPLE_LINES))
     if len(start) == _SAMPLE_BYTES and len(lines) > 1 and not lines[-1].endswith("\n"):
         lines.pop()  # cut by the end of the sample
-    title = _ENCODINGS[encoding]
-    if encoding == "utf-8" and not _is_utf_8(start):
-        title = "Windows-1252"
-    skipped = 0
-    delimiter = ""
-    if lines and (found := _SEP_LINE.fullmatch(lines[0])):
-        delimiter, skipped = found[1], 1
-    ends = [k for k, line in enumerate(lines) if line.startswith(_END_OF_HEAD)]
-    skipped = ends[-1] + 1 if ends else skipped
-    if "".join(lines[skipped:]).strip() == "":
+    title = "Windows-1252" if encoding == "utf-8" and not _is_utf_8(start) else _ENCODINGS[encoding]
+    separator = _SEP_LINE.fullmatch(lines[0]) if lines else None
+    ends = [k + 1 for k, line in enumerate(lines) if line.startswith(_END_OF_HEAD)]
+    skipped = max(ends, default=int(separator is not None))
+    if not "".join(lines[skipped:]).strip():
         raise UserError(f"{path}: a line must name the columns, but the file is empty")
-    delimiter = delimiter or _delimiter(lines)
+    delimiter = separator[1] if separator else _delimiter(lines)
     rows = [(1 + skipped + k, [cell.strip() for cell in row]) for k, row in _numbered(path, lines[skipped:], delimiter)]
     return _layout(path, encoding, title, delimiter, [(number, row) for number, row in rows if any(row)])
 
@@ -157,7 +156,7 @@ def rows_of(layout: Layout, wider: list[str] | None = None) -> Iterator[list[str
     """
     rows = 0
     wider = [] if wider is None else wider
-    width, names, first = len(layout.names), list(layout.written), layout.written[0]
+    width, names, first = len(layout.columns), list(layout.written), layout.written[0]
     try:
         for row in islice(_cells(layout), layout.first_row - 1, None):
             if len(row) < width:
@@ -286,36 +285,31 @@ def _layout(path: Path, encoding: str, title: str, delimiter: str, lines: Sequen
     first = next((k for k, (_, row) in enumerate(lines) if _is_row(row, kinds)), len(lines))
     if not any(kind in ("number", "time") for kind in kinds):
         first = next((k for k, (_, row) in enumerate(lines) if len(row) == width), 0) + 1
-    above = [(number, row) for number, row in lines[:first] if not _is_ruler(row)]
-    first_row = lines[first][0] if first < len(lines) else (lines[-1][0] + 1 if lines else 1)
-    sample = [row + [""] * (width - len(row)) for _, row in lines[first:]]
+    above = [(number, row) for number, row in lines[:first] if not all(map(_RULER.fullmatch, filter(None, row)))]
     head, written, second, units, about = _head(above, width)
-    if not written:
-        written = [f"column {k + 1}" for k in range(width)]
+    written = written or [f"column {k + 1}" for k in range(width)]
     if delimiter == BLANKS and len(written) == width - 1 and kinds[:2] == ["time", "time"]:
         written = ["Date", *written]  # the blank within a date
     if not written:
         raise UserError(f"{path}: not a text file with columns; export it as CSV")
+    cells = [tuple(row[k] for _, row in lines[first:] if k < len(row) and row[k]) for k in range(len(written))]
+    marks = [Marks.of(each) for each in cells]
+    decimal = file_decimal(marks, delimiter)
     names = _each_once([" ".join(name.split()) for name in written])
-    marks = tuple(Marks.of(row[k] for row in sample if k < len(row)) for k in range(len(names)))
-    found_units = [units[k] if k < len(units) and units[k] else unit_in_name(name) for k, name in enumerate(written)]
-    return Layout(
-        path=path,
-        encoding=encoding,
-        title=title,
-        delimiter=delimiter,
-        head=head,
-        first_row=first_row,
-        names=tuple(names),
-        second_names=tuple(second) if len(second) == len(names) else (),
-        written=tuple(written),
-        units=tuple(found_units),
-        about=about,
-        kinds=tuple(kinds[k] if k < len(kinds) else "" for k in range(len(names))),
-        marks=marks,
-        decimal=file_decimal(marks, delimiter),
-        sample=tuple(map(tuple, sample)),
-    )
+    columns = [
+        Heading(
+            index=k,
+            name=name,
+            second=second[k] if len(second) == len(names) else "",
+            unit=(units[k] if k < len(units) else "") or unit_in_name(written[k]),
+            kind=kinds[k] if k < len(kinds) else "",
+            decimal=marks[k].decimal or ("" if marks[k].point and marks[k].comma else decimal),
+            cells=cells[k],
+        )
+        for k, name in enumerate(names)
+    ]
+    first_row = lines[first][0] if first < len(lines) else (lines[-1][0] + 1 if lines else 1)
+    return Layout(path, encoding, title, delimiter, head, first_row, tuple(columns), tuple(written), about)
 
 
 def _head(
@@ -362,10 +356,6 @@ def _is_row(row: Sequence[str], kinds: Sequence[str]) -> bool:
     is_filled = any(cell == kind for cell, kind in pairs)
     wanted = sum(kind in ("number", "time") for kind in kinds)
     return is_filled and alike > _LEAST_ALIKE * wanted
-
-
-def _is_ruler(row: Sequence[str]) -> bool:
-    return all(_RULER.fullmatch(cell) for cell in row if cell)
 
 
 def _most_common(kinds: Sequence[str]) -> str:

@@ -44,14 +44,16 @@ class TableFile(ColumnFile):
             raise UsageError("--period is for tables without a time column: leave out --time or --period")
         self._layout, self._period = layout, period or ""
         self.title, self.names, self.about = layout.in_words, layout.all_names, layout.about
-        both = list(zip(layout.second_names, layout.names, strict=False))
-        self.labels = {a: b for a, b in (*both, *((b, a) for a, b in both)) if b and a != b}
+        named_twice = [each for each in layout.columns if each.second not in ("", each.name)]
+        self.labels = {each.second: each.name for each in named_twice} | {
+            each.name: each.second for each in named_twice
+        }
         profile = profile_of(self)
         self._time = time or ("" if period else (profile and profile.time_in(self.names)) or usual_time(layout))
         self._reading = replace(reading, dates=reading.dates or (profile.dates if profile else ""))
         of_time = time_names(layout, self._time)[0] if self._time else []
-        kinds = zip(layout.names, layout.kinds, strict=True)
-        self.numbers = [name for name, kind in kinds if kind == "number" and name and name not in of_time]
+        numbers = (each.name for each in layout.columns if each.kind == "number")
+        self.numbers = [name for name in numbers if name and name not in of_time]
 
     def read(self, names: Sequence[str]) -> Mapping[str, Column]:
         """See ColumnFile."""
@@ -76,7 +78,7 @@ class TableFile(ColumnFile):
             for name in names
             if f"{name} [2]" in self._layout.names
         ]
-        width = len(self._layout.names)
+        width = len(self._layout.columns)
         more = f"{len(wider)} rows left out: more cells than the {width} names, first " if wider else ""
         self.notes = [
             *of_times,
@@ -89,7 +91,7 @@ class TableFile(ColumnFile):
         for name, column in columns.items():
             unsure = column.problem
             values = np.full(count, np.nan) if unsure else column.values
-            unit = self._layout.unit(name) or column.unit
+            unit = self._layout.column(name).unit or column.unit
             found[name] = Column(t_ns, values, unit, column.texts(has_time), unsure or problem)
         return found
 
@@ -120,8 +122,8 @@ def read_cells(
             name: NumberColumn(
                 layout.path,
                 name,
-                layout.index(name),
-                reading.decimal or shown.get(name) or layout.decimal_of(name),
+                layout.column(name).index,
+                reading.decimal or shown.get(name) or layout.column(name).decimal,
                 is_final=bool(reading.decimal) or name in shown,
             )
             for name in names

@@ -24,6 +24,8 @@ from fantwin.schemas.units import NS_PER_S
 DATE_UNIT = "iso"
 _FINER_UNIT = {"s": "ms", "ms": "us", "us": "ns"}
 _YEAR_2000_NS = 946_684_800 * NS_PER_S
+_USUAL = ("time", "timestamp", "t", "date", "datetime", "zeit", "_time", "datum", "elapsed", "ts", "x_value")
+"""names of columns of times"""
 TIME_UNITS = (*NS_PER_UNIT, DATE_UNIT)
 
 
@@ -45,15 +47,16 @@ class TimeColumn:
         for name in self.names:
             require(str(layout.path), names, name)
         self.name = "+".join(self.names)
-        self._indices = [layout.index(name) for name in self.names]
+        columns = [layout.column(name) for name in self.names]
+        self._indices = [each.index for each in columns]
         self._zone = zone_of(reading.zone) if reading.zone else None
         self._is_given = bool(self._unit)
         self._by_file = False
-        if not self._unit and len(self.names) == 1 and layout.unit(self.name) in NS_PER_UNIT:
-            self._unit, self._by_file = layout.unit(self.name), True
+        if not self._unit and columns[0].unit in NS_PER_UNIT:
+            self._unit, self._by_file = columns[0].unit, True
         self._dates = DateColumn(layout.path, self.name, reading.dates, has_zone=bool(reading.zone))
         self._is_final = bool(decimal)
-        self._decimal = decimal or layout.decimal_of(self.names[0])
+        self._decimal = decimal or columns[0].decimal
         self._numbers = NumberColumn(layout.path, self.name, self._indices[0], self._decimal, is_final=self._is_final)
         self._first = ""
         self._far = 0
@@ -194,22 +197,12 @@ def time_names(layout: Layout, given: str) -> tuple[list[str], str]:
 
 def usual_time(layout: Layout) -> str:
     """The time column that a table shows by its names and cells, as `--time` takes it; empty: none, or several."""
-    names, kinds = layout.names, layout.kinds
-    lower = [name.lower() for name in names]
-    dated = [k for k, kind in enumerate(kinds) if kind == "time"]
-    if len(dated) == 2:
-        is_of_day = [is_time_of_day(_first(layout, k)) for k in dated]
-        if sorted(is_of_day) == [False, True]:
-            return "+".join(names[k] for k in dated)
-    if len(dated) == 1:
-        return names[dated[0]]
-    usual = ("time", "timestamp", "t", "date", "datetime", "zeit", "_time", "datum", "elapsed", "ts", "x_value")
-    for word in usual:
-        for k, name in enumerate(lower):
-            if kinds[k] and (name == word or name.split()[:1] == [word] or name.startswith((f"{word}_", f"{word}("))):
-                return names[k]
-    return names[dated[0]] if dated else ""
+    dated = [each for each in layout.columns if each.kind == "time"]
+    if len(dated) == 2 and is_time_of_day(dated[0].cells[0]) != is_time_of_day(dated[1].cells[0]):
+        return "+".join(each.name for each in dated)
+    named = (each for word in _USUAL for each in layout.columns if each.kind and _is_called(each.name.lower(), word))
+    return next((each.name for each in (*(dated if len(dated) == 1 else ()), *named, *dated)), "")
 
 
-def _first(layout: Layout, column: int) -> str:
-    return next((row[column] for row in layout.sample if column < len(row) and row[column]), "")
+def _is_called(name: str, word: str) -> bool:
+    return name == word or name.split()[:1] == [word] or name.startswith((f"{word}_", f"{word}("))
