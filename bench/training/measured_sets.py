@@ -23,8 +23,8 @@ from fantwin.pipeline.learning.training_data import Part, read_training_data
 from fantwin.pipeline.recordings.raw_recordings import write_table
 from fantwin.pipeline.replay.offline.healthy_runs import in_this_process
 from fantwin.pipeline.sources.imported_file import read_file
-from fantwin.pipeline.sources.samples_of_file import Wanted
 from fantwin.pipeline.sources.tables.units import RAD_S_PER_TABLE_UNIT
+from fantwin.pipeline.sources.wanted import Wanted
 from fantwin.twin.runs import Run
 
 FOLDER = Path(os.environ.get("FANTWIN_DATA", Path(__file__).parents[3] / "shared" / "data"))

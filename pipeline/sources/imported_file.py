@@ -12,8 +12,8 @@ import numpy as np
 from fantwin.pipeline.errors import UsageError, UserError
 from fantwin.pipeline.sources.column_file import NO_TIME, Column, ColumnFile
 from fantwin.pipeline.sources.logs.formats import log_format, open_log
-from fantwin.pipeline.sources.preview import Preview, ProposedFan, column_of
-from fantwin.pipeline.sources.samples_of_file import Wanted, chosen_fans, samples_of, speed_unit
+from fantwin.pipeline.sources.preview import Preview, PreviewColumn, ProposedFan
+from fantwin.pipeline.sources.samples_of_file import chosen_fans, samples_of, speed_unit
 from fantwin.pipeline.sources.series.line_protocol import is_line_protocol, read_line_protocol
 from fantwin.pipeline.sources.series.long_table import is_annotated, long_table
 from fantwin.pipeline.sources.series.prometheus_range import is_prometheus, read_prometheus_range
@@ -25,6 +25,7 @@ from fantwin.pipeline.sources.tables.measured_table import Table
 from fantwin.pipeline.sources.tables.profiles import profile_of
 from fantwin.pipeline.sources.tables.table_file import TableFile
 from fantwin.pipeline.sources.tables.units import ELECTRICAL, ELECTRICAL_HUNDREDS, SPEED_UNITS
+from fantwin.pipeline.sources.wanted import Wanted
 from fantwin.schemas.units import NS_PER_S, period_in_words
 
 _START = 4096
@@ -41,12 +42,12 @@ def open_file(path: Path, wanted: Wanted) -> ColumnFile:
             raise UsageError(f"--time and --period are for tables: {path} has its own times ({file.title})")
         return file
     layout = find_layout(path)
-    table = TableFile(layout, wanted.time, wanted.period, wanted.reading)
+    table = TableFile(layout, wanted)
     asked = (*wanted.command, *(with_unit(each, table.names, SPEED_UNITS)[0] for each in wanted.speed))
     if not is_annotated(layout) and not any(each not in table.names for each in asked) and (asked or profile_of(table)):
         return table
     try:
-        return long_table(layout, wanted.time, wanted.reading) or table
+        return long_table(layout, wanted) or table
     except UserError:
         if asked:
             raise
@@ -81,7 +82,7 @@ def read_file(path: Path, wanted: Wanted) -> Table:
 
 
 def _as_long(path: Path, wanted: Wanted) -> Table | None:
-    long = long_table(find_layout(path), wanted.time, wanted.reading)
+    long = long_table(find_layout(path), wanted)
     return samples_of(path, long, wanted) if long else None
 
 
@@ -115,7 +116,7 @@ def preview_of(path: Path, wanted: Wanted) -> Preview:
     return Preview(
         path,
         (title, *_times_in_words(file, columns)),
-        tuple(column_of(name, columns[name], file.labels.get(name, "")) for name in names),
+        tuple(PreviewColumn.of(name, columns[name], file.labels.get(name, "")) for name in names),
         tuple(map(ProposedFan, labels, chosen.command, chosen.speed)),
         _options(wanted, chosen, unit),
         tuple(dict.fromkeys(notes)),
@@ -138,17 +139,17 @@ def _options(wanted: Wanted, chosen: FanColumns, unit: str) -> tuple[str, ...]:
     """Options of the command that imports these fans."""
     if not chosen.speed:
         return ()
-    reading, poles = wanted.reading, "14" if unit in (ELECTRICAL, ELECTRICAL_HUNDREDS) else ""
+    poles = "14" if unit in (ELECTRICAL, ELECTRICAL_HUNDREDS) else ""
     said = {
         "--command": chosen.command if len(set(chosen.command)) > 1 else chosen.command[:1],
         "--speed": [f"{name}:{unit}" if unit else name for name in chosen.speed],
         "--channel": [f"{channel}={name}" for channel, of in chosen.others.items() for name in dict.fromkeys(of)],
         "--time": [wanted.time],
         "--period": [wanted.period],
-        "--dates": [reading.dates],
-        "--zone": [reading.zone],
-        "--decimal": [reading.decimal],
-        "--poles": [str(reading.poles or poles)],
+        "--dates": [wanted.dates],
+        "--zone": [wanted.zone],
+        "--decimal": [wanted.decimal],
+        "--poles": [str(wanted.poles or poles)],
     }
     return tuple(word for option, values in said.items() for value in values if value for word in (option, value))
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,8 +17,8 @@ from fantwin.pipeline.sources.tables.clocks import Clock, continued
 from fantwin.pipeline.sources.tables.fan_columns import FanColumns, fan_columns, used_fans
 from fantwin.pipeline.sources.tables.measured_table import Table, table_of
 from fantwin.pipeline.sources.tables.profiles import Profile, profile_of
-from fantwin.pipeline.sources.tables.reading import AS_FOUND, Reading
 from fantwin.pipeline.sources.tables.units import SPEED_UNITS, in_unit_of, rad_s_per, unit_in_name
+from fantwin.pipeline.sources.wanted import Wanted
 from fantwin.schemas.messages import Array
 
 _MOST_NAMED = 8
@@ -26,25 +26,6 @@ _NO_READING = (-1, 65535, 4294967295)
 """speeds that programs and chips give where they have none"""
 _FAR_BEYOND = 3.0
 """times the largest other speed, above which one of these is no reading"""
-
-
-@dataclass(frozen=True)
-class Wanted:
-    """What a user asks of a file.
-
-    Attributes:
-        command, speed: as for `fan_columns`; both empty: those that the program that wrote the file is known to write.
-        time, period: as for `TableFile`.
-        channels: columns, by the name of their channel.
-        reading: what the file does not show.
-    """
-
-    command: Sequence[str] = ()
-    speed: Sequence[str] = ()
-    time: str | None = None
-    period: str | None = None
-    channels: Mapping[str, Sequence[str]] = field(default_factory=dict[str, Sequence[str]])
-    reading: Reading = AS_FOUND
 
 
 def chosen_fans(path: Path, file: ColumnFile, wanted: Wanted, profile: Profile | None) -> FanColumns:
@@ -94,7 +75,7 @@ def samples_of(path: Path, file: ColumnFile, wanted: Wanted) -> Table:
             values[name], note = in_unit_of(channel, name, values[name], _unit(name, columns))
             of_units += [note] if note else []
     table = table_of(
-        path, chosen, values, t_ns, *rad_s_per(unit or "rad/s", wanted.reading.poles), longest_part=not file.is_rows
+        path, chosen, values, t_ns, *rad_s_per(unit or "rad/s", wanted.poles), longest_part=not file.is_rows
     )
     example = f"--speed {shlex.quote(f'{(*wanted.speed, *chosen.speed)[0]}:rpm')}"
     remarks = (

@@ -43,7 +43,7 @@ def model_fans(count: int, *, balance_filter_per_s: float, **given: Any) -> Fans
     """Fans whose command, of 0 to 100, is a torque, with exact tachos but for what is given, of each or of all."""
     zeros = dict.fromkeys(("friction", "pulse_rad_s", "held_s", "timing_s"), 0.0)
     flags = dict.fromkeys(("has_own_drive", "may_have_plateau", "prefers_balance"), False)
-    each = {**zeros, **flags, "lowest_command": np.nan, "adjoins": True, **given}
+    each = {**zeros, **flags, "lowest_command": np.nan, "adjoins": True, "may_be_ahead": True, **given}
     columns = {name: np.broadcast_to(value, count).copy() for name, value in each.items()}
     return Fans(commands=100.0, balance_filter_per_s=balance_filter_per_s, **columns)
 

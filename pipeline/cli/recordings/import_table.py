@@ -13,16 +13,13 @@ import typer
 
 from fantwin.pipeline.cli.options import JsonOption
 from fantwin.pipeline.cli.printing import show
-from fantwin.pipeline.cli.recordings.import_preview import show_previews
 from fantwin.pipeline.config.settings import NAME_PATTERN
 from fantwin.pipeline.errors import UsageError, UserError
 from fantwin.pipeline.recordings.raw_recordings import write_table
 from fantwin.pipeline.sources.imported_file import preview_of, read_files
-from fantwin.pipeline.sources.samples_of_file import Wanted
-from fantwin.pipeline.sources.tables.measured_table import Table
-from fantwin.pipeline.sources.tables.reading import Reading
 from fantwin.pipeline.sources.tables.tachos import parse_tachos
 from fantwin.pipeline.sources.tacho_evidence import tacho_hints
+from fantwin.pipeline.sources.wanted import Wanted
 from fantwin.schemas.channels import CHANNELS
 from fantwin.schemas.fan_names import FanNames, is_fan_name
 from fantwin.schemas.topics import RESERVED_TRAY_NAMES
@@ -117,10 +114,15 @@ def import_table(
         time,
         period,
         _channels(channel or ()),
-        Reading(dates or "", zone or "", decimal or "", poles),
+        dates or "",
+        zone or "",
+        decimal or "",
+        poles,
     )
     if preview:
-        show_previews([preview_of(path, wanted) for path in paths], json_output=json_output)
+        previews = [preview_of(path, wanted) for path in paths]
+        lines = (line for each in previews for line in each.lines)
+        show({"files": [each.as_json for each in previews]}, *lines, json_output=json_output)
         return
     if output is None:
         raise UsageError("an import needs -o REC.mcap; --preview shows what is in the file")
@@ -136,7 +138,20 @@ def import_table(
     fans = "1 fan" if table.fans == 1 else f"{table.fans} fans"
     period_text = f"{period_in_words(table.median_period_s)} apart (median)"
     line = f"{output}: {len(table.t_ns)} samples of {fans} over {table.duration_s:.1f} s, {period_text}"
-    found = import_summary(table, output) | {"hints": hints}
+    found = {
+        "recording": str(output),
+        "samples": len(table.t_ns),
+        "fans": table.fans,
+        "duration_s": table.duration_s,
+        "median_rate_hz": 1 / table.median_period_s,
+        "speed_unit": table.speed_unit,
+        "assumed": table.assumed,
+        "notes": list(table.remarks),
+        "hints": hints,
+        "gaps": table.gaps,
+        "columns": list(table.auxiliary),
+        **asdict(table.repairs),
+    }
     lines = (line, *(f"  {note}" for note in (table.assumed, *table.notes) if note))
     show(found, *lines, json_output=json_output)
     for hint in hints if not json_output else ():
@@ -162,20 +177,3 @@ def _channels(given: Sequence[str]) -> dict[str, list[str]]:
             raise UsageError(f"--channel {text}: give NAME=COLUMN; known are {', '.join(known)}")
         columns.setdefault(name, []).append(column)
     return columns
-
-
-def import_summary(table: Table, output: Path) -> dict[str, object]:
-    """The JSON output of an import."""
-    return {
-        "recording": str(output),
-        "samples": len(table.t_ns),
-        "fans": table.fans,
-        "duration_s": table.duration_s,
-        "median_rate_hz": 1 / table.median_period_s,
-        "speed_unit": table.speed_unit,
-        "assumed": table.assumed,
-        "notes": list(table.remarks),
-        "gaps": table.gaps,
-        "columns": list(table.auxiliary),
-        **asdict(table.repairs),
-    }

@@ -15,9 +15,8 @@ from fantwin.pipeline.config.loading import checked_section, set_key
 from fantwin.pipeline.config.settings import Section
 from fantwin.pipeline.errors import UsageError, UserError
 from fantwin.pipeline.sources.imported_file import read_file
-from fantwin.pipeline.sources.samples_of_file import Wanted
 from fantwin.pipeline.sources.simulated.table import TableDevice
-from fantwin.pipeline.sources.tables.reading import Reading
+from fantwin.pipeline.sources.wanted import Wanted
 from fantwin.schemas import wire
 from fantwin.schemas.channels import CHANNELS
 from fantwin.schemas.tacho import INSTANTANEOUS, Tacho, Tachos
@@ -115,8 +114,8 @@ class Scenario(Section):
         if unknown := [name for name in file.channels if name not in names]:
             raise UsageError(f"file.channels.{unknown[0]}: known are {', '.join(names)}")
         channels = {name: list(columns) for name, columns in file.channels.items()}
-        reading = Reading(file.dates, file.zone, file.decimal)
-        wanted = Wanted(file.command, file.speed, file.time, file.period, channels, reading)
+        how = (file.dates, file.zone, file.decimal)
+        wanted = Wanted(file.command, file.speed, file.time, file.period, channels, *how)
         table = read_file(file.path, wanted)
         return TableDevice(table, file.from_s, math.inf if file.to_s is None else file.to_s)
 

@@ -18,9 +18,9 @@ from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.sources.column_file import NO_TIME
 from fantwin.pipeline.sources.series.series_file import Label, SeriesFile, named
 from fantwin.pipeline.sources.tables.layout import Heading, Layout, all_rows_of, rows_of
-from fantwin.pipeline.sources.tables.reading import AS_FOUND, Reading
 from fantwin.pipeline.sources.tables.table_file import read_cells
 from fantwin.pipeline.sources.tables.times import time_names, usual_time
+from fantwin.pipeline.sources.wanted import Wanted
 from fantwin.schemas.messages import Array
 
 MOST_SERIES = 10_000
@@ -57,13 +57,13 @@ class _TooManyError(Exception):
     """A table with more series than there are fans anywhere."""
 
 
-def long_table(layout: Layout, time: str | None = None, reading: Reading = AS_FOUND) -> SeriesFile | None:
-    """The series of a table; None: it is not long. time: as for `TableFile`.
+def long_table(layout: Layout, wanted: Wanted) -> SeriesFile | None:
+    """The series of a table; None: it is not long.
 
     Raises:
         UserError: it is one, and its times or numbers cannot be read.
     """
-    columns = _of_influx(layout) if is_annotated(layout) else _of_any(layout, time)
+    columns = _of_influx(layout) if is_annotated(layout) else _of_any(layout, wanted.time)
     if columns is None:
         return None
     at = [columns.names.index(key) for key in columns.keys]
@@ -80,7 +80,7 @@ def long_table(layout: Layout, time: str | None = None, reading: Reading = AS_FO
             yield row
 
     try:
-        times, numbers, _ = read_cells(_with_names(layout, columns.names), columns.time, columns.values, reading, rows)
+        times, numbers, _ = read_cells(_with_names(layout, columns.names), columns.time, columns.values, wanted, rows)
     except _TooManyError:
         return None
     if not of_row or times is None:

@@ -17,7 +17,7 @@ import numpy as np
 
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.sources.column_file import NO_TIME
-from fantwin.pipeline.sources.tables.reading import ORDERS
+from fantwin.pipeline.sources.wanted import ORDERS
 from fantwin.schemas.messages import Array
 from fantwin.schemas.units import NS_PER_S
 

@@ -18,9 +18,9 @@ from fantwin.pipeline.sources.column_file import NO_TIME, Column, ColumnFile
 from fantwin.pipeline.sources.tables.layout import Layout, rows_of
 from fantwin.pipeline.sources.tables.numbers import NumberColumn, OtherMarkError
 from fantwin.pipeline.sources.tables.profiles import profile_of
-from fantwin.pipeline.sources.tables.reading import AS_FOUND, Reading
 from fantwin.pipeline.sources.tables.times import TimeColumn, time_names, usual_time
 from fantwin.pipeline.sources.tables.units import NS_PER_UNIT
+from fantwin.pipeline.sources.wanted import Wanted
 from fantwin.schemas.messages import FURTHEST_T_NS, LARGEST_PERIOD_NS, Array
 
 _ROWS_IN_PART = 4096
@@ -31,26 +31,18 @@ class TableFile(ColumnFile):
 
     is_rows = True
 
-    def __init__(
-        self, layout: Layout, time: str | None = None, period: str | None = None, reading: Reading = AS_FOUND
-    ) -> None:
-        """time: `COLUMN`, `COLUMN:UNIT` with unit s, ms, us, ns or iso (dates), or `DATE+TIME`, two columns; None: the
-        one that the names and cells show, or with `period`, the time between rows such as `10ms`, none.
-
-        Raises:
-            UserError: there is no such column, or the period cannot be used.
-        """
-        if time and period:
-            raise UsageError("--period is for tables without a time column: leave out --time or --period")
-        self._layout, self._period = layout, period or ""
+    def __init__(self, layout: Layout, wanted: Wanted) -> None:
+        """Raises UserError: there is no such column of times."""
+        self._layout = layout
         self.title, self.names, self.about = layout.in_words, layout.all_names, layout.about
         named_twice = [each for each in layout.columns if each.second not in ("", each.name)]
         self.labels = {each.second: each.name for each in named_twice} | {
             each.name: each.second for each in named_twice
         }
         profile = profile_of(self)
-        self._time = time or ("" if period else (profile and profile.time_in(self.names)) or usual_time(layout))
-        self._reading = replace(reading, dates=reading.dates or (profile.dates if profile else ""))
+        found = "" if wanted.period else (profile and profile.time_in(self.names)) or usual_time(layout)
+        self._time = wanted.time or found
+        self._wanted = replace(wanted, dates=wanted.dates or (profile.dates if profile else ""))
         of_time = time_names(layout, self._time)[0] if self._time else []
         numbers = (each.name for each in layout.columns if each.kind == "number")
         self.numbers = [name for name in numbers if name and name not in of_time]
@@ -63,7 +55,7 @@ class TableFile(ColumnFile):
             wider.clear()
             return rows_of(self._layout, wider)
 
-        times, columns, count = read_cells(self._layout, self._time, names, self._reading, rows)
+        times, columns, count = read_cells(self._layout, self._time, names, self._wanted, rows)
         problem = None
         try:
             t_ns = times.values() if times else self._counted_times(count)
@@ -97,19 +89,20 @@ class TableFile(ColumnFile):
 
     def _counted_times(self, rows: int) -> Array:
         """Times of a table without a time column: rows `period` apart, from 0."""
-        if not self._period:
+        period = self._wanted.period
+        if not period:
             raise UsageError("a table needs --time COLUMN[:UNIT], or --period 10ms if it has no time column")
-        match = re.fullmatch(r"(\d{1,9}\.?\d*|\.\d+)\s*(s|ms|us|ns)", self._period.strip())
+        match = re.fullmatch(r"(\d{1,9}\.?\d*|\.\d+)\s*(s|ms|us|ns)", period.strip())
         period_ns = round(float(match[1]) * NS_PER_UNIT[match[2]]) if match else 0
         if not 0 < period_ns <= LARGEST_PERIOD_NS:
-            raise UsageError(f"--period {self._period}: give the time between samples with its unit, for example 10ms")
+            raise UsageError(f"--period {period}: give the time between samples with its unit, for example 10ms")
         if rows * period_ns >= FURTHEST_T_NS:
-            raise UsageError(f"--period {self._period}: beyond the year 2116 at its end; give a shorter period")
+            raise UsageError(f"--period {period}: beyond the year 2116 at its end; give a shorter period")
         return np.arange(rows, dtype=np.int64) * period_ns
 
 
 def read_cells(
-    layout: Layout, time: str, names: Sequence[str], reading: Reading, rows: Callable[[], Iterator[list[str]]]
+    layout: Layout, time: str, names: Sequence[str], wanted: Wanted, rows: Callable[[], Iterator[list[str]]]
 ) -> tuple[TimeColumn | None, dict[str, NumberColumn], int]:
     """The times, the columns of these names with their numbers, and the number of rows.
 
@@ -117,14 +110,14 @@ def read_cells(
     """
     shown: dict[str, str] = {}
     while True:
-        times = TimeColumn(layout, time, reading, reading.decimal or shown.get(f"time {time}", "")) if time else None
+        times = TimeColumn(layout, time, wanted, wanted.decimal or shown.get(f"time {time}", "")) if time else None
         columns = {
             name: NumberColumn(
                 layout.path,
                 name,
                 layout.column(name).index,
-                reading.decimal or shown.get(name) or layout.column(name).decimal,
-                is_final=bool(reading.decimal) or name in shown,
+                wanted.decimal or shown.get(name) or layout.column(name).decimal,
+                is_final=bool(wanted.decimal) or name in shown,
             )
             for name in names
         }

@@ -15,9 +15,9 @@ from fantwin.pipeline.sources.tables.dates import DateColumn, is_time_of_day
 from fantwin.pipeline.sources.tables.fan_columns import require, with_unit
 from fantwin.pipeline.sources.tables.layout import Layout
 from fantwin.pipeline.sources.tables.numbers import NumberColumn
-from fantwin.pipeline.sources.tables.reading import Reading
 from fantwin.pipeline.sources.tables.units import NS_PER_UNIT
 from fantwin.pipeline.sources.tables.zones import as_utc, zone_of
+from fantwin.pipeline.sources.wanted import Wanted
 from fantwin.schemas.messages import FURTHEST_T_NS, Array
 from fantwin.schemas.units import NS_PER_S
 
@@ -32,7 +32,7 @@ TIME_UNITS = (*NS_PER_UNIT, DATE_UNIT)
 class TimeColumn:
     """The column of times, or the two of date and time of day, in ns."""
 
-    def __init__(self, layout: Layout, given: str, reading: Reading, decimal: str = "") -> None:
+    def __init__(self, layout: Layout, given: str, wanted: Wanted, decimal: str = "") -> None:
         """given: `NAME`, `NAME:UNIT` or `DATE+TIME`. decimal: mark of the numbers; empty: found, as of other columns.
 
         Without a unit, numbers are in the one that the file names, else since 1970 in the one that fits, else in s, and
@@ -49,12 +49,12 @@ class TimeColumn:
         self.name = "+".join(self.names)
         columns = [layout.column(name) for name in self.names]
         self._indices = [each.index for each in columns]
-        self._zone = zone_of(reading.zone) if reading.zone else None
+        self._zone = zone_of(wanted.zone) if wanted.zone else None
         self._is_given = bool(self._unit)
         self._by_file = False
         if not self._unit and columns[0].unit in NS_PER_UNIT:
             self._unit, self._by_file = columns[0].unit, True
-        self._dates = DateColumn(layout.path, self.name, reading.dates, has_zone=bool(reading.zone))
+        self._dates = DateColumn(layout.path, self.name, wanted.dates, has_zone=bool(wanted.zone))
         self._is_final = bool(decimal)
         self._decimal = decimal or columns[0].decimal
         self._numbers = NumberColumn(layout.path, self.name, self._indices[0], self._decimal, is_final=self._is_final)

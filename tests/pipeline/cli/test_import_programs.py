@@ -14,8 +14,8 @@ import pytest
 from fantwin.pipeline.errors import FantwinError
 from fantwin.pipeline.recordings.training_runs import read_runs
 from fantwin.pipeline.sources.imported_file import preview_of, read_file
-from fantwin.pipeline.sources.samples_of_file import Wanted
 from fantwin.pipeline.sources.tables import profiles
+from fantwin.pipeline.sources.wanted import Wanted
 from tests.support.fan_rows import COLUMNS, COMMAND, EPOCH_S, RPM, SECONDS, SPEED, N, Table, require_imported
 from tests.support.fantwin_command import error_of, fantwin
 from tests.support.written_recordings import raw_columns

@@ -8,9 +8,9 @@ import pytest
 
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.sources.imported_file import read_file
-from fantwin.pipeline.sources.samples_of_file import Wanted
 from fantwin.pipeline.sources.tables import table_file
 from fantwin.pipeline.sources.tables.measured_table import Table
+from fantwin.pipeline.sources.wanted import Wanted
 
 RPM = 2 * np.pi / 60
 UNITS = {"rad/s": 1.0, "rpm": RPM, "hz": 2 * np.pi, "deg/s": np.pi / 180}
