@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -29,6 +30,15 @@ from fantwin.pipeline.sources.wanted import Wanted
 from fantwin.schemas.units import NS_PER_S, period_in_words
 
 _START = 4096
+
+
+@contextmanager
+def _readable() -> Iterator[None]:
+    """Raise UserError for what the system says of a file."""
+    try:
+        yield
+    except OSError as error:
+        raise UserError(f"{error.filename or 'the file'}: cannot be read: {error.strerror}") from error
 
 
 def open_file(path: Path, wanted: Wanted) -> ColumnFile:
@@ -64,6 +74,7 @@ def _log_or_series(path: Path) -> ColumnFile | None:
     return read_line_protocol(path) if is_line_protocol(start) else None
 
 
+@_readable()
 def read_file(path: Path, wanted: Wanted) -> Table:
     """The samples of a file. A table whose times go back or repeat is read as a long one, if it is that.
 
@@ -86,6 +97,7 @@ def _as_long(path: Path, wanted: Wanted) -> Table | None:
     return samples_of(path, long, wanted) if long else None
 
 
+@_readable()
 def preview_of(path: Path, wanted: Wanted) -> Preview:
     """What a file is understood to be.
 
@@ -154,6 +166,7 @@ def _options(wanted: Wanted, chosen: FanColumns, unit: str) -> tuple[str, ...]:
     return tuple(word for option, values in said.items() for value in values if value for word in (option, value))
 
 
+@_readable()
 def read_files(paths: Sequence[Path], wanted: Wanted) -> Table:
     """The samples of several files: parts of one run, or tables that have commands and speeds apart.
 

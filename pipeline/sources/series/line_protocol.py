@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 
-from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.sources.series.series_file import Label, SeriesFile, named
 from fantwin.schemas.messages import FURTHEST_T_NS
 from fantwin.schemas.units import NS_PER_S
@@ -34,32 +33,25 @@ def is_line_protocol(start: str) -> bool:
 
 
 def read_line_protocol(path: Path) -> SeriesFile:
-    """The series of a file: `measurement.field{tag=value}`, without the measurement if there is only one.
-
-    Raises:
-        UserError: it cannot be read.
-    """
+    """The series of a file: `measurement.field{tag=value}`, without the measurement if there is only one."""
     times: dict[tuple[str, str, str], array[int]] = {}
     values: dict[tuple[str, str, str], array[float]] = {}
     damaged: list[int] = []
-    try:
-        with path.open(encoding="utf-8", errors="replace") as file:
-            for number, line in enumerate(file, 1):
-                if not line.strip() or line.startswith("#"):
-                    continue
-                found = _LINE.fullmatch(line) if len(line) < _LONGEST_LINE else None
-                time = found["time"] or "" if found else ""
-                t_ns = int(time or 0) * next(ns for digits, ns in _PRECISION if len(time) >= digits)
-                if found is None or not time or abs(t_ns) >= FURTHEST_T_NS:
-                    damaged.append(number)
-                    continue
-                for each in _FIELDS.finditer(found["fields"]):
-                    if value := _VALUE.fullmatch(each["value"]):
-                        key = (found["name"], found["tags"], each["key"])
-                        times.setdefault(key, array("q")).append(t_ns)
-                        values.setdefault(key, array("d")).append(float(value[1]))
-    except OSError as error:
-        raise UserError(f"{path}: cannot be read: {error.strerror}") from error
+    with path.open(encoding="utf-8", errors="replace") as file:
+        for number, line in enumerate(file, 1):
+            if not line.strip() or line.startswith("#"):
+                continue
+            found = _LINE.fullmatch(line) if len(line) < _LONGEST_LINE else None
+            time = found["time"] or "" if found else ""
+            t_ns = int(time or 0) * next(ns for digits, ns in _PRECISION if len(time) >= digits)
+            if found is None or not time or abs(t_ns) >= FURTHEST_T_NS:
+                damaged.append(number)
+                continue
+            for each in _FIELDS.finditer(found["fields"]):
+                if value := _VALUE.fullmatch(each["value"]):
+                    key = (found["name"], found["tags"], each["key"])
+                    times.setdefault(key, array("q")).append(t_ns)
+                    values.setdefault(key, array("d")).append(float(value[1]))
     several = len({name for name, _, _ in times}) > 1
     series = named(
         (

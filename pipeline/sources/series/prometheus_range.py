@@ -36,8 +36,6 @@ def read_prometheus_range(path: Path) -> SeriesFile:
         answer: Any = json.loads(path.read_text(encoding="utf-8-sig"))
         results = answer["data"]["result"]
         found = [_series(each) for each in results]
-    except OSError as error:
-        raise UserError(f"{path}: cannot be read: {error.strerror}") from error
     except (ValueError, TypeError, KeyError, IndexError) as error:
         raise UserError(f"{path}: no answer of Prometheus to a query over a range: {error!r}") from error
     if not found:

@@ -125,11 +125,8 @@ def find_layout(path: Path) -> Layout:
     Raises:
         UserError: it cannot be read, or is no text file.
     """
-    try:
-        with path.open("rb") as file:
-            start = file.read(_SAMPLE_BYTES)
-    except OSError as error:
-        raise UserError(f"{path}: cannot read the table: {error.strerror}") from error
+    with path.open("rb") as file:
+        start = file.read(_SAMPLE_BYTES)
     encoding = _encoding(path, start)
     text = codecs.getincrementaldecoder(encoding)(_AS_WINDOWS).decode(start)
     lines = list(islice(io.StringIO(text, newline=""), _SAMPLE_LINES))
@@ -141,9 +138,10 @@ def find_layout(path: Path) -> Layout:
     skipped = max(ends, default=int(separator is not None))
     if not "".join(lines[skipped:]).strip():
         raise UserError(f"{path}: a line must name the columns, but the file is empty")
-    delimiter = separator[1] if separator else _delimiter(lines)
-    rows = [(1 + skipped + k, [cell.strip() for cell in row]) for k, row in _numbered(path, lines[skipped:], delimiter)]
-    return _layout(path, encoding, title, delimiter, [(number, row) for number, row in rows if any(row)])
+    delimiter = separator[1] if separator else _delimiter(path, lines)
+    rows = enumerate(_split(path, lines[skipped:], delimiter), 1 + skipped)
+    stripped = [(number, [cell.strip() for cell in row]) for number, row in rows]
+    return _layout(path, encoding, title, delimiter, [(number, row) for number, row in stripped if any(row)])
 
 
 def rows_of(layout: Layout, wider: list[str] | None = None) -> Iterator[list[str]]:
@@ -157,19 +155,16 @@ def rows_of(layout: Layout, wider: list[str] | None = None) -> Iterator[list[str
     rows = 0
     wider = [] if wider is None else wider
     width, names, first = len(layout.columns), list(layout.written), layout.written[0]
-    try:
-        for row in islice(_cells(layout), layout.first_row - 1, None):
-            if len(row) < width:
-                row.extend([""] * (width - len(row)))
-            if len(row) > width and any(row[width:]):
-                wider.append(",".join(row[width:]))
-            elif first and row[0] == first and not any(map(is_number, row)):
-                _require_same_names(layout, names, row)
-            elif any(row):
-                rows += 1
-                yield row
-    except csv.Error as error:
-        raise UserError(f"{layout.path}: not a text file with columns: {error}") from error
+    for row in islice(all_rows_of(layout), layout.first_row - 1, None):
+        if len(row) < width:
+            row.extend([""] * (width - len(row)))
+        if len(row) > width and any(row[width:]):
+            wider.append(",".join(row[width:]))
+        elif first and row[0] == first and not any(map(is_number, row)):
+            _require_same_names(layout, names, row)
+        elif any(row):
+            rows += 1
+            yield row
     if len(wider) > rows:
         raise UserError(
             f"{layout.path}: rows have more cells than the {width} names of line {layout.head}: if numbers have "
@@ -191,16 +186,9 @@ def _require_same_names(layout: Layout, names: Sequence[str], row: Sequence[str]
 
 
 def all_rows_of(layout: Layout) -> Iterator[list[str]]:
-    """All rows of the file, those before the names, too."""
-    return _cells(layout)
-
-
-def _cells(layout: Layout) -> Iterator[list[str]]:
-    try:
-        with layout.path.open(encoding=layout.encoding, errors=_AS_WINDOWS, newline="") as file:
-            yield from _split(_lines(layout.path, file), layout.delimiter)
-    except OSError as error:
-        raise UserError(f"{layout.path}: cannot read the table: {error.strerror}") from error
+    """All rows of the file, those before the names, too. Raises UserError."""
+    with layout.path.open(encoding=layout.encoding, errors=_AS_WINDOWS, newline="") as file:
+        yield from _split(layout.path, _lines(layout.path, file), layout.delimiter)
 
 
 def _lines(path: Path, file: io.TextIOWrapper) -> Iterator[str]:
@@ -210,18 +198,11 @@ def _lines(path: Path, file: io.TextIOWrapper) -> Iterator[str]:
         yield line
 
 
-def _split(lines: Iterable[str], delimiter: str) -> Iterator[list[str]]:
+def _split(path: Path, lines: Iterable[str], delimiter: str) -> Iterator[list[str]]:
     if delimiter == BLANKS:
         lines = (line.strip().replace("\t", " ") for line in lines)
-    return csv.reader(lines, delimiter=delimiter, skipinitialspace=True)
-
-
-def _numbered(path: Path, lines: Sequence[str], delimiter: str) -> Iterator[tuple[int, list[str]]]:
-    if any(len(line) >= LONGEST_LINE or len(line) > csv.field_size_limit() for line in lines):
-        raise UserError(f"{path}: not a text file with columns: a line is longer than {LONGEST_LINE:,} characters")
-    reader = csv.reader([]) if not lines else _split(lines, delimiter)
     try:
-        yield from enumerate(reader)
+        yield from csv.reader(lines, delimiter=delimiter, skipinitialspace=True)
     except csv.Error as error:
         raise UserError(f"{path}: not a text file with columns: {error}") from error
 
@@ -243,18 +224,18 @@ def _is_utf_8(start: bytes) -> bool:
     return True
 
 
-def _delimiter(lines: Sequence[str]) -> str:
+def _delimiter(path: Path, lines: Sequence[str]) -> str:
     """The delimiter that gives the most lines one width, with cells that are numbers, dates or short words."""
     filled = [line for line in lines if line.strip() and not _RULER.fullmatch(line.strip())]
-    scores = {each: _score(filled, each) for each in _DELIMITERS}
+    scores = {each: _score(path, filled, each) for each in _DELIMITERS}
     best = max(scores, key=lambda each: scores[each])
     return best if scores[best] > 0 else ","
 
 
-def _score(lines: Sequence[str], delimiter: str) -> float:
+def _score(path: Path, lines: Sequence[str], delimiter: str) -> float:
     try:
-        rows = [row for row in _split(lines, delimiter) if row]
-    except csv.Error:
+        rows = [row for row in _split(path, lines, delimiter) if row]
+    except UserError:
         return 0.0
     last = rows[len(rows) // 3 :]
     if not last:
