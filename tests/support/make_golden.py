@@ -92,9 +92,7 @@ def make_golden_restart(path: Path) -> None:
 
 def record(chain: Chain) -> None:
     """Some ten seconds with a fault and two killed stages."""
-    tray = chain.start_tray(
-        "--fans", str(FANS), "--set", "rate_hz=50", "--fault", f"inlet:fan={FAULTY},start=3,stop=9,size=2.0"
-    )
+    tray = chain.start_tray("--fans", str(FANS), "--fault", f"inlet:fan={FAULTY},start=3,stop=9,size=2.0")
     up = chain.start_up()
     with chain.watcher() as watcher:
         eventually(lambda: published(view_of(watcher, "scorer")) > 100, "scores flow")

@@ -24,6 +24,8 @@ from fantwin.pipeline.site.stage_states import StageView
 DEMO = Path(__file__).parents[2] / "pipeline" / "demo"
 SITE, TRAY, FANS = "demo", "tray1", 8
 STAGES = ("acquisition", "resampler", "twin_integrator", "scorer", "recorder")
+RATE_HZ, STEP_NS = 50, 20_000_000
+"""of the samples of a chain: half of the rate of the demo, and of its work"""
 DEADLINE_S = 300.0  # only what hangs takes as long, also on a busy machine
 
 
@@ -130,7 +132,9 @@ class Chain:
         self.configuration = configuration
         self.endpoint = endpoint
         self.port = folder / "tray"
+        own_rate = [f"resampler.rate_hz={RATE_HZ}"] if configuration == DEMO / "demo.toml" else []
         self.settings = [
+            *own_rate,
             *(f"run_folder='{folder}'", f"tray.0.port='{self.port}'", f"bus.endpoint='{endpoint}'"),
             *("viewer.grpc_port=0", "viewer.file='view.rrd'", f"launcher.stages={json.dumps(list(stages))}"),
             "recorder.topics=['raw', 'grid', 'prediction', 'score']",
@@ -148,7 +152,8 @@ class Chain:
         truth = self.folder / "truth.json"
         self.tray = RunningCommand(
             [
-                *("simulate", "--fans", FANS, "--set", "speed_unit=rpm", "--link", self.port, "--truth", truth),
+                *("simulate", "--fans", FANS, "--set", "speed_unit=rpm", "--set", f"rate_hz={RATE_HZ}"),
+                *("--link", self.port, "--truth", truth),
                 *("--wait-for-reader", "--json", *words),
             ]
         )

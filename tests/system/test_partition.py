@@ -24,7 +24,7 @@ from fantwin.schemas.enums import Transition
 from fantwin.schemas.messages import Alarm, Grid, Raw
 from fantwin.schemas.topics import tray_key
 from tests.support.fantwin_command import as_typed
-from tests.support.running_chain import SITE, TRAY, Chain, RunningCommand, eventually
+from tests.support.running_chain import SITE, STEP_NS, TRAY, Chain, RunningCommand, eventually
 from tests.support.tcp_relay import TcpRelay
 
 pytestmark = [pytest.mark.slow, pytest.mark.real_time]
@@ -33,7 +33,6 @@ FAULTY = 2
 BEFORE_S, FAULT = 5.0, f"inlet:fan={FAULTY},start=12,stop=14,size=2.5"
 CUT_S = int(LEASE_MS) / 1000 + 6.0
 """the whole fault lies in it, also if the cut comes seven seconds after BEFORE_S on a busy machine"""
-STEP_NS = 10_000_000
 CLIENTS = ("bus.mode='client'", "twin_integrator.warm_up_s=2")
 JUDGES = ["resampler", "twin_integrator", "scorer", "recorder"]
 

@@ -52,7 +52,7 @@ class Site:
     """Stages of the site of the demo, and the messages received on their bus."""
 
     def __init__(self, folder: Path, endpoint: str, *, listens: bool = True) -> None:
-        self.chain = Chain(folder, endpoint, SILENCE)
+        self.chain = Chain(folder, endpoint, SILENCE, "resampler.rate_hz=100")
         self.heard: dict[type[Message], queue.Queue[Message]] = {kind: queue.Queue() for kind in (Grid, Clock, Health)}
         self.bus = Bus(BusConfig(endpoint=endpoint), listens=listens)
         self.watcher = SiteWatcher(self.bus, SITE)
