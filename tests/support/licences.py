@@ -32,6 +32,10 @@ with. `make licences` writes this page from the locks.
 """
 
 
+UNDECLARED = {"pysnmp": "BSD-2-Clause"}
+"""by the text of their licence alone"""
+
+
 def locked(lock: str) -> Iterator[tuple[str, str]]:
     """Name and version of each package that a lock installs on Linux with Python 3.11."""
     for line in re.findall(r"^[a-z0-9].*?(?= *\\?$)", (ROOT / lock).read_text(encoding="utf-8"), re.MULTILINE):
@@ -53,7 +57,8 @@ def licence(name: str) -> str:
     """What an installed package declares: an SPDX expression, else classifiers, else the first line of its text."""
     declared = metadata(name)
     classifiers = (words.split(" :: ")[-1] for words in declared.get_all("Classifier", []) if "License ::" in words)
-    return declared["License-Expression"] or ", ".join(classifiers) or (declared["License"] or "").split("\n")[0]
+    text = (declared["License"] or "").split("\n")[0]
+    return declared["License-Expression"] or ", ".join(classifiers) or text or UNDECLARED.get(name, "")
 
 
 def page() -> str:
