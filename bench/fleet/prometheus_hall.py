@@ -60,6 +60,7 @@ def main(
     seconds: Annotated[float, typer.Option(help="That are measured.")] = 300.0,
     scored: Annotated[bool, typer.Option("--scored", help="Let a static twin judge the fans.")] = False,
     faulty: Annotated[int, typer.Option(help="Nodes with a fan that becomes 15 % slower, with --scored.")] = 0,
+    known_for: Annotated[float, typer.Option(help="Periods before nodes become bad or faulty.")] = 0.0,
     json_output: JsonOption = False,
 ) -> None:
     """Print what acquisition takes, and by kind of node which of the due samples came, and when."""
@@ -69,13 +70,14 @@ def main(
     plan.faulty = [(3 + 17 * number) % controllers for number in range(faulty)]
     with tempfile.TemporaryDirectory() as folder:
         twin = twin_of_hall(plan, Path(folder), period_s, LEARNED_PERIODS * period_s, "") if scored else None
-        about, rows = _measured(plan, Path(folder), period_s, seconds, twin)
+        about, rows = _measured(plan, Path(folder), period_s, seconds, twin, known_for)
     show({"acquisition": [about], "samples by kind of node": rows}, [], as_json=json_output)
 
 
 def _measured(
-    plan: Plan, folder: Path, period_s: float, seconds: float, twin: Path | None
+    plan: Plan, folder: Path, period_s: float, seconds: float, twin: Path | None, known_for: float
 ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    bad = {number: kind for kind in BAD for number in getattr(plan, kind)}
     words = _prometheus(plan, folder, period_s)
     with _running(_exporters(plan, folder)), _running(words) as prometheus:
         url = f"http://127.0.0.1:{words[-1].rpartition(':')[2]}"
@@ -85,8 +87,14 @@ def _measured(
         with join_bus(config) as bus:
             watcher, arriving = SiteWatcher(bus, config.site), RawSamples(bus, config.site, names)
             alarms, scored_s = list[Alarm](), list[float]()
+
+            def add_score(_: str, payload: bytes) -> None:
+                score = decode(Score, payload)
+                if int(score.header.tray.removeprefix("node")) not in bad:
+                    scored_s.append(time.time() - int(score.t_ns[-1]) / NS_PER_S)
+
             bus.subscribe(tray_key(config.site, "*", "alarm"), lambda _, payload: alarms.append(decode(Alarm, payload)))
-            bus.subscribe(tray_key(config.site, "*", "score"), lambda _, payload: scored_s.append(_age_s(payload)))
+            bus.subscribe(tray_key(config.site, "*", "score"), add_score)
             up = RunningCommand(["up", "-c", path, "--json"])
             try:
                 seen: set[str] = set()
@@ -101,6 +109,7 @@ def _measured(
                     for view in watcher.stages()
                     if view.alive and view.health.stage == "acquisition"
                 )
+                time.sleep(known_for * period_s)
                 (folder / "bad").touch()
                 time.sleep(4.0 * period_s)  # until Prometheus has left out what is dead
                 before_s, queries = [cpu_s(process), cpu_s(prometheus.pid)], _queries(url)
@@ -136,17 +145,11 @@ def _measured(
                 up.end()
             finally:
                 up.kill()
-    bad = {number: kind for kind in BAD for number in getattr(plan, kind)}
     groups: dict[str, list[str]] = defaultdict(list)
     for name in names:
         number = int(name.removeprefix("node"))
         groups[bad.get(number, f"{ORDINARY}: {list(EXPORTERS)[number % len(EXPORTERS)]}")].append(name)
     return about, list(samples_by_kind(groups, times_ns, seconds / period_s, first=ORDINARY))
-
-
-def _age_s(payload: bytes) -> float:
-    """How old the newest sample of a score is."""
-    return time.time() - int(decode(Score, payload).t_ns[-1]) / NS_PER_S
 
 
 def _configuration(plan: Plan, folder: Path, url: str, twin: Path | None) -> tuple[Path, dict[str, int], float]:
