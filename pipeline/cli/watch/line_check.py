@@ -212,6 +212,8 @@ def _ranges(
     if unknown := sorted(silent - doubts.keys()):
         yield False, f"no speed of {tray.names.labels(unknown)}: {tray.source.no_speed}"
     known_commands = command[np.isfinite(command)]  # a fan's may be unknown, but not all
+    if without := np.flatnonzero(~np.isfinite(command).any(axis=0)).tolist():
+        yield None, f"{tray.names.labels(without)}: no command is known, so not judged: say in source where it is"
     low, high = float(known_commands.min()), float(known_commands.max())
     if twin and not (twin.card.command_range[0] <= high and low <= twin.card.command_range[1]):
         known = "{:g} to {:g}".format(*twin.card.command_range)
@@ -246,7 +248,9 @@ def _range_of(command: Array, speed_rad_s: Array, tray: TrayConfig) -> str:
     if tray.speed_unit == "rad/s":  # numbers in rpm that are taken for rad/s are plausible, and ten times too large
         speeds += f" ({_speeds(speed_rad_s, 'rpm')})"
     limits = f"of {tray.command_min:g} to {tray.command_max:g}"
-    return f"commands {command.min():g} to {command.max():g} ({limits}), speeds {speeds}"
+    known = command[np.isfinite(command)]
+    commands = f"commands {known.min():g} to {known.max():g} ({limits}), " if len(known) else ""
+    return f"{commands}speeds {speeds}"
 
 
 def _tachos(t_s: Array, speed_rad_s: Array, tray: TrayConfig) -> Iterator[Finding]:

@@ -188,6 +188,16 @@ def test_while_a_site_runs_pushed_samples_are_listened_to(endpoint: str, tmp_pat
     assert [line for ok, line in lines if not ok] == ["tray1: no speed of fan 1: is its tacho connected?"]
 
 
+def test_a_fan_without_a_command_is_named_and_shown_by_its_speed_alone() -> None:
+    line = line_of(np.arange(50) / 10.0, np.full(50, 150.0))
+    for raw in line:
+        raw.command[:, 1] = np.nan
+    said = _findings(line, config_of().trays[0], config_of(), None, {})
+    assert (None, "fan 1: no command is known, so not judged: say in source where it is") in said
+    (shown,) = [text for _, text in said if text.startswith("fan 1: speeds")]
+    assert "nan" not in shown
+
+
 def test_a_source_whose_samples_are_all_refused_is_said_with_the_reason(tmp_path: Path) -> None:
     """One that is asked so rarely that its health has no problem yet."""
     (tmp_path / "fans").write_text('#!/bin/sh\necho \'{"command": [null, null], "speed": [1, 2]}\'; exec sleep 100\n')
