@@ -57,10 +57,10 @@ def on_the_grid(missing: Floats) -> Prediction:
 
 
 def resampled(
-    speed: Floats, rate_hz: int, fans: int = 1, tachos: Sequence[Tacho] = INSTANTANEOUS, t_ns: Times | None = None
+    speed: Floats, rate_hz: float, fans: int = 1, tachos: Sequence[Tacho] = INSTANTANEOUS, t_ns: Times | None = None
 ) -> Prediction:
     """Predictions of TWIN_SPEED beside these raw samples, as the resampler shows them."""
-    t_ns = EPOCH_NS + NS_PER_S // rate_hz * np.arange(len(speed)) if t_ns is None else t_ns
+    t_ns = EPOCH_NS + round(NS_PER_S / rate_hz) * np.arange(len(speed)) if t_ns is None else t_ns
     raw = Raw(fans=fans, host_receive_t_ns=t_ns, command=np.full(speed.shape, NEEDED), speed_rad_s=speed)
     resampler = ResamplerCore(fans, ResamplerConfig(rate_hz=float(rate_hz)), tachos=tachos)
     grid = join([*resampler.step(raw), *resampler.close()])
@@ -172,6 +172,37 @@ def test_a_tacho_of_many_wrong_readings_is_said_and_raises_no_alarm() -> None:
     _, alarms = feed(core, [at_2_hz(is_wrong, 2.0 * TWIN_SPEED)])
     assert alarms == []
     assert "fan 0: 5% of the readings of its tacho are wrong: check the tacho and its wire" in core.notes()
+
+
+CHIP = Tacho(kind="average", window_s=0.05, update_s=1.5)
+WRONG = (2.0 * TWIN_SPEED, 0.5 * TWIN_SPEED, 9917.0 * np.pi / 30.0, 65535.0 * np.pi / 30.0)
+
+
+@pytest.mark.parametrize(
+    ("rate_hz", "tacho"),
+    [
+        (rate_hz, tacho)
+        for tacho in (Tacho(), CHIP)
+        for rate_hz in (10, 2, 1, 1 / 1.5, 1 / 15)
+        if rate_hz != 1 or tacho != CHIP
+    ],
+)
+def test_one_wrong_reading_is_no_alarm_at_any_rate_and_a_slower_fan_is_found(rate_hz: float, tacho: Tacho) -> None:
+    shown = max(1, round(tacho.held_s * rate_hz))  # samples of a reading
+    reading = np.arange(220 * shown) // shown
+    speed = TWIN_SPEED + noise(220, seed=3)[reading]
+    for kind, wrong in enumerate(WRONG):
+        speed[reading % (45 * len(WRONG)) == 45 * kind + 44] = wrong
+    core = core_of(tachos=(tacho,))
+    _, alarms = feed(core, [resampled(speed, rate_hz, tachos=(tacho,))])
+    assert alarms == []
+    speed[reading >= 200] *= 0.9
+    core = core_of(tachos=(tacho,))
+    _, alarms = feed(core, [resampled(speed, rate_hz, tachos=(tacho,))])
+    raised = [(each.t_ns - EPOCH_NS) / NS_PER_S for each in alarms if each.transition == Transition.RAISED]
+    assert len(raised) == 1
+    after_s = raised[0] - 200 * max(tacho.held_s, 1 / rate_hz)
+    assert 0.0 <= after_s <= 4.5 * max(tacho.held_s, 1 / rate_hz), after_s
 
 
 def test_an_alarm_is_not_lost_between_the_counts_of_a_slow_tacho() -> None:
