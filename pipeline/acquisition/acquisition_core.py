@@ -30,6 +30,7 @@ from fantwin.pipeline.sources.source import (
     ReadingLimits,
     SampleSource,
 )
+from fantwin.pipeline.sources.stand_in import with_stand_in
 from fantwin.pipeline.timebase.host_clock import HostClock
 from fantwin.schemas.channels import CHANNELS
 from fantwin.schemas.health import AcceptedSamples, NamedFan
@@ -42,7 +43,7 @@ STEP_SHOWN_NS = 60 * NS_PER_S  # how long health says that the host clock was se
 
 def limits_of(tray: TrayConfig) -> ReadingLimits:
     """Limits for the accepted readings of a tray."""
-    return ReadingLimits(tray.fans, tray.command_min, tray.command_max, tray.speed_max)
+    return ReadingLimits(tray.fans, tray.command_min, tray.command_max, tray.speed_max, bool(tray.command_from))
 
 
 Item: TypeAlias = BlockEvent | Command | PushedSamples
@@ -224,4 +225,7 @@ class AcquisitionCore(Core):
             reading = self._plausibility.plausible(item)
             if reading is not None and self._sequence.is_new(reading, self._counts):
                 self._counts["samples"] += 1
-                yield ReceivedReading(self._plausibility.with_plausible_columns(reading), batch.received_t_ns)
+                reading = self._plausibility.with_plausible_columns(reading)
+                if self._tray.command_from:
+                    reading = with_stand_in(reading, self._tray.command_from, RAD_S_PER_UNIT[self._tray.speed_unit])
+                yield ReceivedReading(reading, batch.received_t_ns)

@@ -69,7 +69,7 @@ class Plausibility:
     def _with_plausible_speeds(self, reading: Reading) -> Reading:
         speed_max = self.limits.speed_max
         self.counts["no_speed"] += sum(map(math.isnan, reading.speed))
-        if unknown := sum(map(math.isnan, reading.command)):
+        if not self.limits.has_stand_in and (unknown := sum(map(math.isnan, reading.command))):
             self.counts["fans_without_command"] += unknown
         absurd = [speed for speed in reading.speed if abs(speed) > speed_max]
         if not absurd:

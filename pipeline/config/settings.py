@@ -27,6 +27,7 @@ from fantwin.pipeline.errors import UsageError, UserError
 from fantwin.pipeline.sources.kinds import parse_source
 from fantwin.pipeline.sources.serial.config import MOST_FANS_ON_LINE
 from fantwin.pipeline.sources.source import MOST_FANS, SourceConfig, too_many_fans
+from fantwin.pipeline.sources.stand_in import STAND_INS
 from fantwin.schemas.fan_names import LONGEST_NAME, FanNames, fan_label, is_fan_name, is_one_short_line
 from fantwin.schemas.tacho import INSTANTANEOUS, Tacho, Tachos, tacho_of_each_fan
 from fantwin.schemas.topics import RESERVED_TRAY_NAMES
@@ -260,6 +261,11 @@ class TrayConfig(Section):
     speed_max: float = Field(default=1e5, gt=0, description="a speed beyond this, in speed_unit, is refused")
     command_min: float = Field(default=0.0, description="smallest command the device may send or be sent")
     command_max: float = Field(default=1.0, description="largest command the device may send or be sent")
+    command_from: Literal["", *STAND_INS] = Field(  # type: ignore[valid-type]
+        default="",
+        description="what stands for a command that the source does not know: the median speed of the other fans, in "
+        "rpm, or a channel; command_min and command_max are then its range",
+    )
     twin: Path | None = Field(default=None, description="ONNX file of the healthy twin")
     tacho: Tachos | None = Field(
         default=None,

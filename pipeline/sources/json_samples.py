@@ -118,9 +118,9 @@ def _timed_reading(sample: Mapping[str, Any]) -> TimedReading:
     if "fans" in sample:
         sample = {**{key: sample[key] for key in ("t", "sequence") if key in sample}, **_by_column(sample)}
     columns = {name: _numbers(name, sample[name]) for name in _OF_FAN if name in sample}
-    for name in ("command", "speed"):
-        if name not in columns:
-            raise ValueError(f"{name!r} is missing")
+    if "speed" not in columns:
+        raise ValueError("'speed' is missing")
+    columns.setdefault("command", (math.nan,) * len(columns["speed"]))
     t_ns = _time_ns(sample["t"]) if sample.get("t") is not None else None
     clock_us = None if t_ns is None else (t_ns + NS_PER_US // 2) // NS_PER_US % UINT32
     reading = Reading(

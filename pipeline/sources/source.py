@@ -88,12 +88,16 @@ class ReadingLimits:
     command_min: float
     command_max: float
     speed_max: float
+    has_stand_in: bool = False
+    """something stands for the command (pipeline.sources.stand_in): readings need none"""
 
     def why_refused(self, reading: Reading) -> Rejected | None:
         """Why a reading cannot be used; None: it can, maybe without some speeds."""
         if not len(reading.command) == len(reading.speed) == self.fans:
             detail = f"a reading of {len(reading.speed)} fans, this tray has {self.fans}"
             return Rejected("wrong_fan_count", detail, is_sample=True, setting=f"fans = {self.fans}")
+        if self.has_stand_in:
+            return None
         # Without its actual command a fan cannot be judged, and a command must not be invented: NaN is one not known.
         if all(map(math.isnan, reading.command)):
             return Rejected("unknown_command", "the command of no fan is known", is_sample=True, setting="source")

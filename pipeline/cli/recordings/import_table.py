@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from glob import glob
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import typer
 
 from fantwin.pipeline.cli.options import JsonOption
@@ -17,7 +18,10 @@ from fantwin.pipeline.config.settings import NAME_PATTERN
 from fantwin.pipeline.errors import UsageError, UserError
 from fantwin.pipeline.recordings.raw_recordings import write_table
 from fantwin.pipeline.sources.imported_file import preview_of, read_files
+from fantwin.pipeline.sources.stand_in import FEWEST, STAND_INS, stand_in, stand_ins_of
+from fantwin.pipeline.sources.tables.measured_table import Table, hold_last
 from fantwin.pipeline.sources.tables.tachos import parse_tachos
+from fantwin.pipeline.sources.tables.units import SPEED_UNITS
 from fantwin.pipeline.sources.tacho_evidence import tacho_hints
 from fantwin.pipeline.sources.wanted import Wanted
 from fantwin.schemas.channels import CHANNELS
@@ -72,6 +76,13 @@ def import_table(
             "Repeatable.",
         ),
     ] = None,
+    command_from: Annotated[
+        str | None,
+        typer.Option(
+            metavar="|".join(STAND_INS),
+            help="What stands for a command that is not in the file: the median speed of the others, or a --channel.",
+        ),
+    ] = None,
     tray: Annotated[str, typer.Option(help="Name of the tray in the recording.")] = "tray1",
     tacho: Annotated[
         list[str] | None,
@@ -107,6 +118,8 @@ def import_table(
 
     Example: fantwin import FLIGHT.ulg --command 'out.u[*]' --speed 'esc.rpm[*]:rpm' -o REC.mcap
     """
+    if command_from is not None and (command or not speed or command_from not in STAND_INS):
+        raise UsageError(f"--command-from is one of {', '.join(STAND_INS)}, with --speed and without --command")
     paths = _existing(files)
     wanted = Wanted(
         command or (),
@@ -130,7 +143,7 @@ def import_table(
         raise UsageError(f"--tray {tray}: use letters, digits, - and _, but not {' or '.join(RESERVED_TRAY_NAMES)}")
     if output.exists() and not force:
         raise UserError(f"{output}: exists; name another file with -o, or replace it with --force")
-    table = read_files(paths, wanted)
+    table = _without_command(paths, wanted, command_from) if speed and not command else read_files(paths, wanted)
     tachos = parse_tachos(tacho or (), table.fans)
     names = FanNames(tuple(label if is_fan_name(label) else "" for label in table.labels))
     write_table(table, output, tray, tachos, names)
@@ -156,6 +169,33 @@ def import_table(
     show(found, *lines, json_output=json_output)
     for hint in hints if not json_output else ():
         typer.echo(f"hint: {hint}; see --tacho", err=True)
+
+
+def _without_command(paths: Sequence[Path], wanted: Wanted, name: str | None) -> Table:
+    """The samples of files without a command, with what stands for it.
+
+    Raises:
+        UsageError: none was chosen.
+    """
+    columns = [each.rpartition(":")[0] if each.rpartition(":")[2] in SPEED_UNITS else each for each in wanted.speed]
+    table = read_files(paths, replace(wanted, command=columns))
+    found = stand_ins_of(table.speed_rad_s, table.auxiliary)
+    if name is None:
+        offers = "".join(f"; or {each.words(table.fans)}" for each in found)
+        raise UsageError(f"an import needs --command{offers}")
+    command = hold_last(stand_in(name, table.speed_rad_s, table.auxiliary))
+    known = np.isfinite(command).all(axis=1)
+    if name not in [each.name for each in found] or known.sum() < FEWEST:
+        raise UserError(f"{paths[0]}: --command-from {name}: it is not known of all fans; give --channel, or more fans")
+    (words,) = (each.words(table.fans) for each in found if each.name == name)
+    return replace(
+        table,
+        t_ns=table.t_ns[known],
+        command=command[known],
+        speed_rad_s=table.speed_rad_s[known],
+        auxiliary={channel: values[known] for channel, values in table.auxiliary.items()},
+        remarks=(*table.remarks, f"no command is known; {words}"),
+    )
 
 
 def _existing(files: Sequence[Path]) -> list[Path]:
