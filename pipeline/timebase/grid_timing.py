@@ -19,8 +19,6 @@ PERIODS_S = (60, 30, 20, 15, 10, 5, 3, 2)
 """sample periods of grids slower than 1 Hz: how often systems of monitoring look"""
 RATES_HZ = (*(1 / period_s for period_s in PERIODS_S), 1, 2, 5, 10, 20, 25, 50, 100)
 """rates of a grid that follows from the line; a faster line gets the last one"""
-HELD_FROM_NS = 3 * NS_PER_S // 2
-"""grid period from which on readings are held until the next: between two, a fan has long reached its speed"""
 GAP_PERIODS = 5.0
 """length of a gap that is bridged, in sample periods"""
 FEWEST_PERIODS = 1.5  # of a gap limit: with fewer, samples that are a little late are gaps

@@ -1,4 +1,4 @@
-"""Speeds at grid times, interpolated linearly between raw samples; each fan between its own readings."""
+"""Commands and speeds at grid times; speeds are interpolated linearly, each fan's between its own readings."""
 
 from __future__ import annotations
 
@@ -8,8 +8,14 @@ import numpy as np
 
 from fantwin.schemas.channels import CHANNELS
 from fantwin.schemas.messages import Array
+from fantwin.schemas.units import NS_PER_S
 
 NEVER_NS = -(1 << 62)
+SLOW_NS = NS_PER_S // 2
+"""a grid of this period or a longer one is slow: a fan moves much within it, so that the phase of samples and grid must
+not show, which changes with a restart, and slips where a sample comes now before, now after a grid time"""
+SETTLED_NS = 3 * NS_PER_S // 2
+"""from this grid period on, commands and readings are held until the next: in between, a fan has reached its speed"""
 _IS_LINEAR = np.array([each.interpolation == "linear" for each in CHANNELS])[:, np.newaxis]
 
 
@@ -59,6 +65,23 @@ def interpolate_samples(t_ns: Array, at: Array, samples: Samples, is_held: Array
     share = np.where(is_held, 0.0, (since_ns / np.maximum(span_ns, 1))[:, np.newaxis])
     between = here + share * (samples.speed_rad_s.take(after, axis=0, mode="clip") - here)
     return np.where((since_ns == 0)[:, np.newaxis], here, between)
+
+
+def held_commands(t_ns: Array, at: Array, samples: Samples, period_ns: int) -> Array:
+    """Commands (n, fans) at t_ns (n,): those of the last samples at or before each time.
+
+    On a slow grid on which fans do not settle, the mean of what holds until the next grid time, so that no impulse is
+    lost: that command, and from its time on the one of the next sample. A grid sample is made when the first raw sample
+    at or after it is there, so none after that counts.
+
+    at: (n,), index of the last sample at or before each time.
+    """
+    held = samples.command.take(at, axis=0)
+    if not SLOW_NS <= period_ns < SETTLED_NS:
+        return held
+    since_ns = t_ns + period_ns - samples.t_ns.take(at + 1, mode="clip")
+    share = np.where(samples.t_ns.take(at) == t_ns, 0.0, (since_ns / period_ns).clip(0.0, 1.0))[:, np.newaxis]
+    return np.where(share > 0.0, held + share * (samples.command.take(at + 1, axis=0, mode="clip") - held), held)
 
 
 def interpolate_auxiliary(t_ns: Array, at: Array, samples: Samples) -> Array:

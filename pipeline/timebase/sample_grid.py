@@ -14,12 +14,15 @@ from typing import Any
 import numpy as np
 
 from fantwin.pipeline.timebase.device_clock import LARGEST_GAP, UINT32, DeviceClock
-from fantwin.pipeline.timebase.grid_timing import HELD_FROM_NS, GridTiming
+from fantwin.pipeline.timebase.grid_timing import GridTiming
 from fantwin.pipeline.timebase.interpolation import (
     NEVER_NS,
+    SETTLED_NS,
+    SLOW_NS,
     LastReadings,
     Samples,
     all_true,
+    held_commands,
     interpolate_auxiliary,
     interpolate_samples,
 )
@@ -59,7 +62,8 @@ class SampleGrid:
         """tachos: one for each fan; readings that a tacho shows until the next one are held. link_wait_ns: how long a
         gap is not published because its samples may still come."""
         self._fans = fans = len(tachos)
-        self._is_held = np.array([tacho.held_s > 0.0 or timing.period_ns >= HELD_FROM_NS for tacho in tachos])
+        is_slow, settles = timing.period_ns >= SLOW_NS, timing.period_ns >= SETTLED_NS
+        self._is_held = np.array([settles or (tacho.held_s > 0.0 and not is_slow) for tacho in tachos])
         self._holds = bool(self._is_held.any())
         self._period_ns = timing.period_ns
         self._gap_limit_ns = timing.gap_limit_ns
@@ -299,9 +303,8 @@ class SampleGrid:
             self._in_gap = False
             auxiliary = interpolate_auxiliary(t_ns, at, samples) if self._auxiliary else samples.auxiliary
             is_late = t_ns - samples.t_ns.take(at) >= self._period_ns
-            self._append(
-                t_ns, samples.command.take(at, axis=0), speed, NO_SPEED, ~has.take(at, axis=0), is_late, auxiliary
-            )
+            command = held_commands(t_ns, at, samples, self._period_ns)
+            self._append(t_ns, command, speed, NO_SPEED, ~has.take(at, axis=0), is_late, auxiliary)
         return not waits
 
     def _fill_gap(self, until_t_ns: int) -> None:
