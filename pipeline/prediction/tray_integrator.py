@@ -185,6 +185,9 @@ class TrayIntegrator:
             invalid_reason = np.where(inputs.stopped, REASON.STOPPED, invalid_reason)
             judged = judged | ((inputs.stopped | starting) & (grid.invalid_reason == REASON.NO_SPEED))
         invalid_reason = np.where(judged, invalid_reason, grid.invalid_reason).astype(np.uint8)
+        # what gives neither a command nor a speed is not read; that is no fault of a tacho
+        is_unread = ~np.isfinite(grid.command) & (invalid_reason == REASON.NO_SPEED)
+        invalid_reason[is_unread] = REASON.OUT_OF_RANGE
         return self._prediction(grid, predicted, reading_range, invalid_reason, ratios)
 
     def problem(self) -> str:

@@ -99,14 +99,19 @@ def scored(grid: Grid) -> tuple[list[Score], list[Alarm], Prediction]:
     return scores, [each for each in found if isinstance(each, Alarm)], predicted
 
 
+@pytest.mark.parametrize("has_speed", [True, False])
 @pytest.mark.parametrize("unknown", [1, 3, 30])
-def test_a_command_that_is_unknown_for_a_while_is_said_raises_no_alarm_and_leaves_no_trace(unknown: int) -> None:
+def test_a_command_that_is_unknown_for_a_while_is_said_raises_no_alarm_and_leaves_no_trace(
+    unknown: int, has_speed: bool
+) -> None:
     t_s = times_of(0.4, 0.0)
     command = np.full(SECONDS, 50.0)
     speed = speeds_at(t_s, command)
     command[60 : 60 + unknown] = np.nan
+    if not has_speed:  # as of a fan whose object cannot be read
+        speed[60 : 60 + unknown] = np.nan
     grid = gridded(t_s, speed, command)
-    assert np.isfinite(grid.speed_rad_s).all(), "the speed is known all the same"
+    assert np.isfinite(grid.speed_rad_s).all() or not has_speed, "the speed is known all the same"
     scores, alarms, predicted = scored(grid)
     assert not [alarm for alarm in alarms if alarm.transition == Transition.RAISED]
     reason, lacking = predicted.invalid_reason[:, 0], np.isnan(grid.command[:, 0])

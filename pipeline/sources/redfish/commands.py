@@ -56,7 +56,7 @@ class FanCommands:
         listed = {key: pwm.percent for pwm in listing.pwms for key in pwm.keys}
 
         def value(fan: FanObject, place: CommandPlace | None) -> float:
-            if place is None:
+            if place is None or fan.why_unread:  # with a command alone its tacho would seem to be silent
                 return math.nan
             if place.pwm:
                 return listed.get(place.pwm, math.nan)

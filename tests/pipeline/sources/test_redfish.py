@@ -357,6 +357,10 @@ def test_a_fan_that_cannot_be_read_is_named_by_its_path_and_comes_back() -> None
         controller.documents[path] = 500
         assert math.isnan(reading(made).speed[1])
         assert [note.detail for note in notes] == [f"{path}: refused with HTTP status 500"]
+        controller.documents["/redfish/v1/Oem/Fans"] = {"Duty": 40.0}
+        elsewhere = connected(url, command="/redfish/v1/Oem/Fans#/Duty")
+        assert [math.isnan(each) for each in reading(elsewhere).command] == [False, True], "no silent tacho"
+        elsewhere.disconnect()
         controller.documents[path] = kept
         assert reading(made) == Reading((40.0, 40.0), (4100.0, 4100.0))
         made.disconnect()
