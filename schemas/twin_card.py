@@ -127,6 +127,7 @@ class TrainingCard:
     networks: Count = 1
     of_type: str = ""
     fan_names: tuple[str, ...] = ()
+    closed_loop: tuple[bool, ...] = ()
 
 
 @dataclass(frozen=True, config=_CONFIG)
@@ -329,6 +330,7 @@ class TwinCard:
                 f"command {self.command_range[0]:.4g} to {self.command_range[1]:.4g} {self.command_unit}".rstrip()
                 + f", speed_rpm {low:.4g} to {high:.4g}",
                 f"{of.source} free run: " + ", ".join(f"{name} {value:.4g}" for name, value in shown.items()),
+                *(["closed loop: yes"] if self.is_closed_loop else []),
             )
         )
 
@@ -348,6 +350,11 @@ class TwinCard:
             return ""
         here, there = (", ".join(each) for each in zip(*found, strict=True))
         return f"the fans {here} are in the places of {there} in the twin: use a twin of these fans in this order"
+
+    @property
+    def is_closed_loop(self) -> bool:
+        """Whether the command of any fan answered its measured speed in training."""
+        return any(self.training.closed_loop)
 
     @property
     def fan_numbers(self) -> tuple[int, ...]:

@@ -209,11 +209,12 @@ def advance(
     duration_s: float,
     parameters: FanParameters,
     disturbance: Disturbance = HEALTHY,
+    longest_substep_s: float = MAX_SUBSTEP_S,
 ) -> PlantState:
-    """The state `duration_s` later with duty (fans,) and disturbance held; substeps of at most 1 ms."""
+    """The state `duration_s` later with duty (fans,) and disturbance held."""
     if duration_s <= 0.0:
         return state
-    substeps = int(np.ceil(duration_s / MAX_SUBSTEP_S))
+    substeps = int(np.ceil(duration_s / longest_substep_s))
     step_s = duration_s / substeps
     target_v = parameters.supply_v * disturbance.supply_factor * drive(duty, parameters)
     decay = np.exp(-step_s / np.asarray(parameters.lag_s))

@@ -1,7 +1,7 @@
 """From a fitted model to a twin with its card: band, uncertainty, torque balance, and figures on healthy runs."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import reduce
 from importlib.metadata import PackageNotFoundError, version
@@ -139,7 +139,7 @@ def finish_twin(
         command_range=(float(commands.min()), float(commands.max())),
         rate_hz=1.0 / float(np.median(np.concatenate([np.diff(run.t_s) for run in runs]))),
         network=model.network_card,
-        training=training,
+        training=replace(training, closed_loop=tuple(identification.closed_loop.tolist())),
         validation=ValidationCard(
             source="held-out" if validation_runs else "training",
             data=tuple(validation_data),

@@ -69,6 +69,10 @@ class TrainingData:
         """What people call the fan of each column."""
         return [self.names.label(fan) for fan in self.fans]
 
+    def numbers_where(self, flags: Sequence[bool]) -> list[int]:
+        """The fan numbers of the columns for which a flag is set."""
+        return [number for number, flag in zip(self.fans, flags, strict=True) if flag]
+
     def with_fan_numbers(self, warnings: Sequence[str]) -> list[str]:
         """The outlier warnings, then those of the model maker, with the fans and the speed unit of the recordings.
 

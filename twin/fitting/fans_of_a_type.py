@@ -22,6 +22,7 @@ from fantwin.twin.fitting.free_run_problem import (
     sums_by_fan,
     without_initial_speeds,
 )
+from fantwin.twin.fitting.identifiability import feedback_share
 from fantwin.twin.fitting.identification import Identification
 from fantwin.twin.fitting.reading_errors import robust_scale
 from fantwin.twin.fitting.trajectories import Trajectories, cut_into_trajectories, stretch_samples
@@ -119,6 +120,7 @@ def place_fans(
         iterations=found.iterations,
         warnings=_strangers(unknowns, of_type),
         misfits=(),
+        closed_loop=np.array([feedback_share(pieces, fan) > 0.0 for fan in range(fans)]),
     )
     return identification, of_unknowns
 

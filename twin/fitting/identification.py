@@ -7,8 +7,8 @@ largest whose parameters give nearly the smallest free-run error. A small lambda
 follows the response to the command, which is what has to be learned.
 
 Least squares on noisy regressors is biased, so that result only starts the refinement, a fit of the free run itself
-(twin.fitting.free_run_fit). The inertia stays anchored to the start: under closed-loop control the speed hardly moves,
-and a model so slow that it keeps its initial speed would otherwise fit best.
+(twin.fitting.free_run_fit). The inertia stays anchored to the start: where the speed hardly moves, a model so slow that
+it keeps its initial speed would otherwise fit best.
 
 The lag of the command (twin.models.lag) is estimated with the rest and kept only if it is larger than its uncertainty;
 otherwise it is zero, and the model is the published one of three parameters.
@@ -34,9 +34,11 @@ from fantwin.twin.fitting.free_run_fit import FreeRunFit, fit_physics
 from fantwin.twin.fitting.free_run_problem import ALL_FREE, FreeRunProblem, Prior
 from fantwin.twin.fitting.identifiability import (
     TOP_SPEED_QUANTILE,
+    feedback_share,
     identifiability_warnings,
     misfit_warnings,
     short_warnings,
+    why_a_loop_tells_nothing,
 )
 from fantwin.twin.fitting.reading_errors import robust_scale
 from fantwin.twin.fitting.trajectories import Trajectories, cut_into_trajectories, stretch_samples
@@ -71,7 +73,7 @@ class Identification:
     interval_95: (fans, 4, 2). A lag that was not found is zero, and so is its uncertainty. lambda_per_s, rmse_rad_s,
     time_constant_s, top_speed_rad_s: (fans,); the time constant is taken at the median speed. iterations: those of the
     refinement. warnings: one line each, empty when all is well. misfits: one line for the fans that physics alone do
-    not describe, which is what a hybrid is for.
+    not describe, which is what a hybrid is for. closed_loop: (fans,) true where the command answers the speed.
     """
 
     parameters: Array
@@ -84,6 +86,7 @@ class Identification:
     iterations: int
     warnings: tuple[str, ...]
     misfits: tuple[str, ...]
+    closed_loop: Flags
 
     @property
     def standard_errors(self) -> Array:
@@ -101,8 +104,7 @@ def identify(runs: Sequence[Run], *, progress: Progress = unreported) -> Identif
     """Identify every fan of the runs. Raises TwinError when the data do not determine the parameters."""
     fans = common_fans(runs)
     pieces = [piece for run in runs for piece in run.split_at_gaps()]
-    for fan in range(fans):
-        require_excitation(pieces, fan)
+    closed_loop = np.array([_in_a_loop(pieces, fan) for fan in range(fans)])
     top_speed = np.array([_top_speed_rad_s(_pooled(pieces, fan)[1]) for fan in range(fans)])
     start, lambda_per_s = _filtered_start(pieces, top_speed, progress)
     speed = np.array([np.nanmedian(_pooled(pieces, fan)[1]) for fan in range(fans)])
@@ -141,7 +143,17 @@ def identify(runs: Sequence[Run], *, progress: Progress = unreported) -> Identif
             *identifiability_warnings(runs, parameters, covariance),
         ),
         misfits=misfit_warnings(pieces, rmse_rad_s, trajectories.rms_of_fans(noise_rad_s)),
+        closed_loop=closed_loop,
     )
+
+
+def _in_a_loop(pieces: Sequence[Run], fan: int) -> bool:
+    """Whether the command of a fan answers its speed. Raises TwinError where nothing else has moved it."""
+    require_excitation(pieces, fan)
+    is_closed = feedback_share(pieces, fan) > 0.0
+    if is_closed and (why := why_a_loop_tells_nothing(pieces, fan)):
+        raise TwinError(f"fan {fan}: {why}")
+    return is_closed
 
 
 def filtering_operator(runs: Sequence[Run], fan: int, lambda_per_s: float) -> Array:

@@ -34,8 +34,9 @@ from fantwin.pipeline.site.loss_accounting import label, losses, refused, refuse
 from fantwin.pipeline.site.stage_states import note_lines, notes_as_json
 from fantwin.schemas.fan_names import FanNames
 from fantwin.schemas.health import Health
-from fantwin.schemas.messages import Raw
+from fantwin.schemas.messages import ModelCard, Raw
 from fantwin.schemas.streams import StreamId
+from fantwin.schemas.twin_card import CardError, TwinCard
 from fantwin.schemas.units import NS_PER_S
 
 _WIDEST = 1000
@@ -165,7 +166,10 @@ def _part_as_json(part: Contents) -> dict[str, Any]:
         "left_out": list(left_out_of(part.metadata)),
         "attachments": list(part.attachments),
         "has_configuration": CONFIGURATION in part.attachments,
-        "twins": {_tray(key): {"twin": c.twin, "kind": c.kind, "sha256": c.sha256} for key, c in part.cards.items()},
+        "twins": {
+            _tray(key): {"twin": c.twin, "kind": c.kind, "sha256": c.sha256, "closed_loop": _is_closed_loop(c)}
+            for key, c in part.cards.items()
+        },
         "topics": {key: _counts_as_json(counts) for key, counts in sum_by_key(part.streams.items()).items()},
         "producers": [{"key": key, "producer": producer, **asdict(a)} for (key, producer), a in part.streams.items()],
         "other_topics": dict(part.others),
@@ -242,7 +246,8 @@ def _about(part: Contents) -> list[str]:
             f"tray {tray}{fans}, speeds in {metadata.get(f'speed_unit.{tray}') or metadata.get('speed_unit', 'rad/s')}"
         )
     for key, card in part.cards.items():
-        lines.append(f"twin of {_tray(key)}: {card.twin}, {card.kind}, sha256 {card.sha256[:12]}")
+        closed = ", closed loop: yes" if _is_closed_loop(card) else ""
+        lines.append(f"twin of {_tray(key)}: {card.twin}, {card.kind}{closed}, sha256 {card.sha256[:12]}")
     if left_out := left_out_of(metadata):
         lines.append(f"left out on purpose (recorder.topics): {', '.join(left_out)}")
     if "source" in metadata:
@@ -250,6 +255,13 @@ def _about(part: Contents) -> list[str]:
     if part.attachments:
         lines.append(f"attached: {', '.join(part.attachments)}")
     return lines
+
+
+def _is_closed_loop(card: ModelCard) -> bool:
+    try:
+        return TwinCard.from_json(card.card_json).is_closed_loop
+    except CardError:  # of another format, or of no card
+        return False
 
 
 def _table(part: Contents) -> Table:

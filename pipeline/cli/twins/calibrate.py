@@ -16,6 +16,7 @@ from fantwin.pipeline.cli.in_parallel import JobsOption, RecordingsInParallel, S
 from fantwin.pipeline.cli.options import JsonOption, SetOption
 from fantwin.pipeline.cli.progress import interruptible, show_part
 from fantwin.pipeline.cli.twins.data_options import FromOption, ToOption, recordings_argument, recordings_option
+from fantwin.pipeline.cli.twins.figures import closed_loop_sentence
 from fantwin.pipeline.errors import UsageError, UserError
 from fantwin.pipeline.files import write_whole
 from fantwin.pipeline.learning.drops_found import drops_found
@@ -152,7 +153,10 @@ def calibrate(
             }
             for warning in warnings:
                 typer.echo(warning, err=True)
-            lines = _lines(output, calibration, [drop.line(speed_unit) for drop in drops])
+            card, names = load_tray_twin(output).card, found.learned[0].tray.names
+            loops = [fan for fan, closed in zip(card.fan_numbers, card.training.closed_loop, strict=False) if closed]
+            closed = [closed_loop_sentence(names.labels(loops))] if loops else []
+            lines = _lines(output, calibration, [*closed, *(drop.line(speed_unit) for drop in drops)])
             for line in () if json_output else lines:
                 typer.echo(line)
         if verify:

@@ -27,3 +27,11 @@ def sentence(figures: dict[str, Any], unit: str) -> str:
         f"R2 {shown(figures['r2'], '.4f')}, {shown(figures['coverage_2_sigma'], '.1%')} within 2 sigma; "
         f"one step: rmse {text['one_step_rmse']} {unit}; {figures['samples']} samples"
     )
+
+
+def closed_loop_sentence(fans: str) -> str:
+    """One line on fans whose command answers their speed."""
+    return (
+        f"closed loop: the command of {fans} answers the measured speed, so a fault shows in the command and hardly in "
+        "the speed; alarms compare the two"
+    )

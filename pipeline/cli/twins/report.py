@@ -28,7 +28,7 @@ from fantwin.pipeline.cli.twins.data_options import (
     report_damage,
     show_hints,
 )
-from fantwin.pipeline.cli.twins.figures import sentence
+from fantwin.pipeline.cli.twins.figures import closed_loop_sentence, sentence
 from fantwin.pipeline.errors import UsageError
 from fantwin.pipeline.extras import require
 from fantwin.pipeline.files import write_whole
@@ -175,9 +175,11 @@ def show_fans(recordings: Sequence[Path], part: Part, pool: RecordingsInParallel
         with training_progress(training_data) as start, twin_errors(training_data):
             found = identify_at_reference(training_data.runs, progress=start(""))
     result = fans_as_json(found, training_data)
-    allowed = [f"allows for {result['allows_for']}"] if result["allows_for"] else []
+    notes = [f"allows for {result['allows_for']}"] if result["allows_for"] else []
+    if loops := result["closed_loop"]:
+        notes.append(closed_loop_sentence(training_data.names.labels(loops)))
     warnings = [f"warning: {warning}" for warning in result["warnings"]]
-    pool.end_with(result, _table(result), *allowed, warnings=warnings, json_output=json_output)
+    pool.end_with(result, _table(result), *notes, warnings=warnings, json_output=json_output)
 
 
 def fans_as_json(at_reference: AtReference, training_data: TrainingData) -> dict[str, Any]:
@@ -209,6 +211,7 @@ def fans_as_json(at_reference: AtReference, training_data: TrainingData) -> dict
         "iterations": found.iterations,
         "warnings": training_data.with_fan_numbers([*at_reference.notes, *found.warnings, *found.misfits]),
         "allows_for": conditions.in_words if conditions else "",
+        "closed_loop": training_data.numbers_where(found.closed_loop.tolist()),
         "hints": list(training_data.hints),
     }
 

@@ -29,7 +29,7 @@ from fantwin.pipeline.cli.twins.data_options import (
     report_damage,
     show_hints,
 )
-from fantwin.pipeline.cli.twins.figures import sentence, shown
+from fantwin.pipeline.cli.twins.figures import closed_loop_sentence, sentence, shown
 from fantwin.pipeline.cli.twins.side_by_side import Data, train_side_by_side
 from fantwin.pipeline.errors import UsageError
 from fantwin.pipeline.extras import require_torch
@@ -227,6 +227,8 @@ def _lines(
     if conditions:
         columns = f"column{'s' * (len(conditions.needed) > 1)} {' and '.join(conditions.needed)}"
         yield f"  allows for {conditions.in_words}, and needs the {columns}"
+    if result["closed_loop"]:
+        yield f"  {closed_loop_sentence(training_data.names.labels(result['closed_loop']))}"
 
 
 def balance_sentence(result: dict[str, Any]) -> str:
@@ -258,5 +260,6 @@ def as_json(trained: TrainedTwin, training_data: TrainingData, output: Path) -> 
         "iterations": card.training.iterations,
         "duration_s": card.training.duration_s,
         "warnings": training_data.with_fan_numbers(trained.identification.warnings),
+        "closed_loop": training_data.numbers_where(card.training.closed_loop),
         "hints": list(training_data.hints),
     }

@@ -69,7 +69,7 @@ def test_topics_metadata_twins_and_stages_are_in_the_json_and_in_the_text(tmp_pa
     assert (found["messages"], found["duration_s"]) == (8, 6.0)
     assert found["size_bytes"] == (tmp_path / "r.mcap").stat().st_size
     assert found["has_configuration"] is True
-    assert found["twins"] == {"tray1": {"twin": "demo", "kind": "hybrid", "sha256": "ab" * 32}}
+    assert found["twins"] == {"tray1": {"twin": "demo", "kind": "hybrid", "sha256": "ab" * 32, "closed_loop": False}}
     assert found["stages"] == {
         "acquisition/tray1": {
             "status": "degraded",

@@ -7,11 +7,13 @@ import numpy as np
 import pytest
 
 from fantwin.schemas.tacho import Tacho
+from fantwin.twin.errors import TwinError
 from fantwin.twin.fitting.identifiability import feedback_share, identifiability_warnings
 from fantwin.twin.fitting.identification import identify
 from fantwin.twin.models.physics import PARAMETER_NAMES
 from fantwin.twin.runs import Array, Run
 from tests.support import fan_data
+from tests.support.controlled_fans import ANSWER_THE_SPEED, LOOPS, plain_fans, runs_of, true_parameters
 from tests.support.fan_data import published_run, rough_run
 
 INERTIA, VISCOUS, DRAG = fan_data.PUBLISHED_PARAMETERS[:3]
@@ -144,11 +146,30 @@ def test_every_loop_is_noticed_also_behind_steps_of_its_set_point(set_points: st
     assert all(feedback_share([run], fan) > 0.0 for fan in range(run.fans))
 
 
-def test_a_loop_at_one_set_point_is_reported_with_biased_and_indistinguishable_parameters() -> None:
-    lines = warnings_of(controlled(np.full((4000, 4), 120.0), seed=5))
-    for fan in range(4):
-        assert has_line_with(lines, f"fan {fan}: closed loop", "J and lag_s", "controller off")
-        assert has_line_with(lines, f"fan {fan}: alpha and C_D cannot be distinguished", "the speed keeps between 11")
+def test_a_loop_at_one_set_point_tells_one_operating_point_and_no_parameters() -> None:
+    with pytest.raises(TwinError) as refused:
+        identify([controlled(np.full((4000, 4), 120.0), seed=5)])
+    said = re.fullmatch(
+        r"fan 0: closed loop at one set-point: .* so J, alpha and C_D cannot be known, only that command (\S+) gives "
+        r"(\S+) rad/s; record several set-points over the range, or steps of the command .*",
+        str(refused.value),
+    )
+    assert said and float(said[2]) == pytest.approx(120.0, rel=0.01)
+    assert float(said[1]) == pytest.approx((VISCOUS + DRAG * 120.0) * 120.0, rel=0.01)
+
+
+def test_fans_whose_command_answers_their_speed_are_known_and_identified_as_well_as_in_open_loop() -> None:
+    fans = plain_fans(3, seed=7)
+    runs = runs_of(list(LOOPS), fans, 300.0, 10.0, seed=11)
+    closed = {loop: [feedback_share([run], fan) > 0.0 for fan in range(run.fans)] for loop, run in runs.items()}
+    assert closed == {loop: [loop in ANSWER_THE_SPEED] * 3 for loop in LOOPS}
+    for loop in ("open", "PI fast", "PI slow", "current limit"):
+        found = identify([runs[loop]])
+        error, true = found.parameters[:, :3] - true_parameters(fans), true_parameters(fans)
+        assert np.all(np.abs(error) < 3.0 * found.standard_errors[:, :3] + 0.02 * true), loop  # the air of that day
+        assert np.abs(np.median(error[:, 0] / true[:, 0])) < 0.02, loop
+        assert list(found.closed_loop) == closed[loop]
+        assert not has_line_with(found.warnings, "closed loop")
 
 
 @pytest.mark.parametrize(
