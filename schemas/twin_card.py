@@ -298,8 +298,9 @@ class TwinCard:
                 raise ValueError(f"balance.{name} must have one value for each fan")
         if len(self.fan_numbers) != self.fans:
             raise ValueError("training.fans must name each fan, or none")
-        if len(self.training.fan_names) not in (0, self.fans):
-            raise ValueError("training.fan_names must have one name for each fan, or none")
+        for name in ("fan_names", "closed_loop"):
+            if len(getattr(self.training, name)) not in (0, self.fans):
+                raise ValueError(f"training.{name} must have one entry for each fan, or none")
         tacho_of_each_fan(self.tacho, self.fans)
         if self.drive is not None and len(self.drive.lowest_command) != self.fans:
             raise ValueError("drive.lowest_command must have one value for each fan")

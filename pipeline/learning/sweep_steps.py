@@ -206,7 +206,7 @@ class Excitation:
             fan = self.fans[place]
             raise UserError(
                 f"{self.names.label(fan)} has command {applied[-1, fan]:g} and not {commands[place]:g}: something else "
-                "sets it; stop that"
+                "sets it, its own controller or a program; stop that, or let it move the fans instead of a sweep"
             )
 
 

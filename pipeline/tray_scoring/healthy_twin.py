@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from pydantic import ValidationError
 
-from fantwin.pipeline.prediction.tray_twin import TrayTwin
+from fantwin.pipeline.prediction.tray_twin import TrayTwin, for_fans
 from fantwin.pipeline.runtime.stage import Context, StageError
 from fantwin.pipeline.tray_scoring.scorer_config import FALSE_ALARMS_PER_DAY
 from fantwin.schemas.messages import Array
@@ -138,7 +138,8 @@ def known_of(twin: TrayTwin, declared_per_day: float | None = None) -> HealthyTw
     calibration = Calibration.model_validate(card.calibration) if card.calibration is not None else None
     declared = calibration.false_alarms_per_day if calibration else FALSE_ALARMS_PER_DAY
     lowest_command = card.standstill.turning_command if card.standstill else 0.0
-    columns = (fans.viscous, fans.drag, fans.friction, fans.top_rad_s, fans.has_own_drive)
+    loops = for_fans(card.training.closed_loop or (False,) * card.fans, twin.fans).astype(np.bool_)
+    columns = (fans.viscous, fans.drag, fans.friction, fans.top_rad_s, fans.has_own_drive, loops)
     return HealthyTwin(
         twin.sha256,
         fans,

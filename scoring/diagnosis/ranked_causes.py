@@ -47,6 +47,8 @@ class SteadyFan:
     top_rad_s: float
     has_own_drive: bool = False
     """true if it controls its speed by itself: its torque is then not known, and a fault is a share of the speed"""
+    is_closed_loop: bool = False
+    """true if a controller answers its speed by the command: people move the set-point, and not the command"""
 
     def needed(self, speed_rad_s: float) -> float:
         """Command that holds a speed."""
@@ -73,6 +75,7 @@ SLOWER, FASTER = 2.0 / 3.0, 4.0 / 3.0
 DIGITS = 2
 
 KNOWN_SOON = "more is known in a few seconds"
+AT_LIMIT = "its command stays at the limit: its controller can give no more"
 
 
 @dataclass(frozen=True)
@@ -102,6 +105,8 @@ class Advice:
 
     def added_to(self, unclear: str, seen: SeenSinceOnset, fan: SteadyFan) -> str:
         """Why the cause is unclear, with what would tell."""
+        if fan.is_closed_loop:
+            return f"{unclear}: change its set-point by a third for ten seconds, and back"
         command = self._other_command(seen, fan)
         if not math.isfinite(command):
             return unclear
@@ -172,6 +177,8 @@ class CauseWords:
             return ()
         least = min(MIN_PROBABILITY, ranked[0].probability)
         listed = tuple(self._words(each, fan) for each in ranked if each.probability >= least)
+        if fan.is_closed_loop and seen.lowest_command == seen.highest_command >= self._advice.highest_command:
+            listed = (replace(listed[0], evidence=f"{listed[0].evidence}; {AT_LIMIT}"), *listed[1:])
         if ranked[0].probability >= CLEAR:
             return listed
         evidence = self._advice.added_to(_why_unclear(ranked, seen), seen, fan)

@@ -94,7 +94,7 @@ def test_a_fan_that_does_not_follow_is_named_and_the_others_go_on() -> None:
 def test_where_something_else_sets_the_command_it_says_so() -> None:
     line = FirstOrderFans([1.0])
     line.forced = 0.5
-    with pytest.raises(UserError, match=r"fan 0 has command 0.5 and not 0.2: something else sets it"):
+    with pytest.raises(UserError, match=r"fan 0 has command 0.5 and not 0.2: something else sets it, its own cont"):
         swept(line)
 
 

@@ -193,3 +193,20 @@ def test_nothing_is_advised_where_no_other_command_is_known() -> None:
     at_its_only_one = Advice("V", lowest_command=0.3, highest_command=SEEN.highest_command)
     assert at_its_only_one.added_to("why", SEEN, FAN) == "why"
     assert Advice("V").added_to("why", replace(SEEN, lowest_rad_s=float("nan")), FAN) == "why"
+
+
+def test_in_a_loop_people_move_the_set_point_and_are_told_where_its_controller_can_give_no_more() -> None:
+    in_loop = replace(FAN, is_closed_loop=True)
+    assert (
+        Advice("V").added_to("why", SEEN, in_loop) == "why: change its set-point by a third for ten seconds, and back"
+    )
+    fault, held = sure("drag_up", -0.1, 0.01), replace(SEEN, lowest_command=0.9, highest_command=0.9)
+    at_limit = "its command stays at the limit: its controller can give no more"
+    for fan, highest, seen, is_said in (
+        (in_loop, 0.9, held, True),
+        (FAN, 0.9, held, False),
+        (in_loop, 0.95, held, False),
+        (in_loop, 0.9, replace(held, lowest_command=0.89), False),
+    ):
+        (first,) = CauseWords(Advice("V", highest_command=highest), has_supply=False).of([fault], seen, fan)
+        assert first.evidence.startswith("drag +") and first.evidence.endswith(at_limit) == is_said
