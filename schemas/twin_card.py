@@ -127,7 +127,6 @@ class TrainingCard:
     networks: Count = 1
     of_type: str = ""
     fan_names: tuple[str, ...] = ()
-    closed_loop: tuple[bool, ...] = ()
 
 
 @dataclass(frozen=True, config=_CONFIG)
@@ -246,7 +245,8 @@ class TwinCard:
     model_uncertainty: how far the twin itself may be wrong at each speed and command, for each fan; of hybrids only,
     None for other kinds. conditions: the supply voltage and the air for which it holds, and so the
     columns that it needs beside the command (schemas.reference_conditions); None: none. steady_commands: those at which
-    the parameters of a static twin are speeds; empty: it is none. format: of the card.
+    the parameters of a static twin are speeds; empty: it is none. closed_loop: for each fan, whether its command
+    answered its measured speed in training or calibration; empty: not known. format: of the card.
     """
 
     kind: str
@@ -281,6 +281,7 @@ class TwinCard:
     model_uncertainty: ModelUncertainty | None = None
     conditions: ReferenceConditions | None = None
     steady_commands: tuple[float, ...] = ()
+    closed_loop: tuple[bool, ...] = ()
     format: int = TWIN_CARD.written
 
     @model_validator(mode="after")
@@ -298,9 +299,10 @@ class TwinCard:
                 raise ValueError(f"balance.{name} must have one value for each fan")
         if len(self.fan_numbers) != self.fans:
             raise ValueError("training.fans must name each fan, or none")
-        for name in ("fan_names", "closed_loop"):
-            if len(getattr(self.training, name)) not in (0, self.fans):
-                raise ValueError(f"training.{name} must have one entry for each fan, or none")
+        if len(self.training.fan_names) not in (0, self.fans):
+            raise ValueError("training.fan_names must have one name for each fan, or none")
+        if len(self.closed_loop) not in (0, self.fans):
+            raise ValueError("closed_loop must have one value for each fan, or none")
         tacho_of_each_fan(self.tacho, self.fans)
         if self.drive is not None and len(self.drive.lowest_command) != self.fans:
             raise ValueError("drive.lowest_command must have one value for each fan")
@@ -331,7 +333,7 @@ class TwinCard:
                 f"command {self.command_range[0]:.4g} to {self.command_range[1]:.4g} {self.command_unit}".rstrip()
                 + f", speed_rpm {low:.4g} to {high:.4g}",
                 f"{of.source} free run: " + ", ".join(f"{name} {value:.4g}" for name, value in shown.items()),
-                *(["closed loop: yes"] if self.is_closed_loop else []),
+                *(["closed loop: yes"] if any(self.closed_loop) else []),
             )
         )
 
@@ -351,11 +353,6 @@ class TwinCard:
             return ""
         here, there = (", ".join(each) for each in zip(*found, strict=True))
         return f"the fans {here} are in the places of {there} in the twin: use a twin of these fans in this order"
-
-    @property
-    def is_closed_loop(self) -> bool:
-        """Whether the command of any fan answered its measured speed in training."""
-        return any(self.training.closed_loop)
 
     @property
     def fan_numbers(self) -> tuple[int, ...]:

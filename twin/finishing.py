@@ -1,7 +1,7 @@
 """From a fitted model to a twin with its card: band, uncertainty, torque balance, and figures on healthy runs."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import reduce
 from importlib.metadata import PackageNotFoundError, version
@@ -139,7 +139,7 @@ def finish_twin(
         command_range=(float(commands.min()), float(commands.max())),
         rate_hz=1.0 / float(np.median(np.concatenate([np.diff(run.t_s) for run in runs]))),
         network=model.network_card,
-        training=replace(training, closed_loop=tuple(identification.closed_loop.tolist())),
+        training=training,
         validation=ValidationCard(
             source="held-out" if validation_runs else "training",
             data=tuple(validation_data),
@@ -155,6 +155,7 @@ def finish_twin(
         tacho=tacho[:1] if len(set(tacho)) == 1 else tacho,
         standstill=standstill,
         conditions=conditions,
+        closed_loop=tuple(identification.closed_loop.tolist()),
         drive=drive.card if drive else None,
         reading_sigma_rad_s=tuple(
             reading_sigma_rad_s(model, parameters, sigma_rad_s, standstill, pieces).tolist() if counts else ()

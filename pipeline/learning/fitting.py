@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.learning.training_data import TrainingData, data_cards, twin_errors
@@ -128,8 +128,8 @@ def _part(part: HealthyPart) -> dict[str, float | str]:
     return wanted | ({"tray": part.tray} if part.tray else {})
 
 
-def with_calibration(twin: Path, calibration: Calibration) -> bytes:
-    """The file of a twin with a calibration in its card.
+def with_calibration(twin: Path, calibration: Calibration, **entries: Any) -> bytes:
+    """The file of a twin with a calibration, and other entries, in its card.
 
     Raises:
         UserError: the file is not a twin.
@@ -137,4 +137,5 @@ def with_calibration(twin: Path, calibration: Calibration) -> bytes:
     with twin_errors():
         from fantwin.twin.export.onnx_export import with_card_entries  # noqa: PLC0415  the command line loads twin only when needed
 
-        return with_card_entries(twin.read_bytes(), {"calibration": json.loads(calibration.model_dump_json())})
+        entries["calibration"] = json.loads(calibration.model_dump_json())
+        return with_card_entries(twin.read_bytes(), entries)

@@ -138,7 +138,7 @@ def known_of(twin: TrayTwin, declared_per_day: float | None = None) -> HealthyTw
     calibration = Calibration.model_validate(card.calibration) if card.calibration is not None else None
     declared = calibration.false_alarms_per_day if calibration else FALSE_ALARMS_PER_DAY
     lowest_command = card.standstill.turning_command if card.standstill else 0.0
-    loops = for_fans(card.training.closed_loop or (False,) * card.fans, twin.fans).astype(np.bool_)
+    loops = for_fans(card.closed_loop or (False,) * card.fans, twin.fans).astype(np.bool_)
     columns = (fans.viscous, fans.drag, fans.friction, fans.top_rad_s, fans.has_own_drive, loops)
     return HealthyTwin(
         twin.sha256,

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from fantwin.pipeline.learning.loops_found import closed_loops
+from fantwin.pipeline.prediction.tray_twin import load_tray_twin
 from fantwin.pipeline.recordings.reading import read_recording
 from fantwin.schemas.enums import Transition
 from fantwin.schemas.messages import Alarm
@@ -63,6 +66,16 @@ def test_training_calibration_card_and_recordings_say_that_the_fans_are_in_a_loo
     assert "closed loop: yes" in fantwin("info", recording).stdout
     (found,) = json.loads(fantwin("info", recording, "--json").stdout)["files"]
     assert found["twins"]["tray1"]["closed_loop"] is True
+
+
+def test_a_loop_that_training_did_not_see_is_found_in_the_recordings_of_a_calibration(
+    trained: tuple[Path, str, str], folder: Path, tmp_path: Path
+) -> None:
+    of_a_sweep = replace(load_tray_twin(trained[0]).card, closed_loop=())
+    run = runs_of(["open"], plain_fans(FANS, 7), 120.0, RATE_HZ, seed=8)["open"]
+    swept = write_run(tmp_path / "swept.mcap", run)
+    assert closed_loops(of_a_sweep, [swept], None) == (False, False)
+    assert closed_loops(of_a_sweep, [swept, folder / "healthy.mcap"], "tray1") == (True, True)
 
 
 def test_a_set_point_that_rests_gives_no_numbers_and_says_what_to_record(tmp_path: Path) -> None:

@@ -259,7 +259,7 @@ def _about(part: Contents) -> list[str]:
 
 def _is_closed_loop(card: ModelCard) -> bool:
     try:
-        return TwinCard.from_json(card.card_json).is_closed_loop
+        return any(TwinCard.from_json(card.card_json).closed_loop)
     except CardError:  # of another format, or of no card
         return False
 

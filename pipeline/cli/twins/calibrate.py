@@ -28,6 +28,7 @@ from fantwin.pipeline.learning.healthy_evidence import (
     outlier_warnings,
     training_warnings,
 )
+from fantwin.pipeline.learning.loops_found import closed_loops
 from fantwin.pipeline.prediction.tray_twin import load_tray_twin
 from fantwin.pipeline.replay.offline.calibration_of_twin import (
     LARGEST_PER_DAY,
@@ -139,9 +140,13 @@ def calibrate(
             found = calibrated_on(healthy, part, false_alarms_per_day, pool.map, **how)
             calibration, speed_unit = found.calibration, found.learned[0].tray.speed_unit
             output = output or twin
-            write_whole(output, with_calibration(twin, calibration))
+            card = load_tray_twin(twin).card
+            closed = closed_loops(card, dict.fromkeys(run.tray.path for run in found.learned), tray)
+            write_whole(output, with_calibration(twin, calibration, closed_loop=closed))
             drops = drops_found(output, RAD_S_PER_UNIT[speed_unit])
-            warnings = [*training_warnings(load_tray_twin(twin).card, calibration), *outlier_warnings(found)]
+            warnings = [*training_warnings(card, calibration), *outlier_warnings(found)]
+            loops = [fan for fan, is_closed in zip(card.fan_numbers, closed, strict=True) if is_closed]
+            said = [closed_loop_sentence(found.learned[0].tray.names.labels(loops))] if loops else []
             result = {
                 "twin": str(output),
                 "alarms": marked.as_json(),
@@ -150,13 +155,11 @@ def calibrate(
                 "warnings": warnings,
                 "speed_unit": speed_unit,
                 "drops_found": [drop.model_dump() for drop in drops],
+                "closed_loop": loops,
             }
             for warning in warnings:
                 typer.echo(warning, err=True)
-            card, names = load_tray_twin(output).card, found.learned[0].tray.names
-            loops = [fan for fan, closed in zip(card.fan_numbers, card.training.closed_loop, strict=False) if closed]
-            closed = [closed_loop_sentence(names.labels(loops))] if loops else []
-            lines = _lines(output, calibration, [*closed, *(drop.line(speed_unit) for drop in drops)])
+            lines = _lines(output, calibration, [*said, *(drop.line(speed_unit) for drop in drops)])
             for line in () if json_output else lines:
                 typer.echo(line)
         if verify:

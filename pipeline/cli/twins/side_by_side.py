@@ -15,7 +15,7 @@ from rich.table import Table
 from fantwin.pipeline.cli.in_parallel import RecordingsInParallel
 from fantwin.pipeline.cli.printing import table_of
 from fantwin.pipeline.cli.progress import training_progress
-from fantwin.pipeline.cli.twins.figures import shown
+from fantwin.pipeline.cli.twins.figures import closed_loop_sentence, shown
 from fantwin.pipeline.errors import UsageError
 from fantwin.pipeline.files import make_folder, write_whole
 from fantwin.pipeline.learning.evaluation import figures_in
@@ -83,6 +83,8 @@ def train_side_by_side(
     lines = [f"* best: smallest free-run rmse over {SOURCE_MEANING[source]}."]
     if floor := next(m["figures"][source]["tacho_floor"] for m in result["models"] if m["model"] == result["best"]):
         lines.append(f"The tacho alone would leave a perfect model an rmse of {shown(floor)} {result['speed_unit']}.")
+    if winner.twin and (loops := training_data.numbers_where(winner.twin.card.closed_loop)):
+        lines.append(closed_loop_sentence(training_data.names.labels(loops)))
     lines.append(f"{folder}: the twins and comparison.json")
     failed = (f"{m['title']}: not trained: {m['invalid_reason']}" for m in result["models"] if m["invalid_reason"])
     warnings = (*failed, *result["warnings"])

@@ -260,6 +260,6 @@ def as_json(trained: TrainedTwin, training_data: TrainingData, output: Path) -> 
         "iterations": card.training.iterations,
         "duration_s": card.training.duration_s,
         "warnings": training_data.with_fan_numbers(trained.identification.warnings),
-        "closed_loop": training_data.numbers_where(card.training.closed_loop),
+        "closed_loop": training_data.numbers_where(card.closed_loop),
         "hints": list(training_data.hints),
     }
