@@ -19,11 +19,14 @@ from fantwin.pipeline.sources.tables.measured_table import Table, table_of
 from fantwin.pipeline.sources.tables.profiles import Profile, profile_of
 from fantwin.pipeline.sources.tables.units import SPEED_UNITS, in_unit_of, rad_s_per, unit_in_name
 from fantwin.pipeline.sources.wanted import Wanted
+from fantwin.schemas.channels import BY_NAME
 from fantwin.schemas.messages import Array
 
 _MOST_NAMED = 8
 _NO_READING = (-1, 65535, 4294967295)
 """speeds that programs and chips give where they have none"""
+_NAMES_OF_SPEEDS = {"a", "c", "v", "s", "h", "min"}
+"""units that are letters or words in a name, such as `speed_a` and `rpm_min`"""
 _FAR_BEYOND = 3.0
 """times the largest other speed, above which one of these is no reading"""
 
@@ -73,7 +76,8 @@ def samples_of(path: Path, file: ColumnFile, wanted: Wanted) -> Table:
     for channel, names in chosen.others.items():
         for name in dict.fromkeys(filter(None, names)):
             values[name], note = in_unit_of(channel, name, values[name], _unit(name, columns))
-            of_units += [note] if note else []
+            values[name], unlikely = _plausible(channel, name, values[name])
+            of_units += filter(None, (note, unlikely))
     table = table_of(
         path, chosen, values, t_ns, *rad_s_per(unit or "rad/s", wanted.poles), longest_part=not file.is_rows
     )
@@ -102,7 +106,7 @@ def speed_unit(chosen: FanColumns, columns: Mapping[str, Column], profile: Profi
     Raises:
         UsageError: the file has speeds in several.
     """
-    in_file = (unit if len(unit := _unit(name, columns)) > 1 or unit == "%" else "" for name in chosen.speed)
+    in_file = ("" if (unit := _unit(name, columns)) in _NAMES_OF_SPEEDS else unit for name in chosen.speed)
     units = [chosen.unit] if chosen.unit else list(dict.fromkeys(in_file))
     if len(units) > 1 or units[0] not in ("", *SPEED_UNITS):
         raise UsageError(
@@ -200,6 +204,17 @@ def _without_error_codes(chosen: FanColumns, values: dict[str, Array]) -> list[s
                 values[name] = np.where(is_code, np.nan, values[name])
                 notes.append(f"{name!r}: {np.count_nonzero(is_code)} values of {code:.0f} left out, an error code")
     return notes
+
+
+def _plausible(channel: str, name: str, values: Array) -> tuple[Array, str]:
+    """The values of a channel, NaN where they cannot be true, and a note on those."""
+    of = BY_NAME[channel]
+    is_beyond = (values < of.lowest) | (values > of.highest)
+    if not is_beyond.any():
+        return values, ""
+    beyond = f"{of.lowest:g} to {of.highest:g} {of.unit}"
+    note = f"{name!r}: {np.count_nonzero(is_beyond)} values beyond {beyond} left out: what is its unit?"
+    return np.where(is_beyond, np.nan, values), note
 
 
 def _with_others(names: Collection[str]) -> str:

@@ -62,7 +62,7 @@ def import_table(
         str | None,
         typer.Option(
             metavar="COLUMN[:UNIT]",
-            help="Time column, or DATE+TIME, two of them; default: found. Units: s, ms, us, ns, iso (dates).",
+            help="Time column, or DATE+TIME, two of them; default: found. Units: h, min, s, ms, us, ns, iso (dates).",
         ),
     ] = None,
     period: Annotated[

@@ -68,6 +68,8 @@ def continued(path: Path, t_ns: Array, has_time: Array, *, longest_part: bool = 
     is_good = np.ones(len(t_ns), np.bool_)
     if not goes_back(t_ns):
         return Clock(t_ns, is_good)
+    if np.all(t_ns[1:] <= t_ns[:-1]) and len(t_ns) > _AHEAD_OF:
+        return Clock(t_ns, is_good, ("the newest row is the first",))
     t_ns, notes = _unwrapped(t_ns)
     if not goes_back(t_ns):
         return Clock(t_ns, is_good, tuple(notes))
@@ -180,7 +182,7 @@ def _set_back_in_words(t_ns: Array, rows: Array, at: int) -> str:
     """What was seen where times go back, and what to do."""
     reached = int(t_ns[:at].max())
     by_ns = reached - int(t_ns[at])
-    count = int(np.count_nonzero(np.diff(t_ns) < -OUT_OF_ORDER_NS))
+    count = max(1, int(np.count_nonzero(np.diff(t_ns) < -OUT_OF_ORDER_NS)))
     often = "" if count == 1 else f", and {count - 1} times more"
     span = f"from {time_in_words(reached)} to {time_in_words(int(t_ns[at]))}"
     seen = f"time goes back by {by_ns / NS_PER_S:.3f} s at row {int(rows[at]) + 1}, {span}{often}"

@@ -103,7 +103,7 @@ _BLACKBOX = Profile(
     time=(r"time(?: \(us\))?",),
     time_unit="us",
     command=(r"motor\[(?P<fan>\d+)\]",),
-    channels={"supply_voltage_v": (r"vbatLatest \(V\)", r"vbatLatest"), "current_a": (r"amperageLatest \(A\)",)},
+    channels={"supply_voltage_v": (r"vbatLatest \(V\)",), "current_a": (r"amperageLatest \(A\)",)},
     note="no speeds in it: switch on bidirectional DShot, or debug_mode RPM_FILTER, before the flight",
 )
 _OF_TOPIC = r"(?:(?P<before>.*/)?{}\.)?"

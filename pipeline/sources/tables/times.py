@@ -24,6 +24,9 @@ from fantwin.schemas.units import NS_PER_S
 DATE_UNIT = "iso"
 _FINER_UNIT = {"s": "ms", "ms": "us", "us": "ns"}
 _YEAR_2000_NS = 946_684_800 * NS_PER_S
+_DAY, _NS_PER_DAY, _DAYS_TO_1970 = "days", 86_400 * NS_PER_S, 25_569
+_FIRST_DAY, _LAST_DAY = 30_000, 60_000
+"""dates as spreadsheets count them, from 1982 to 2064"""
 _USUAL = ("time", "timestamp", "t", "date", "datetime", "zeit", "_time", "datum", "elapsed", "ts", "x_value")
 """names of columns of times"""
 TIME_UNITS = (*NS_PER_UNIT, DATE_UNIT)
@@ -79,7 +82,10 @@ class TimeColumn:
                 del self._t_ns[:]
             self._dates.add(cells)
             return
-        self._t_ns.frombytes(self._counted(cells, NS_PER_UNIT[self._unit]).tobytes())
+        t_ns = self._counted(cells, NS_PER_UNIT.get(self._unit, _NS_PER_DAY))
+        if self._unit == _DAY:
+            t_ns = np.where(t_ns == NO_TIME, NO_TIME, t_ns - _DAYS_TO_1970 * _NS_PER_DAY)
+        self._t_ns.frombytes(t_ns.tobytes())
 
     def _counted(self, cells: Sequence[str], scale: int) -> Array:
         """(cells,) times in ns. Whole numbers are exact: a float cannot hold ns since 1970."""
@@ -121,6 +127,10 @@ class TimeColumn:
         if self._unit or self._numbers.unit in NS_PER_UNIT:
             self._by_file = True
             return self._unit or self._numbers.unit
+        if "dat" in self.name.lower() and _FIRST_DAY < value < _LAST_DAY:
+            self._by_file = True
+            self.notes.append(f"dates of {self.name!r} are numbers, days since 1899 as in a spreadsheet")
+            return _DAY
         if abs(value) * NS_PER_S < FURTHEST_T_NS:
             self._by_file = value * NS_PER_S > _YEAR_2000_NS  # since 1970
             return "s"

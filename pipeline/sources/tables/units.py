@@ -15,7 +15,7 @@ RAD_S_PER_TABLE_UNIT = {**RAD_S_PER_UNIT, "hz": 2 * math.pi, "deg/s": math.pi / 
 ELECTRICAL, ELECTRICAL_HUNDREDS = "erpm", "erpm/100"
 """electrical revolutions a minute, which need the number of poles"""
 SPEED_UNITS = (*RAD_S_PER_TABLE_UNIT, ELECTRICAL, ELECTRICAL_HUNDREDS)
-NS_PER_UNIT = {"s": NS_PER_S, "ms": 1_000_000, "us": 1_000, "ns": 1}
+NS_PER_UNIT = {"s": NS_PER_S, "ms": 1_000_000, "us": 1_000, "ns": 1, "min": 60 * NS_PER_S, "h": 3600 * NS_PER_S}
 
 _SPEEDS = {
     "rpm": ("rpm", "r/min", "rev/min", "u/min", "1/min", "min-1", "min^-1", "tr/min", "g/min", "omw/min"),
@@ -30,6 +30,8 @@ _TIMES = {
     "ms": ("ms", "msec", "millis", "milliseconds", "millisecond"),
     "us": ("us", "µs", "μs", "usec", "micros", "microseconds", "microsecond"),
     "ns": ("ns", "nsec", "nanos", "nanoseconds"),
+    "min": ("min", "mins", "minute", "minutes"),
+    "h": ("h", "hr", "hrs", "hour", "hours"),
 }
 
 
