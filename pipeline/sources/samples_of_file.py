@@ -27,6 +27,8 @@ _NO_READING = (-1, 65535, 4294967295)
 """speeds that programs and chips give where they have none"""
 _NAMES_OF_SPEEDS = {"a", "c", "v", "s", "h", "min"}
 """units that are letters or words in a name, such as `speed_a` and `rpm_min`"""
+_FEWEST_ROWS = 8
+"""of a table whose newest row is the first"""
 _FAR_BEYOND = 3.0
 """times the largest other speed, above which one of these is no reading"""
 
@@ -69,6 +71,9 @@ def samples_of(path: Path, file: ColumnFile, wanted: Wanted) -> Table:
             raise UserError(f"{path}: column {name!r} has no numbers{column.note and f', but {column.note}'}")
     columns, clocks = _continued(path, columns)
     t_ns, values = _at_times_of_speeds(columns, chosen)
+    if _is_newest_first(t_ns):
+        t_ns, values = t_ns[::-1], {name: each[::-1] for name, each in values.items()}
+        clocks = [*clocks, "the newest row is the first: read from the last"]
     no_reading = _without_error_codes(chosen, values)
     chosen = used_fans(path, chosen, values)
     stopped = _without_stops(chosen, columns, values, t_ns)
@@ -150,6 +155,12 @@ def _at_times_of_speeds(columns: Mapping[str, Column], chosen: FanColumns) -> tu
             values[name] = np.full(len(t_ns), np.nan)
             values[name][np.searchsorted(t_ns, each.t_ns)] = each.values
     return t_ns, values
+
+
+def _is_newest_first(t_ns: Array) -> bool:
+    """Whether times go back from row to row, as in exports of pages that show the newest value on top."""
+    known = t_ns[t_ns != NO_TIME]
+    return len(known) >= _FEWEST_ROWS and bool(known[-1] < known[0] and np.all(known[1:] <= known[:-1]))
 
 
 def _continued(path: Path, columns: Mapping[str, Column]) -> tuple[Mapping[str, Column], list[str]]:

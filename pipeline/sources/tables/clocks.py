@@ -68,8 +68,6 @@ def continued(path: Path, t_ns: Array, has_time: Array, *, longest_part: bool = 
     is_good = np.ones(len(t_ns), np.bool_)
     if not goes_back(t_ns):
         return Clock(t_ns, is_good)
-    if np.all(t_ns[1:] <= t_ns[:-1]) and len(t_ns) > _AHEAD_OF:
-        return Clock(t_ns, is_good, ("the newest row is the first",))
     t_ns, notes = _unwrapped(t_ns)
     if not goes_back(t_ns):
         return Clock(t_ns, is_good, tuple(notes))
