@@ -159,8 +159,8 @@ def _at_times_of_speeds(columns: Mapping[str, Column], chosen: FanColumns) -> tu
 
 def _is_newest_first(t_ns: Array) -> bool:
     """Whether times go back from row to row, as in exports of pages that show the newest value on top."""
-    known = t_ns[t_ns != NO_TIME]
-    return len(known) >= _FEWEST_ROWS and bool(known[-1] < known[0] and np.all(known[1:] <= known[:-1]))
+    known = t_ns[t_ns != NO_TIME] if len(t_ns) >= _FEWEST_ROWS and t_ns[-1] < t_ns[0] else t_ns[:1]
+    return len(known) >= _FEWEST_ROWS and bool(np.all(known[1:] <= known[:-1]))
 
 
 def _continued(path: Path, columns: Mapping[str, Column]) -> tuple[Mapping[str, Column], list[str]]:

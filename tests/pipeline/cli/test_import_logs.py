@@ -211,30 +211,20 @@ def test_a_command_that_never_changes_is_named_with_its_field_and_later_with_its
 
 
 @pytest.mark.parametrize(
-    ("names", "command", "speed"),
+    ("command", "speed"),
     [
-        (
-            ["actuator_motors.control[0]", "actuator_outputs.output[0]", "esc_status.esc[0].esc_rpm"],
-            "actuator_motors.control[0]",
-            "esc_status.esc[0].esc_rpm",
-        ),
-        (
-            ["/fmu/out/esc_status.esc[0].esc_rpm", "/fmu/out/actuator_outputs.output[0]"],
-            "/fmu/out/actuator_outputs.output[0]",
-            "/fmu/out/esc_status.esc[0].esc_rpm",
-        ),
-        (
-            ["/uav1/mavros/esc_status.esc_status[0].rpm", "/uav1/mavros/rc/out.channels[0]"],
-            "/uav1/mavros/rc/out.channels[0]",
-            "/uav1/mavros/esc_status.esc_status[0].rpm",
-        ),
-        (["esc_status.esc[0].esc_rpm", "input_rc.values[0]"], None, None),
+        ("actuator_motors.control[0]", "esc_status.esc[0].esc_rpm"),
+        ("actuator_outputs.output[0]", "esc_status.esc[0].esc_rpm"),
+        ("/fmu/out/actuator_outputs.output[0]", "/fmu/out/esc_status.esc[0].esc_rpm"),
+        ("/uav1/mavros/rc/out.channels[0]", "/uav1/mavros/esc_status.esc_status[0].rpm"),
     ],
 )
-def test_the_fields_of_motors_are_known_in_logs_and_bags(
-    names: list[str], command: str | None, speed: str | None
-) -> None:
+def test_the_fields_of_motors_are_known_in_logs_and_bags(command: str, speed: str) -> None:
     log = ColumnFile()
-    log.names = names
-    fans = profile.fans_in(log) if (profile := profile_of(log)) else None
-    assert (fans and fans.command, fans and fans.speed) == (command and (command,), speed and (speed,))
+    log.names = [speed, "input_rc.values[0]"]
+    assert profile_of(log) is None
+    log.names = [*log.names, "actuator_outputs.output[0]", command]  # the motors count, where both are there
+    known = profile_of(log)
+    assert known
+    fans = known.fans_in(log)
+    assert (fans.command, fans.speed) == ((command,), (speed,))
