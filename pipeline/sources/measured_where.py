@@ -32,25 +32,33 @@ STOPPED_WHERE_NAN = (r"(?:.*\bactuator_motors(?:#\d+)?\.)?control\[\d+\]",)
 """commands that are NaN while a motor is stopped, so that the one before does not hold"""
 
 
-def read_measured(file: ColumnFile, names: Sequence[str]) -> tuple[Mapping[str, Column], list[tuple[str, int, str]]]:
-    """These columns of a file, NaN where they are not measured; and of those what is left out, how many, and where."""
+class LeftOut(NamedTuple):
+    """Values of a column that are left out: how many, and why."""
+
+    name: str
+    values: int
+    why: str
+
+
+def read_measured(file: ColumnFile, names: Sequence[str]) -> tuple[Mapping[str, Column], list[LeftOut]]:
+    """These columns of a file, NaN where they are not measured, and what is left out by that."""
     there = set(file.names)
     rules = [(name, by, bit) for name in names for by, bit in _rules_of(name) if by in there]
     columns = dict(file.read(list(dict.fromkeys((*names, *(by for _, by, _ in rules))))))
-    left_out: list[tuple[str, int, str]] = []
+    left_out: list[LeftOut] = []
     for name, by, bit in rules:
         told, values = columns[by].values, columns[name].values
         if len(told) != len(values):
             continue
         if bit:
             is_measured = (np.nan_to_num(told).astype(np.int64) >> int(bit)) & 1 == 1
-            where = f"the bit of the motor in {by} is not set"
+            why = f"where the bit of the motor in {by} is not set"
         else:
             is_measured = np.diff(told, prepend=0.0) != 0  # 0: not yet
-            where = "readings are repeated, by their own timestamps"
+            why = "where readings are repeated, by their own timestamps"
         if is_measured.sum() > 1 and not is_measured.all():
             columns[name] = replace(columns[name], values=np.where(is_measured, values, np.nan))
-            left_out.append((name, int(np.count_nonzero(~is_measured & np.isfinite(values))), where))
+            left_out.append(LeftOut(name, int(np.count_nonzero(~is_measured & np.isfinite(values))), why))
     return {name: columns[name] for name in names}, left_out
 
 

@@ -4,7 +4,7 @@ speeds. What is left out is said."""
 from __future__ import annotations
 
 import shlex
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +12,7 @@ import numpy as np
 
 from fantwin.pipeline.errors import UsageError, UserError
 from fantwin.pipeline.sources.column_file import NO_TIME, Column, ColumnFile, listed
-from fantwin.pipeline.sources.measured_where import read_measured, stops_where_nan
+from fantwin.pipeline.sources.measured_where import LeftOut, read_measured, stops_where_nan
 from fantwin.pipeline.sources.tables.clocks import Clock, continued
 from fantwin.pipeline.sources.tables.fan_columns import FanColumns, fan_columns, used_fans
 from fantwin.pipeline.sources.tables.measured_table import Table, table_of
@@ -63,7 +63,7 @@ def samples_of(path: Path, file: ColumnFile, wanted: Wanted) -> Table:
     """
     profile = profile_of(file)
     chosen = chosen_fans(path, file, wanted, profile)
-    columns, unmeasured = read_measured(file, chosen.names)
+    columns, left_out = read_measured(file, chosen.names)
     for name, column in columns.items():
         if column.problem:
             raise column.problem
@@ -74,15 +74,15 @@ def samples_of(path: Path, file: ColumnFile, wanted: Wanted) -> Table:
     if _is_newest_first(t_ns):
         t_ns, values = t_ns[::-1], {name: each[::-1] for name, each in values.items()}
         clocks = [*clocks, "the newest row is the first: read from the last"]
-    no_reading = _without_error_codes(chosen, values)
+    left_out += _error_codes(chosen, values)
     chosen = used_fans(path, chosen, values)
-    stopped = _without_stops(chosen, columns, values, t_ns)
+    left_out += _stops(chosen, columns, values, t_ns)
     unit, of_units = speed_unit(chosen, columns, profile)
     for channel, names in chosen.others.items():
         for name in dict.fromkeys(filter(None, names)):
             values[name], note = in_unit_of(channel, name, values[name], _unit(name, columns))
-            values[name], unlikely = _plausible(channel, name, values[name])
-            of_units += filter(None, (note, unlikely))
+            of_units += [note] if note else []
+            left_out.append(_beyond(channel, name, values))
     table = table_of(
         path, chosen, values, t_ns, *rad_s_per(unit or "rad/s", wanted.poles), longest_part=not file.is_rows
     )
@@ -91,10 +91,8 @@ def samples_of(path: Path, file: ColumnFile, wanted: Wanted) -> Table:
         *file.notes,
         *chosen.notes,
         *(f"{name!r}: {columns[name].note}" for name in chosen.names if columns[name].note),
-        *_unmeasured_in_words(chosen, unmeasured),
-        *no_reading,
+        *_in_words([each for each in left_out if each.values and each.name in chosen.names]),
         *clocks,
-        *stopped,
         *_rates(columns, chosen),
         *of_units,
         *table.remarks,
@@ -134,12 +132,11 @@ def _assumed(*found: tuple[str, str] | None) -> str:
     return f"no unit given, {assumed} assumed; if that is wrong, use for example {options}"
 
 
-def _unmeasured_in_words(chosen: FanColumns, unmeasured: Sequence[tuple[str, int, str]]) -> list[str]:
-    found: dict[str, dict[str, int]] = {}
-    for name, count, where in unmeasured:
-        if count and name in chosen.names:
-            found.setdefault(where, {})[name] = count
-    return [f"{_with_others(of)}: {sum(of.values())} values left out, where {where}" for where, of in found.items()]
+def _in_words(left_out: Sequence[LeftOut]) -> list[str]:
+    """A line each reason why values are left out."""
+    whys = dict.fromkeys(each.why for each in left_out)
+    of_why = {why: {each.name: each.values for each in left_out if each.why == why} for why in whys}
+    return [f"{listed(list(of), 1)}: {sum(of.values())} values left out, {why}" for why, of in of_why.items()]
 
 
 def _at_times_of_speeds(columns: Mapping[str, Column], chosen: FanColumns) -> tuple[Array, dict[str, Array]]:
@@ -189,47 +186,39 @@ def _continued(path: Path, columns: Mapping[str, Column]) -> tuple[Mapping[str, 
     return found, notes
 
 
-def _without_stops(
+def _stops(
     chosen: FanColumns, columns: Mapping[str, Column], values: dict[str, Array], t_ns: Array
-) -> list[str]:
-    """Take away the speeds at which a command says that its motor is stopped, as it is no number; a note on that."""
-    counts: dict[str, int] = {}
+) -> Iterator[LeftOut]:
+    """Take away the speeds at which a command says that its motor is stopped, as it is no number."""
     for command, speed in zip(chosen.command, chosen.speed, strict=True):
         if stops_where_nan(command):
             values[command] = _held(columns[command], t_ns)
             is_stopped = np.isnan(_held(columns[command], t_ns, through_nan=False)) & np.isfinite(values[command])
-            values[speed] = np.where(is_stopped, np.nan, values[speed])
-            counts |= {speed: int(np.count_nonzero(is_stopped))} if is_stopped.any() else {}
-    why = "where their commands are NaN, as the motors were stopped"
-    return [f"{_with_others(counts)}: {sum(counts.values())} values left out, {why}"] if counts else []
+            yield _without(values, speed, is_stopped, "where their commands are NaN, as the motors were stopped")
 
 
-def _without_error_codes(chosen: FanColumns, values: dict[str, Array]) -> list[str]:
-    """Take away speeds that are no readings: an error code beyond all others. Notes on that."""
-    notes: list[str] = []
+def _error_codes(chosen: FanColumns, values: dict[str, Array]) -> Iterator[LeftOut]:
+    """Take away speeds that are no readings: an error code beyond all others."""
     for name in dict.fromkeys(chosen.speed):
         for code in _NO_READING:
             is_code = values[name] == code
             others = values[name][np.isfinite(values[name]) & ~is_code]
-            if is_code.any() and len(others) and (code < 0 <= others.min() or code > _FAR_BEYOND * others.max() > 0):
-                values[name] = np.where(is_code, np.nan, values[name])
-                notes.append(f"{name!r}: {np.count_nonzero(is_code)} values of {code:.0f} left out, an error code")
-    return notes
+            if len(others) and (code < 0 <= others.min() or code > _FAR_BEYOND * others.max() > 0):
+                yield _without(values, name, is_code, f"an error code, {code}")
 
 
-def _plausible(channel: str, name: str, values: Array) -> tuple[Array, str]:
-    """The values of a channel, NaN where they cannot be true, and a note on those."""
+def _beyond(channel: str, name: str, values: dict[str, Array]) -> LeftOut:
+    """Take away the values of a channel that cannot be true."""
     of = BY_NAME[channel]
-    is_beyond = (values < of.lowest) | (values > of.highest)
-    if not is_beyond.any():
-        return values, ""
-    beyond = f"{of.lowest:g} to {of.highest:g} {of.unit}"
-    note = f"{name!r}: {np.count_nonzero(is_beyond)} values beyond {beyond} left out: what is its unit?"
-    return np.where(is_beyond, np.nan, values), note
+    is_beyond = (values[name] < of.lowest) | (values[name] > of.highest)
+    return _without(values, name, is_beyond, f"beyond {of.lowest:g} to {of.highest:g} {of.unit}: what is its unit?")
 
 
-def _with_others(names: Collection[str]) -> str:
-    return listed(list(names), 1)
+def _without(values: dict[str, Array], name: str, rows: Array, why: str) -> LeftOut:
+    """Take away some values of a column."""
+    if rows.any():
+        values[name] = np.where(rows, np.nan, values[name])
+    return LeftOut(name, int(np.count_nonzero(rows)), why)
 
 
 def _rates(columns: Mapping[str, Column], chosen: FanColumns) -> list[str]:

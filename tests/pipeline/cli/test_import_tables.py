@@ -145,8 +145,8 @@ DAMAGED_ROWS = {
 DAMAGED_CELLS = {
     "{t},fast,{c}": "'fan1': 1 cell with text that is no number, first 'fast' in row 31",
     "{t},1.74 krpm,{c}": "1 cell with text that is no number, first '1.74 krpm'",
-    "{t},-1,{c}": "'fan1': 1 values of -1 left out, an error code",
-    "{t},65535,{c}": "'fan1': 1 values of 65535 left out, an error code",
+    "{t},-1,{c}": "fan1: 1 values left out, an error code, -1",
+    "{t},65535,{c}": "fan1: 1 values left out, an error code, 65535",
 }
 
 
@@ -224,8 +224,8 @@ def test_channels_are_in_their_units_and_plausible(tmp_path: Path) -> None:
     channels = ("--channel", "temperature_c=temp_mC", "--channel", "supply_voltage_v=vbat")
     said = fantwin("import", path, "--command", "pwm1", "--speed", "rpm", *channels, "-o", recording).stdout
     assert "'temp_mC' converted from mC to °C" in said
-    assert "'vbat': 20 values beyond " in said
-    assert "V left out: what is its unit?" in said
+    assert "vbat: 20 values left out, beyond " in said
+    assert "V: what is its unit?" in said
     (run,) = read_runs(recording).runs
     np.testing.assert_allclose(run.speed_rad_s[:, 0] / RPM, 1000 + np.arange(20))
     np.testing.assert_allclose(run.auxiliary["temperature_c"], 45.0)
