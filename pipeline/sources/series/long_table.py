@@ -17,7 +17,7 @@ import numpy as np
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.sources.column_file import NO_TIME
 from fantwin.pipeline.sources.series.series_file import Label, SeriesFile, named
-from fantwin.pipeline.sources.tables.layout import Heading, Layout, all_rows_of, rows_of
+from fantwin.pipeline.sources.tables.layout import Heading, Layout, all_rows_of, rows_of, wider_in_words
 from fantwin.pipeline.sources.tables.table_file import read_cells
 from fantwin.pipeline.sources.tables.times import time_names, usual_time
 from fantwin.pipeline.sources.wanted import Wanted
@@ -68,12 +68,14 @@ def long_table(layout: Layout, wanted: Wanted) -> SeriesFile | None:
         return None
     at = [columns.names.index(key) for key in columns.keys]
     known: dict[tuple[str, ...], int] = {}
+    wider: list[str] = []
     of_row = array("i")
 
     def rows() -> Iterator[list[str]]:
         known.clear()
+        wider.clear()
         del of_row[:]
-        for row in _annotated_rows(layout, columns.names) if is_annotated(layout) else rows_of(layout):
+        for row in _annotated_rows(layout, columns.names) if is_annotated(layout) else rows_of(layout, wider):
             of_row.append(known.setdefault(tuple(row[k] for k in at), len(known)))
             if len(known) > MOST_SERIES:
                 raise _TooManyError
@@ -95,7 +97,12 @@ def long_table(layout: Layout, wanted: Wanted) -> SeriesFile | None:
     order = np.argsort(series, kind="stable")
     parts = np.split(order, np.cumsum(np.bincount(series))[:-1])
     by = " and ".join(map(repr, columns.keys)) or "nothing"
-    notes = [f"{name!r}: {texts}" for name, column in numbers.items() if (texts := column.texts(has_time))]
+    texts = {name: column.texts(has_time) for name, column in numbers.items()}
+    notes = [
+        *times.notes,
+        *wider_in_words(layout, wider),
+        *(f"{name!r}: {text}" for name, text in texts.items() if text),
+    ]
     found = [
         (_label(columns, key, name), t_ns[rows][is_value], column.values[rows][is_value])
         for key, rows in zip(known, parts, strict=True)
@@ -104,7 +111,9 @@ def long_table(layout: Layout, wanted: Wanted) -> SeriesFile | None:
     ]
     if not found:
         raise UserError(f"{layout.path}: a row a value, and none of the values is a number")
-    return SeriesFile(f"long table, {len(found)} series by {by}", named(found), (*times.notes, *notes))
+    return SeriesFile(
+        f"long table, {len(found)} series by {by}", named(found), (*times.notes, *wider_in_words(layout, wider), *notes)
+    )
 
 
 def _with_names(layout: Layout, names: Sequence[str]) -> Layout:

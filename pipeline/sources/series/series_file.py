@@ -37,13 +37,16 @@ class JoinedFile(ColumnFile):
 
     def __init__(self, files: Sequence[ColumnFile]) -> None:
         self._file_of = {name: file for file in reversed(files) for name in file.names}
+        seen = Counter(name for file in files for name in file.names)
+        self._again = [name for name in self._file_of if seen[name] > 1]
         self.title = f"columns of {len(files)} files by their times"
         self.names = list(self._file_of)
 
     def read(self, names: Sequence[str]) -> Mapping[str, Column]:
         """See ColumnFile."""
         found: dict[str, Column] = {}
-        self.notes = [self.title]
+        again = [f"several files have {name!r}: that of the first is read" for name in self._again if name in names]
+        self.notes = [self.title, *again]
         for file in dict.fromkeys(self._file_of[name] for name in names):
             found |= file.read([name for name in names if self._file_of[name] is file])
             self.notes += file.notes

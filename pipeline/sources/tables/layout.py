@@ -172,6 +172,12 @@ def rows_of(layout: Layout, wider: list[str] | None = None) -> Iterator[list[str
         )
 
 
+def wider_in_words(layout: Layout, wider: Sequence[str]) -> list[str]:
+    """A note on rows that `rows_of` left out."""
+    names = f"more cells than the {len(layout.columns)} names"
+    return [f"{len(wider)} rows left out: {names}, first {wider[0]!r}"] if wider else []
+
+
 def _require_same_names(layout: Layout, names: Sequence[str], row: Sequence[str]) -> None:
     """Raise UserError where a line of names within the rows names other columns."""
     again = [cell.strip("# \t") for cell in row]

@@ -15,7 +15,7 @@ import numpy as np
 
 from fantwin.pipeline.errors import UsageError, UserError
 from fantwin.pipeline.sources.column_file import NO_TIME, Column, ColumnFile
-from fantwin.pipeline.sources.tables.layout import Layout, rows_of
+from fantwin.pipeline.sources.tables.layout import Layout, rows_of, wider_in_words
 from fantwin.pipeline.sources.tables.numbers import NumberColumn, OtherMarkError
 from fantwin.pipeline.sources.tables.profiles import profile_of
 from fantwin.pipeline.sources.tables.times import TimeColumn, time_names, usual_time
@@ -70,13 +70,11 @@ class TableFile(ColumnFile):
             for name in names
             if f"{name} [2]" in self._layout.names
         ]
-        width = len(self._layout.columns)
-        more = f"{len(wider)} rows left out: more cells than the {width} names, first " if wider else ""
         self.notes = [
             *of_times,
             *([self.title] if self._layout.head != 1 else []),
             *twice,
-            *([f"{more}{wider[0]!r}"] if more else []),
+            *wider_in_words(self._layout, wider),
         ]
         has_time = t_ns != NO_TIME
         found: dict[str, Column] = {}

@@ -105,7 +105,12 @@ PROGRAMS = {
         notes=("long table, 2 series by 'Series'",),
         t_s=EPOCH_S,
     ),
-    "a row a value, by time": Table("Series,Time,Value", f"fan1,{ISO},{{s}}\npwm1,{ISO},{{c}}"),
+    "a row a value, by time": Table(
+        "Series,Time,Value",
+        f"fan1,{ISO},{{s}}\npwm1,{ISO},{{c}}",
+        notes=("1 rows left out: more cells than the 3 names, first '9'",),
+        after="pwm1,2026-06-09 22:00:50,40,9",
+    ),
     "Home Assistant: states of entities": Table(
         "entity_id,state,last_changed",
         "number.fan_pwm,{c},{d:%Y-%m-%dT%H:%M:%S}.000Z\nsensor.fan_rpm,{s},{d:%Y-%m-%dT%H:%M:%S}.000Z",
@@ -209,6 +214,10 @@ def test_telemetry_by_instance_is_joined_with_the_outputs_of_another_table(tmp_p
     words = ("--command", "C1", "--command", "C2", "--speed", "RPM{0}:rpm", "--speed", "RPM{1}:rpm")
     result = fantwin("import", escs, outputs, *words, "-o", tmp_path / "r.mcap")
     assert "columns of 2 files by their times" in result.stdout
+    copy = tmp_path / "rcou-2.csv"
+    copy.write_bytes(outputs.read_bytes())
+    again = fantwin("import", escs, outputs, copy, *words, "-o", tmp_path / "s.mcap").stdout
+    assert "several files have 'C1': that of the first is read" in again
     _, command, speed = raw_columns(tmp_path / "r.mcap")
     for fan, expected in enumerate((SPEED, SPEED // 2)):
         known = np.isfinite(speed[:, fan])
