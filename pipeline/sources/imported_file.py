@@ -22,7 +22,7 @@ from fantwin.pipeline.sources.series.series_file import JoinedFile
 from fantwin.pipeline.sources.tables.clocks import SetBackError, time_in_words
 from fantwin.pipeline.sources.tables.fan_columns import FanColumns, used_fans, with_unit
 from fantwin.pipeline.sources.tables.layout import find_layout
-from fantwin.pipeline.sources.tables.measured_table import Table
+from fantwin.pipeline.sources.tables.measured_table import Repairs, Table
 from fantwin.pipeline.sources.tables.profiles import profile_of
 from fantwin.pipeline.sources.tables.table_file import TableFile
 from fantwin.pipeline.sources.tables.units import ELECTRICAL, ELECTRICAL_HUNDREDS, SPEED_UNITS
@@ -114,15 +114,20 @@ def preview_of(path: Path, wanted: Wanted) -> Preview:
     of_log = () if file.is_rows else file.notes  # once all topics are read together, there are more, on their times
     columns = file.read([*names, *(name for name in chosen.names if name not in names)])
     notes = [str(each.problem) for each in columns.values() if each.problem]
-    notes += [note for note in of_log or file.notes if note != file.title]
+    can_import = not notes and sum(bool(np.isfinite(each.values).any()) for each in columns.values()) > 1
+    notes += of_log or file.notes
     notes += [profile.note] if profile and profile.note else []
     unit = ""
     if chosen.speed:
         try:
+            known = [] if wanted.speed else chosen.notes
             chosen = used_fans(path, chosen, {name: column.values for name, column in columns.items()})
             unit, _ = speed_unit(chosen, columns, profile)
+            notes += _notes_of_import(path, wanted, known)
         except UserError as error:
             notes.append(str(error))
+    else:
+        notes += _without_time(file, columns)
     title = f"{profile.title}: {file.title}" if profile else file.title
     labels = (label or speed for label, speed in zip(chosen.labels or chosen.speed, chosen.speed, strict=True))
     return Preview(
@@ -131,8 +136,23 @@ def preview_of(path: Path, wanted: Wanted) -> Preview:
         tuple(PreviewColumn.of(name, columns[name], file.labels.get(name, "")) for name in names),
         tuple(map(ProposedFan, labels, chosen.command, chosen.speed)),
         _options(wanted, chosen, unit),
-        tuple(dict.fromkeys(notes)),
+        tuple(note for note in dict.fromkeys(notes) if note != file.title),
+        can_import=can_import,
     )
+
+
+def _notes_of_import(path: Path, wanted: Wanted, known: Sequence[str]) -> list[str]:
+    """What an import says of the file, without what is known. Raises UserError."""
+    poles = wanted.reading.poles or 2  # changes no note
+    table = read_file(path, replace(wanted, reading=replace(wanted.reading, poles=poles)))
+    return [note for note in (table.assumed, *table.notes) if note and note not in known]
+
+
+def _without_time(file: ColumnFile, columns: Mapping[str, Column]) -> list[str]:
+    """A note on rows that an import of any columns would drop."""
+    is_known = next((each.t_ns != NO_TIME for each in columns.values() if file.is_rows and not each.problem), None)
+    repairs = Repairs() if is_known is None else Repairs(without_time=int(np.count_nonzero(~is_known)))
+    return repairs.in_words
 
 
 def _times_in_words(file: ColumnFile, columns: Mapping[str, Column]) -> list[str]:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from fantwin.pipeline.sources.column_file import Column
-from fantwin.pipeline.sources.tables.units import unit_in_name
+from fantwin.pipeline.sources.tables.units import SPEED_UNITS, unit_in_name
 
 
 @dataclass(frozen=True)
@@ -67,6 +67,7 @@ class Preview:
         understood: a line each: the format, and the times.
         options: of `fantwin import`, beside the file and `-o`, that import it; empty: they are not known.
         notes: what will be left out, or has to be said by the user, a line each.
+        can_import: whether it has columns of numbers, and times.
     """
 
     path: Path
@@ -75,11 +76,15 @@ class Preview:
     fans: tuple[ProposedFan, ...] = ()
     options: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
+    can_import: bool = True
 
     @property
     def command_line(self) -> str:
-        """The command line that imports the file; with placeholders where its columns are not known."""
-        known = [shlex.quote(word) for word in self.options] or ["--command", "COLUMN", "--speed", "COLUMN:rpm"]
+        """The command line of an import, with placeholders where its columns are not known; empty: none can be."""
+        if not self.can_import:
+            return ""
+        unit = "" if any(each.unit in SPEED_UNITS for each in self.columns) else ":UNIT"
+        known = [shlex.quote(word) for word in self.options] or ["--command", "COLUMN", "--speed", f"COLUMN{unit}"]
         return " ".join(["fantwin", "import", shlex.quote(str(self.path)), *known, "-o", "REC.mcap"])
 
     @property
@@ -97,5 +102,5 @@ class Preview:
             *(each.line(width) for each in self.columns),
             *(f"  {each.label}: command {each.command}, speed {each.speed}" for each in self.fans),
             *(f"  {note}" for note in self.notes),
-            f"to import it: {self.command_line}",
+            f"to import it: {self.command_line or 'nothing as it is, without two columns of numbers and their times'}",
         ]

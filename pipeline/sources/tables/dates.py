@@ -41,6 +41,7 @@ _TIME = (
     r"\s*(?P<half>[AaPp]\.?[Mm]\.?)?\s*(?P<zone>Z|[A-Za-z]{3,4}|(?:UTC|GMT)?[+-]\d\d:?\d\d)?(?:\s+[A-Z]{3,4})?"
 )
 _DATED = re.compile(rf"(?:[A-Za-z]{{2,9}}\.?,?\s+)?(?:{_DATE}|{_WORDY})(?:[T,\s]\s*{_TIME})?")
+_TIME_FIRST = re.compile(r"(\d{1,2}:\d\S*(?:\s+[AaPp]\.?[Mm]\.?)?)[,\s]\s*(\d{1,4}[./-]\S+|[A-Za-z]{3}.+)")
 _OF_DAY = re.compile(rf"(?:(?P<days>\d+)[ d.]+)?{_TIME}")
 _MINUTES = re.compile(r"(?P<m>\d{1,4}):(?P<s>[0-5]\d)(?P<f>[.,]\d+)?")
 _FRACTION = re.compile(r"(\d\d:\d\d:\d\d)[:,](\d+)")  # some loggers write 17:14:08:947, or 17:14:08,947
@@ -59,7 +60,7 @@ _ORDER_IN_WORDS = {"dmy": "day, month, year", "mdy": "month, day, year", "ymd": 
 def is_date_or_time(text: str) -> bool:
     """Whether a cell holds a date, a time of day, or both."""
     text = text.strip()
-    return bool(_DATED.fullmatch(text) or _OF_DAY.fullmatch(text) or _MINUTES.fullmatch(text) or _iso(text))
+    return bool(_dated(text) or _OF_DAY.fullmatch(text) or _MINUTES.fullmatch(text) or _iso(text))
 
 
 def is_time_of_day(text: str) -> bool:
@@ -112,7 +113,7 @@ class DateColumn:
 
     def _other(self, text: str) -> None:
         """A cell that is not ISO: its time of day now, its date when all are known."""
-        found = _DATED.fullmatch(text)
+        found = _dated(text)
         if found is None:
             self._time_of_day(text)
             return
@@ -200,7 +201,7 @@ class DateColumn:
             return possible[0], days[possible[0]]
         order = _by_order_of_rows({order: days[order][of_row] for order in possible})
         if not order:
-            example = self._first_cell.split()[0]
+            example = (re.search(_DATE, self._first_cell) or [self._first_cell])[0]
             either = " or ".join(f"--dates {each} ({_ORDER_IN_WORDS[each]})" for each in possible)
             raise UserError(
                 f"{self._path}: column {self._name!r}: {example} can be read in {len(possible)} ways, and no row "
@@ -217,6 +218,11 @@ def _by_order_of_rows(days: Mapping[str, Array]) -> str:
     if not ranked or (len(ranked) > 1 and largest[ranked[1]] < _LARGER_STEPS * max(1, largest[ranked[0]])):
         return ""
     return ranked[0]
+
+
+def _dated(text: str) -> re.Match[str] | None:
+    """The parts of a date, perhaps with a time of day behind or before it."""
+    return _DATED.fullmatch(text) or _DATED.fullmatch(_TIME_FIRST.sub(r"\2 \1", text))
 
 
 def _orders(written: _Date) -> Sequence[str]:

@@ -44,6 +44,19 @@ class Repairs:
         """The counts of several tables together."""
         return Repairs(*(sum(counts) for counts in zip(*map(astuple, (self, *others)), strict=True)))
 
+    @property
+    def in_words(self) -> list[str]:
+        """A line for each kind that was seen."""
+        counts = (
+            (self.without_time, "rows dropped: their time cannot be read"),
+            (self.out_of_order, "rows out of order, sorted by time"),
+            (self.repeated, "rows with the time of another, merged: mean speed, last command"),
+            (self.before_command, "rows before the first command dropped"),
+            (self.commands_held, "cells without a command: the previous command is held"),
+            (self.speeds_missing, "cells without a speed, not filled"),
+        )
+        return [f"{count} {text}" for count, text in counts if count]
+
 
 @dataclass(frozen=True, eq=False)
 class Table:
@@ -96,21 +109,11 @@ class Table:
     @property
     def notes(self) -> tuple[str, ...]:
         """Notes for people, one line per kind of irregularity."""
-        found = self.repairs
-        counts = (
-            (found.without_time, "rows dropped: their time cannot be read"),
-            (found.out_of_order, "rows out of order, sorted by time"),
-            (found.repeated, "rows with the time of another, merged: mean speed, last command"),
-            (found.before_command, "rows before the first command dropped"),
-            (found.commands_held, "cells without a command: the previous command is held"),
-            (found.speeds_missing, "cells without a speed, not filled"),
-            (
-                self.gaps,
-                f"gaps longer than {period_in_words(GAP_IN_MEDIAN_PERIODS * self.median_period_s)}, not filled",
-            ),
-        )
-        notes = [*self.remarks, *(f"{count} {text}" for count, text in counts if count)]
-        if 2 * found.repeated > found.rows:
+        notes = [*self.remarks, *self.repairs.in_words]
+        if self.gaps:
+            longer_s = GAP_IN_MEDIAN_PERIODS * self.median_period_s
+            notes.append(f"{self.gaps} gaps longer than {period_in_words(longer_s)}, not filled")
+        if 2 * self.repairs.repeated > self.repairs.rows:
             notes.append("most times repeat: the time column is too coarse; choose another, or use --period")
         return tuple(notes)
 
@@ -176,16 +179,6 @@ def table_of(
 
 def _rows(columns: Sequence[Array], keep: Array) -> list[Array]:
     return list(columns) if keep.all() else [each[keep] for each in columns]
-
-
-def constant_commands(chosen: FanColumns, command: Array) -> list[str]:
-    """A note on each command (n, fans) that never changes, from which no twin can be made."""
-    never = dict.fromkeys(
-        (name, float(command[0, fan]))
-        for fan, name in enumerate(chosen.command)
-        if not np.any(np.diff(command[:, fan]))
-    )
-    return [f"{name} is {value:g} throughout: a twin needs steps of the command" for name, value in never]
 
 
 def hold_last(command: Array) -> Array:

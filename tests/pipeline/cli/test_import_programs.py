@@ -257,6 +257,44 @@ def test_a_preview_shows_all_but_what_cannot_be_told_which_it_names(tmp_path: Pa
     ]
 
 
+PREVIEWS = {
+    "rows that an import drops": (
+        Table(
+            HWINFO, "{d.day}.{d.month}.{d.year},{d:%H:%M:%S},55.0,{s},{c},700,", other="9.6.2026,noon,55.0,1,30,700,"
+        ),
+        "1 rows dropped: their time cannot be read",
+        "--speed 'Fan1 [RPM]:rpm'",
+    ),
+    "rows that an import of any columns drops": (
+        Table("Time,y,u", ISO + ",{s},{c}", other="?,{s},{c}"),
+        "1 rows dropped: their time cannot be read",
+        "--command COLUMN --speed COLUMN:UNIT",
+    ),
+    "names without rows": (Table("pwm;n1;n2;V;m"), "", "to import it: nothing as it is"),
+    "a log of sentences": (
+        Table("", ISO + " Measuring RPM of cpu_cooler at PWM: {c}"),
+        "",
+        "to import it: nothing as it is",
+    ),
+    "times before dates with two readings": (
+        Table(DATED, "21:59:50 06/09/2026,{s},{c}"),
+        "06/09/2026 can be read in 2 ways, and no row tells: give --dates dmy",
+        "to import it: nothing as it is",
+    ),
+    "speeds with their unit": (Table("t [s],duty [%],speed [Hz]", "{t},{c},{s}"), "", "COLUMN --speed COLUMN -o"),
+}
+
+
+@pytest.mark.parametrize("name", PREVIEWS)
+def test_a_preview_says_what_an_import_would_do(name: str, tmp_path: Path) -> None:
+    table, note, command_line = PREVIEWS[name]
+    path = tmp_path / "table.csv"
+    path.write_bytes(table.content)
+    shown = fantwin("import", path, "--preview").stdout
+    assert note in shown
+    assert command_line in shown.splitlines()[-1]
+
+
 def test_fans_are_called_as_the_program_calls_them(tmp_path: Path) -> None:
     path, recording = tmp_path / "table.csv", tmp_path / "r.mcap"
     path.write_bytes(Table(LHM_HEAD, US + ",{s},{half},{c},{c}").content)

@@ -85,6 +85,9 @@ TABLES = {
     "12 hours": Table(DATED, "{d:%m/%d/%Y %I:%M:%S %p},{s},{c}", notes=("month, day, year",), every_s=7560.0),
     "names of months and zones": Table(DATED, "{d:%d-%b-%Y %H:%M:%S} CEST,{s},{c}", t_s=EPOCH_S - 7200),
     "parts of one digit": Table(DATED, "{d.day}.{d.month}.{d.year} {d.hour}:{d.minute}:{d.second}.0,{s},{c}"),
+    "the time before the date": Table(
+        "Time\tfan1\tpwm1", "{d:%H:%M:%S} {d.day}-{d.month}-{d.year}\t{s}\t{c}", (*COLUMNS, "--dates", "dmy")
+    ),
     "a date that the order of rows tells": Table(
         DATED,
         "{d:%m/%d/%Y %H:%M},{s},{c}",
