@@ -80,7 +80,7 @@ def found_at(
 def alike(found: Sequence[Found], host_of: Callable[[Mapping[str, Any]], str]) -> Iterator[Found]:
     """One tray with `hosts` for all that differ in nothing else; the others as they are.
 
-    host_of: host of a tray, which stands in its name, and in `url` and `labels` of its source.
+    host_of: host of a tray, which stands in its name, and in `url`, `host` and `labels` of its source.
     """
     groups: dict[str, list[Found]] = {}
     for each in found:
@@ -110,7 +110,7 @@ def _template(tray: Mapping[str, Any], host: str) -> dict[str, Any]:
             else (value.replace(host, "{host}") if isinstance(value, str) else value)
         )
 
-    source = {key: placed(each) if key in ("url", "labels") else each for key, each in tray["source"].items()}
+    source = {key: placed(each) if key in ("url", "host", "labels") else each for key, each in tray["source"].items()}
     return {key: value for key, value in tray.items() if key != "name"} | {"source": source}
 
 

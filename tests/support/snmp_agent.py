@@ -28,6 +28,15 @@ class Agent(instrum.AbstractMibInstrumController):
         """The values that are asked for."""
         return [(oid, self._value(".".join(map(str, oid)))) for oid, _ in bindings]
 
+    def read_next_variables(self, *bindings: Any, **_context: Any) -> Any:
+        """The objects that follow those that are asked for."""
+        numbers = sorted(tuple(map(int, oid.split("."))) for oid in self.objects)
+        following = [next((each for each in numbers if each > tuple(oid)), None) for oid, _ in bindings]
+        return [
+            (v2c.ObjectIdentifier(each), self._value(".".join(map(str, each)))) if each else (oid, v2c.EndOfMibView())
+            for each, (oid, _) in zip(following, bindings, strict=True)
+        ]
+
     def _value(self, oid: str) -> Any:
         value = self.objects.get(oid)
         if value is None:
@@ -50,8 +59,9 @@ def snmp_agent(agent: Agent, port: int) -> Iterator[None]:
         config.add_vacm_user(served, 3, USER, "authPriv", (1, 3, 6), (1, 3, 6))
         there = context.SnmpContext(served)
         there.unregister_context_name(b"")
-        there.register_context_name(b"", agent)
+        there.register_context_name(b"", agent)  # pyright: ignore[reportArgumentType]
         cmdrsp.GetCommandResponder(served, there)
+        cmdrsp.BulkCommandResponder(served, there)
         await asyncio.sleep(0)  # the transport opens its socket
         is_ready.set()
         await ends.wait()

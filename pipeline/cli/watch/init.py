@@ -25,8 +25,14 @@ from fantwin.pipeline.sources.logs.discovery import discover_logs
 from fantwin.pipeline.sources.prometheus.discovery import discover_metrics
 from fantwin.pipeline.sources.redfish.discovery import discover_controllers
 from fantwin.pipeline.sources.serial.discovery import discover_device, serial_ports
+from fantwin.pipeline.sources.snmp.discovery import discover_snmp
 
-_BY_URL = {"redfish": discover_controllers, "ipmi": discover_ipmi, "prometheus": discover_metrics}
+_BY_URL = {
+    "redfish": discover_controllers,
+    "ipmi": discover_ipmi,
+    "snmp": discover_snmp,
+    "prometheus": discover_metrics,
+}
 
 
 @dataclass(frozen=True)
@@ -79,6 +85,10 @@ def init(
         list[str] | None,
         typer.Option(metavar="URL", help="The same by IPMI: ipmi://USER@HOST, ipmi://localhost. Repeatable."),
     ] = None,
+    snmp: Annotated[
+        list[str] | None,
+        typer.Option(metavar="HOST", help="By SNMP: HOST with a file of its community, or USER@HOST. Repeatable."),
+    ] = None,
     password_file: Annotated[
         Path | None,
         typer.Option(
@@ -105,14 +115,16 @@ def init(
     Example: fantwin init --redfish "https://ann@bmc[001-400].hall" --password-file bmc.secret
     """
     root = root.absolute() if root != ROOT else root
-    urls = {"redfish": redfish, "ipmi": ipmi, "prometheus": prometheus}
+    urls = {"redfish": redfish, "ipmi": ipmi, "snmp": snmp, "prometheus": prometheus}
     given = {kind: each for kind, each in urls.items() if each}
     chosen = Chosen(hwmon or writable, writable, tuple(serial or ()), given, password_file, logs)
     if chosen.password_file and not given:
         raise UsageError(f"--password-file is for {', '.join(f'--{kind}' for kind in urls)}: name an address")
     if chosen == Chosen():
         if json_output or not _is_terminal():
-            options = "--hwmon, --serial PORT, --redfish URL, --ipmi URL, --prometheus URL or --logs FOLDER"
+            options = (
+                "--hwmon, --serial PORT, --redfish URL, --ipmi URL, --snmp HOST, --prometheus URL or --logs FOLDER"
+            )
             raise UsageError(f"say what to watch: {options}; {_seen(root)}")
         chosen = _asked(root)
     found_logs = discover_logs(chosen.logs) if chosen.logs else []

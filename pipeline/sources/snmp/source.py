@@ -90,6 +90,25 @@ class SnmpSource(NamedValuesSource):
             values |= self._asked(names[first : first + MOST_AT_ONCE])
         return self.reading(values, "snmpwalk shows what there is; correct source.fan")
 
+    def walk(self, column: str) -> dict[str, str]:
+        """What is in a column of a table, as text by index. Raises DeviceError."""
+        from pysnmp.hlapi.v3arch import asyncio as snmp  # noqa: PLC0415
+
+        agent = self._agent
+        assert agent
+
+        async def walked() -> dict[str, str]:
+            found: dict[str, str] = {}
+            first = snmp.ObjectType(snmp.ObjectIdentity(column))
+            asked = agent.engine, agent.credentials, agent.address, snmp.ContextData(), 0, MOST_AT_ONCE, first
+            async for failure, _, _, answer in snmp.bulk_walk_cmd(*asked, lookupMib=False, lexicographicMode=False):
+                if failure:
+                    raise self._unanswered(failure)
+                found |= {str(oid).removeprefix(f"{column}."): value.prettyPrint() for oid, value in answer}
+            return found
+
+        return agent.loop.run_until_complete(walked())
+
     def disconnect(self) -> None:
         """Close the socket."""
         agent, self._agent = self._agent, None
@@ -120,6 +139,10 @@ class SnmpSource(NamedValuesSource):
             privProtocol=getattr(snmp, _PRIVACY[encryption or "AES"]) if privacy else snmp.usmNoPrivProtocol,
         )
 
+    def _unanswered(self, failure: object) -> DeviceError:
+        who = "community" if self._config.community_file else "user and passwords"
+        return DeviceError(f"{failure}: check source.host and its {who}; waiting for it", is_lost=True)
+
     def _asked(self, oids: Sequence[str]) -> dict[str, float]:
         """The numbers of objects, NaN where there is none. Raises DeviceError."""
         from pysnmp.hlapi.v3arch import asyncio as snmp  # noqa: PLC0415
@@ -132,8 +155,7 @@ class SnmpSource(NamedValuesSource):
         )
         failure, status, _, answer = agent.loop.run_until_complete(asking)
         if failure:
-            who = "community" if self._config.community_file else "user and passwords"
-            raise DeviceError(f"{failure}: check source.host and its {who}; waiting for it", is_lost=True)
+            raise self._unanswered(failure)
         if status:
             raise DeviceError(f"it answers with error {getattr(status, 'prettyPrint', lambda: status)()}")
         return {oid: _number(value) for oid, (_, value) in zip(oids, answer, strict=True)}

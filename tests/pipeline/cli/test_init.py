@@ -167,7 +167,8 @@ def test_on_a_terminal_it_asks_and_elsewhere_it_says_what_it_takes_and_what_is_t
     port = ListPortInfo("/dev/ttyUSB9")
     port.description, port.hwid = "FT232R USB UART", "USB VID:PID=0403:6001"
     monkeypatch.setattr(list_ports, "comports", lambda: [port, ListPortInfo("/dev/ttyS9")])
-    options = "say what to watch: --hwmon, --serial PORT, --redfish URL, --ipmi URL, --prometheus URL or --logs FOLDER"
+    options = "say what to watch: --hwmon, --serial PORT, --redfish URL, --ipmi URL, --snmp HOST, --prometheus URL or "
+    options += "--logs FOLDER"
     there = "nct6798 (hwmon2, 1-002f), thinkpad (hwmon8, thinkpad_hwmon), /dev/ttyUSB9"
     assert usage_error_of("init", "--root", root) == f"{options}; here: {there}"
     monkeypatch.setattr(module, "_is_terminal", lambda: True)

@@ -9,13 +9,16 @@ from typing import Any
 
 import pytest
 
+from fantwin.pipeline.config.loading import load_config
 from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.sources.kinds import build_source
 from fantwin.pipeline.sources.polling import DeviceError
 from fantwin.pipeline.sources.snmp import source as module
 from fantwin.pipeline.sources.snmp.config import SnmpConfig
 from fantwin.pipeline.sources.snmp.source import SnmpSource
 from fantwin.pipeline.sources.source import Reading, SourceContext
 from fantwin.schemas.channels import TEMPERATURE
+from tests.support.fantwin_command import error_of, fantwin
 from tests.support.ports import free_port
 from tests.support.snmp_agent import COMMUNITY, PASSWORD, PRIVACY, USER, Agent, snmp_agent
 
@@ -104,3 +107,33 @@ def test_secrets_are_in_files_of_their_owner_and_one_log_in_is_given(agent: Agen
         SnmpConfig.model_validate({"host": "udp://switch7", "fan": FANS, **V2})
     with pytest.raises(ValueError, match="'sysDescr.0' is no identifier with numbers: snmptranslate -On"):
         SnmpConfig.model_validate({"host": "switch7", "fan": [{"speed": "sysDescr.0"}], **V2})
+
+
+def entity(index: int, value: int, name: str, *, kind: int = 10, scale: int = 9, precision: int = 0, unit: str = ""):
+    """Objects of a sensor, as in RFC 3433."""
+    table = {1: kind, 2: scale, 3: precision, 4: value, 6: unit}
+    found = {f"1.3.6.1.2.1.99.1.1.1.{column}.{index}": each for column, each in table.items() if each != ""}
+    return {**found, f"1.3.6.1.2.1.47.1.1.1.1.7.{index}": name}
+
+
+def test_init_finds_the_sensors_in_rpm_with_their_scales_and_none_that_is_in_per_cent(
+    agent: Agent, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    words = ("init", "--snmp", f"127.0.0.1:{agent.port}", "--password-file", "v2")
+    agent.objects = entity(7, 41, "CPU", kind=8) | entity(10, 39, "Fan1", precision=1, unit="Percent (%)")
+    none = error_of(*words)
+    assert none.endswith("1 say that they are in rpm, and show Percent (%); name objects by source.fan")
+    agent.objects |= entity(1001, 5100, "Tray 1 fan") | entity(1002, 52000, "Tray 2 fan", precision=1)
+    agent.objects |= entity(1003, 5300, "Tray 3 fan", scale=8, precision=0)
+    assert fantwin(*words).exit_code == 0
+    (tray,) = load_config(tmp_path / "fantwin.toml", stages=()).trays
+    assert tray.names.names == ("Tray 1 fan", "Tray 2 fan", "Tray 3 fan")
+    source = build_source(tray.source, SourceContext(3, "rpm", tmp_path))
+    assert isinstance(source, SnmpSource)
+    source.connect()
+    assert source.read().speed == pytest.approx((5100.0, 5200.0, 5.3))
+    source.disconnect()
+    agent.objects = {}
+    assert "no fans in rpm in its ENTITY-SENSOR-MIB; name" in error_of(*words, "-c", "x.toml")
+    assert "give --password-file (version 2c)" in error_of("init", "--snmp", "switch7", "-c", "x.toml")
