@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.sources import polling
 from fantwin.pipeline.sources.exec.config import ExecConfig
 from fantwin.pipeline.sources.exec.source import ExecSource
@@ -102,6 +103,19 @@ def test_one_that_reads_no_commands_does_not_stop_the_stage(run: Run) -> None:
     assert found[0] == "" and found[-1] == "./program does not read its commands"
     source, events = run(f"echo '{SAMPLE}'; exec sleep 1000")
     assert source.send((0.5, 0.5), ()) == "its source does not have commands = true"
+
+
+def test_json_of_its_own_is_read_by_pointers_and_a_line_that_is_none_costs_itself(run: Run) -> None:
+    own = '{"at": 1790000000, "fans": [{"rpm": "900 rpm", "pwm": 40}, {"rpm": null, "pwm": 50}]}'
+    pointers = {"speed_key": "/fans/{0}/rpm", "command_key": "/fans/{0}/pwm", "time_key": "/at"}
+    _, events = run(f"echo 'sensors v3'; echo '{own}'; exec sleep 1000", **pointers)
+    eventually(lambda: events.readings, "it is read")
+    (refused,) = events.refused
+    assert refused.kind == "malformed" and "'sensors v3': no JSON" in refused.detail
+    assert str(events.readings[0].speed) == "(900.0, nan)" and events.readings[0].command == (40, 50)
+    assert events.readings[0].clock_us == 1_790_000_000 * 10**6 % 2**32
+    with pytest.raises(UserError, match="speed_key has one speed for 2 fans"):
+        run("", speed_key="/rpm", command_key="/pwm")
 
 
 def test_what_is_no_program_is_one_line(tmp_path: Path) -> None:
