@@ -8,11 +8,16 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
+
+from pydantic import BaseModel, ValidationError
 
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.sources.host_address import by_numbers, hosts_of, ranges_of
+from fantwin.schemas.fan_names import is_fan_name
 
+HIGHEST_RPM = 50_000
+Config = TypeVar("Config", bound=BaseModel)
 AT_ONCE = 32
 """devices that are asked at the same time"""
 
@@ -48,6 +53,27 @@ class Found:
             return ""
         lines = [f"# {line}" for line in (self.title, *self.notes, *self.missing)]
         return "\n".join(["[[tray]]", *lines, *(f"{key} = {as_toml(value)}" for key, value in self.tray.items()), ""])
+
+
+def keys_in_rpm(name: str, called: Sequence[str], command_max: float, source: Mapping[str, Any]) -> dict[str, Any]:
+    """The keys of a tray whose fans a device calls so; their number where that can be no names."""
+    are_names = all(map(is_fan_name, called)) and len({each.casefold() for each in called}) == len(called)
+    return {
+        "name": name,
+        "fans": list(called) if are_names else len(called),
+        "speed_unit": "rpm",
+        "speed_max": HIGHEST_RPM,
+        "command_max": command_max,
+        "source": source,
+    }
+
+
+def checked(model: type[Config], settings: Mapping[str, Any], option: str, url: str) -> Config:
+    """The settings of a source. Raises UserError, which names the option with the URL."""
+    try:
+        return model.model_validate(settings)
+    except ValidationError as error:
+        raise UserError(f"{option} {url}: {error.errors()[0]['msg'].removeprefix('Value error, ')}") from error
 
 
 def found_at(

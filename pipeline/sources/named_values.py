@@ -18,7 +18,6 @@ from fantwin.pipeline.sources.source import Reading, SourceContext
 from fantwin.schemas.channels import CHANNELS
 
 SPEED, COMMAND = "speed", "command"
-HIGHEST_RPM = 50_000
 
 
 def of_each_channel(kind: Any) -> Any:

@@ -5,15 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from pydantic import ValidationError
-
 from fantwin.pipeline.errors import UserError
-from fantwin.pipeline.sources.found import Found, found_at
+from fantwin.pipeline.sources.found import Found, checked, found_at, keys_in_rpm
 from fantwin.pipeline.sources.ipmi.config import IpmiConfig
 from fantwin.pipeline.sources.ipmi.source import RPM, IpmiSource
-from fantwin.pipeline.sources.named_values import HIGHEST_RPM
 from fantwin.pipeline.sources.source import SourceContext
-from fantwin.schemas.fan_names import is_fan_name
 
 
 def discover_ipmi(url: str, password_file: Path | None, folder: Path) -> list[Found]:
@@ -28,10 +24,7 @@ def discover_ipmi(url: str, password_file: Path | None, folder: Path) -> list[Fo
 
 def _discover(url: str, password_file: Path | None, folder: Path) -> Found:
     asked: dict[str, Any] = {"url": url, **({"password_file": str(password_file)} if password_file else {})}
-    try:
-        config = IpmiConfig.model_validate({**asked, "fan": [{"speed": RPM}]})
-    except ValidationError as error:
-        raise UserError(f"--ipmi {url}: {error.errors()[0]['msg'].removeprefix('Value error, ')}") from error
+    config = checked(IpmiConfig, {**asked, "fan": [{"speed": RPM}]}, "--ipmi", url)
     source = IpmiSource(config, SourceContext(0, "rpm", folder))
     try:
         source.connect()
@@ -44,18 +37,9 @@ def _discover(url: str, password_file: Path | None, folder: Path) -> Found:
     if not fans:
         there = ", ".join(f"{each.name} ({each.unit or 'no number'})" for each in sensors) or "none"
         raise UserError(f"{url}: no fans in rpm; its sensors of fans: {there}")
-    are_names = len({each.name.casefold() for each in fans}) == len(fans) and all(
-        is_fan_name(each.name) for each in fans
-    )
-    names = [each.name if are_names else each.number for each in fans]
-    keys = {
-        "name": config.host,
-        "fans": names if are_names else len(fans),
-        "speed_unit": "rpm",
-        "speed_max": HIGHEST_RPM,
-        "command_max": 100,
-        "source": {"kind": "ipmi", **asked, "fan": [{"speed": name} for name in names]},
-    }
+    are_different = len({each.name for each in fans}) == len(fans)
+    rows = [{"speed": each.name if are_different else each.number} for each in fans]
+    keys = keys_in_rpm(config.host, [each.name for each in fans], 100.0, {"kind": "ipmi", **asked, "fan": rows})
     notes = [f"fan {number} is {each.name}: {each.value:g} rpm" for number, each in enumerate(fans)]
     others = ", ".join(each.name for each in sensors if each.unit == "percent")
     lacking = f"no command is known: name a sensor in per cent by command of source.fan ({others or 'it has none'})"

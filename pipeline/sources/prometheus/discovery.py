@@ -9,12 +9,9 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pydantic import ValidationError
-
 from fantwin.pipeline.errors import UserError
-from fantwin.pipeline.sources.found import Found, alike
+from fantwin.pipeline.sources.found import Found, alike, checked, keys_in_rpm
 from fantwin.pipeline.sources.host_address import by_numbers
-from fantwin.pipeline.sources.named_values import HIGHEST_RPM
 from fantwin.pipeline.sources.polling import SLOWEST_S
 from fantwin.pipeline.sources.prometheus.config import NAME, Labels, PrometheusConfig, labels_of
 from fantwin.pipeline.sources.prometheus.server import Samples, quoted, server_of
@@ -74,14 +71,12 @@ def discover_metrics(url: str, password_file: Path | None, folder: Path) -> list
         asked |= {"scrape": "/metrics", "period_s": SCRAPED_EVERY_S}
     speeds = [labels_of(each.speed)[NAME] for each in METRICS]
     names = [*dict.fromkeys([*speeds, *(each.command for each in METRICS if each.command), _CALLED])]
+    config = checked(PrometheusConfig, {**asked, "fan": [{"speed": speeds[0]}]}, "--prometheus", url)
     try:
-        config = PrometheusConfig.model_validate({**asked, "fan": [{"speed": speeds[0]}]})
         server = server_of(config, folder)
         server.connect()
         query = f"{{{NAME}=~{quoted('|'.join(names))}}}[{BACK_S}s]"
         found = server.shown(names) if is_exporter else server.samples(query)
-    except ValidationError as error:
-        raise UserError(f"--prometheus {url}: {error.errors()[0]['msg'].removeprefix('Value error, ')}") from error
     except UserError as error:
         raise UserError(f"{url}: {error}") from error
     series = [(labels, samples) for labels, samples in found if samples]
@@ -99,7 +94,7 @@ def _trays(
     wanted = labels_of(metric.speed)
     devices: dict[Device, dict[str, tuple[str, Samples]]] = {}
     commands: set[tuple[Device, str]] = set()
-    called: dict[tuple[Device, str], str] = {}
+    names: dict[tuple[Device, str], str] = {}
     for labels, samples in series:
         by = next((name for name in metric.fan if labels.get(name)), metric.fan[0])
         fan = labels.get(by, "")
@@ -110,7 +105,7 @@ def _trays(
         elif labels[NAME] == metric.command:
             commands.add((device, fan))
         elif labels[NAME] == _CALLED:
-            called[device, fan] = labels.get("label", "")
+            names[device, fan] = labels.get("label", "")
     for device, unsorted in devices.items():
         fans = {fan: unsorted[fan] for fan in sorted(unsorted, key=by_numbers)}
         labels = dict(sorted(device))
@@ -123,14 +118,10 @@ def _trays(
                 rows[-1]["command"] = f"{metric.command}{{{by}={quoted(drive)}}}"
             else:
                 missing.append(fan)
-        keys = {
-            "name": _host(labels, server),
-            "fans": _fans([called.get((device, fan), "") for fan in fans], list(fans)),
-            "speed_unit": "rpm",
-            "speed_max": HIGHEST_RPM,
-            "command_max": metric.command_max,
-            "source": {"kind": "prometheus", **asked, "labels": labels, "fan": rows},
-        }
+        called = {fan: names.get((device, fan), "") for fan in fans}
+        shown = [name if is_fan_name(name) else fan for fan, name in called.items()]
+        source = {"kind": "prometheus", **asked, "labels": labels, "fan": rows}
+        keys = keys_in_rpm(_host(labels, server), shown, metric.command_max, source)
         notes = [
             f"fan {number} is {fan}: {each[-1][1]:.0f} rpm" for number, (fan, (_, each)) in enumerate(fans.items())
         ]
@@ -143,13 +134,6 @@ def _trays(
 def _host(labels: Labels, server: str) -> str:
     """The host of a device: the target without its port; of an exporter that is read itself, that."""
     return re.sub(r":\d+$", "", labels.get("instance", server))
-
-
-def _fans(labels: Sequence[str], own: Sequence[str]) -> list[str] | int:
-    """What the kernel calls the fans, or else their exporter; their number where that can be no names."""
-    names = [label if is_fan_name(label) else name for label, name in zip(labels, own, strict=True)]
-    are_names = all(map(is_fan_name, names)) and len({each.casefold() for each in names}) == len(names)
-    return names if are_names else len(own)
 
 
 def _period(scraped: Iterable[Samples]) -> dict[str, float]:

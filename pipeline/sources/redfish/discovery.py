@@ -8,11 +8,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from pydantic import ValidationError
-
 from fantwin.pipeline.errors import UserError
-from fantwin.pipeline.sources.found import Found, found_at
-from fantwin.pipeline.sources.named_values import HIGHEST_RPM
+from fantwin.pipeline.sources.found import HIGHEST_RPM, Found, checked, found_at
 from fantwin.pipeline.sources.redfish.config import RedfishConfig
 from fantwin.pipeline.sources.redfish.source import RedfishSource
 from fantwin.pipeline.sources.source import SourceContext
@@ -33,10 +30,7 @@ def discover_controller(url: str, password_file: Path | None, folder: Path) -> F
     Raises:
         UserError: the address is none, the controller cannot be asked, or it has no fans.
     """
-    try:
-        config = RedfishConfig(url=url, password_file=password_file)
-    except ValidationError as error:
-        raise UserError(f"--redfish {url}: {error.errors()[0]['msg'].removeprefix('Value error, ')}") from error
+    config = checked(RedfishConfig, {"url": url, "password_file": password_file}, "--redfish", url)
     source = RedfishSource(config, SourceContext(0, "rpm", folder))
     try:
         source.connect()

@@ -136,4 +136,4 @@ def test_init_finds_the_sensors_in_rpm_with_their_scales_and_none_that_is_in_per
     source.disconnect()
     agent.objects = {}
     assert "no fans in rpm in its ENTITY-SENSOR-MIB; name" in error_of(*words, "-c", "x.toml")
-    assert "give --password-file (version 2c)" in error_of("init", "--snmp", "switch7", "-c", "x.toml")
+    assert "give --password-file, a file with the community" in error_of("init", "--snmp", "switch7", "-c", "x.toml")
