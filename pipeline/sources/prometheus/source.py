@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from bisect import bisect_right
 from collections.abc import Iterator, Sequence
+from itertools import pairwise
 
 from fantwin.pipeline.errors import refusals
 from fantwin.pipeline.sources.named_values import SPEED, NamedValuesSource
@@ -94,12 +95,16 @@ class PrometheusSource(NamedValuesSource):
         return (period_number(period_s) + LATER) * period_s
 
     def _found(self) -> dict[str, Samples]:
-        """The samples of each series. Raises DeviceError: two series for one."""
+        """The samples of each series. Raises DeviceError: two series for one at the same time."""
         answer = self._server.answer()
+        found: dict[str, Samples] = {}
         for name, series in self._series.items():
-            if len(answer.get(series, ())) > 1:
+            each = sorted(answer.get(series, ()), key=lambda samples: samples[0][0])
+            if any(later[0][0] <= earlier[-1][0] for earlier, later in pairwise(each)):
                 raise DeviceError(f"several series are {name}: add a label in which they differ")
-        return {name: answer[series][0] for name, series in self._series.items() if answer.get(series)}
+            if each:  # one after the other, where a label such as the health of the fan has changed
+                found[name] = [sample for samples in each for sample in samples]
+        return found
 
     def _value(self, name: str, samples: Samples, t_ns: int) -> float:
         """The newest value up to a time, that of a speed only if it is of this time; NaN where there is none."""

@@ -174,6 +174,16 @@ def test_two_series_for_one_value_are_refused_and_not_chosen_from() -> None:
             source.read()
 
 
+def test_a_label_that_changes_with_the_health_of_a_fan_makes_no_gap() -> None:
+    metrics = Metrics()
+    ok, critical = ({"__name__": "rpm", "name": "fan_1", "status_code": code} for code in ("ok", "cr"))
+    with connected(metrics, labels={}, fan=[{"speed": 'rpm{name="fan_1"}'}]) as source:
+        metrics.series = [(ok, [(T0, "900"), (T0 + 15, "890")])]
+        assert [speed for _, speed, _ in read(source)] == [(890,)]
+        metrics.series = [(critical, [(T0 + 30, "0")]), (ok, [(T0, "900"), (T0 + 15, "890")])]
+        assert [(t_s, speed) for t_s, speed, _ in read(source)] == [(30, (0,))]
+
+
 def test_an_exporter_is_read_itself_and_a_line_that_is_broken_costs_itself() -> None:
     metrics = Metrics()
     metrics.text = EXPORTER
@@ -268,6 +278,73 @@ def test_init_writes_a_tray_of_each_device_with_its_fans_and_their_commands(
     assert none.startswith(f"{url}/metrics: no fans: none of node_hwmon_fan_rpm, ipmi_fan_speed_rpm, idrac_sensors")
     gone = error_of("init", "--prometheus", url, "-c", "new.toml")
     assert gone == f"{url}: does not answer within 5 s, or cannot be reached: check source.url; waiting for it"
+
+
+USUAL = {
+    "idrac_exporter": (
+        'idrac_sensors_fan_speed{id="0",name="FAN1A",units="rpm"} 7912\n'
+        'idrac_sensors_fan_speed{id="1",name="FAN1B",units="percent"} 42\n',
+        ["FAN1A"],
+    ),
+    "redfish_exporter": (  # whose metric is called rpm, also of a fan in per cent
+        'redfish_chassis_fan_rpm{chassis_id="1",fan="Fan 1",fan_id="0",fan_unit="rpm",resource="fan"} 4320\n'
+        'redfish_chassis_fan_rpm{chassis_id="1",fan="Fan 2",fan_id="1",fan_unit="percent",resource="fan"} 21\n',
+        ["Fan 1"],
+    ),
+    "Telegraf, IPMI": (
+        'ipmi_sensor_value{entity_id="29.10",name="fan_10",server="bmc7",status_code="ok",unit="rpm"} 3000\n'
+        'ipmi_sensor_value{entity_id="29.2",name="fan_2",server="bmc7",status_code="cr",unit="rpm"} 0\n'
+        'ipmi_sensor_value{entity_id="7.1",name="inlet",server="bmc7",status_code="ok",unit="degrees_c"} 23\n',
+        ["fan_2", "fan_10"],
+    ),
+    "Telegraf, Redfish": (
+        'redfish_thermal_fans_reading_rpm{address="bmc7",health="OK",name="System Board Fan1A",state="Enabled"} 17720\n'
+        'redfish_thermal_fans_reading_rpm{address="bmc7",health="Warning",name="System Fan2",state="Enabled"} 90\n',
+        ["System Board Fan1A", "System Fan2"],
+    ),
+    "snmp_exporter, ENTITY-SENSOR-MIB": (
+        'entPhySensorValue{entPhysicalIndex="1001",entPhysicalName="Tray 1",entPhySensorType="10"} 5100\n'
+        'entPhySensorValue{entPhysicalIndex="7",entPhysicalName="CPU",entPhySensorType="8"} 41\n',
+        ["Tray 1"],
+    ),
+    "snmp_exporter, Cisco": (
+        'entSensorValue{entPhysicalIndex="3005",entPhysicalName="fan-1",entSensorScale="9",entSensorType="10"} 8000\n'
+        'entSensorValue{entPhysicalIndex="3006",entPhysicalName="inlet",entSensorScale="9",entSensorType="8"} 29\n',
+        ["fan-1"],
+    ),
+    "snmp_exporter, Dell": (
+        'coolingDeviceReading{coolingDeviceIndex="1",coolingDeviceLocationName="System Board Fan1 RPM"} 2880\n',
+        ["System Board Fan1 RPM"],
+    ),
+    "ipmi_exporter, HPE": ('ipmi_fan_speed_ratio{id="58",name="Fan 1 DutyCycle"} 0.2195\n', None),
+    "snmp_exporter, Fortinet": (
+        'fgHwSensorEntValue{fgHwSensorEntName="SYS Fan1 Speed",fgHwSensorEntValue="6054"} 1\n',
+        None,
+    ),
+}
+"""pages in the form of public reports, and the fans in rpm in them"""
+
+
+@pytest.mark.parametrize("page", USUAL)
+def test_of_the_usual_exporters_only_what_is_in_rpm_is_found_as_a_fan(
+    page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    metrics = Metrics()
+    metrics.text, fans = USUAL[page]
+    with metrics_server(metrics) as url:
+        if fans is None:
+            assert "no fans: none of" in error_of("init", "--prometheus", f"{url}/metrics")
+            return
+        assert fantwin("init", "--prometheus", f"{url}/metrics").exit_code == 0
+        (tray,) = trays(tmp_path / "fantwin.toml")
+        assert list(tray.names.names) == fans
+        source = build_source(tray.source, SourceContext(len(fans), "rpm", tmp_path))
+        assert isinstance(source, PrometheusSource)
+        source.connect()
+        ((_, speed, command),) = read(source)
+    shown = [line.rpartition(" ")[2] for name in fans for line in metrics.text.splitlines() if f'"{name}"' in line]
+    assert list(speed) == list(map(float, shown)) and all(map(math.isnan, command))
 
 
 def hall(nodes: int) -> list[tuple[dict[str, str], list[tuple[float, str]]]]:
