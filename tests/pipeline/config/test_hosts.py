@@ -10,6 +10,7 @@ from fantwin.pipeline.config.loading import parse_config
 from fantwin.pipeline.config.settings import Config
 from fantwin.pipeline.config.shards import process_list
 from fantwin.pipeline.errors import UserError
+from fantwin.pipeline.sources.host_address import hosts_of, ranges_of
 from fantwin.pipeline.sources.redfish.config import RedfishConfig
 
 HALL = """
@@ -63,3 +64,18 @@ def test_hosts_that_cannot_be_trays_are_one_line(change: tuple[str, str], said: 
     text = HALL.replace(', name = "old"', "").replace(*change).replace("PLACE", "row 1")
     with pytest.raises(UserError, match=said):
         site(text)
+
+
+@pytest.mark.parametrize(
+    ("hosts", "ranges"),
+    [
+        (["node002", "node001", "node003"], ["node[001-003]"]),
+        (["node10", "node9", "node2", "spare"], ["node2", "node[9-10]", "spare"]),
+        (["10.0.0.7", "10.0.0.8", "10.0.1.8"], ["10.0.0.[7-8]", "10.0.1.8"]),
+        (["r1n1.hall", "r1n2.hall", "r2n1.hall"], ["r1n[1-2].hall", "r2n1.hall"]),
+        (["n08", "n9"], ["n08", "n9"]),
+    ],
+)
+def test_hosts_become_the_ranges_that_stand_for_them(hosts: list[str], ranges: list[str]) -> None:
+    assert ranges_of(hosts) == ranges
+    assert sorted(host for each in ranges for host in hosts_of(each)) == sorted(hosts)
