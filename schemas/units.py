@@ -17,3 +17,8 @@ def period_in_words(seconds: float) -> str:
             value = seconds / size
             return f"{value:.0f} {unit}" if value >= 100 else f"{value:.3g} {unit}"
     return f"{seconds * 1e6:.3g} us"
+
+
+def short_number(value: float, digits: int = 3) -> str:
+    """A number to so many digits, and large ones whole: 0.25, 25.1, 2520."""
+    return f"{value:.0f}" if abs(value) >= 10 ** (digits - 1) else f"{value:.{digits}g}"

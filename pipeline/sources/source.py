@@ -100,7 +100,8 @@ class ReadingLimits:
             return None
         # Without its actual command a fan cannot be judged, and a command must not be invented: NaN is one not known.
         if all(map(math.isnan, reading.command)):
-            return Rejected("unknown_command", "the command of no fan is known", is_sample=True, setting="source")
+            detail = "the command of no fan is known, and no command_from stands for it"
+            return Rejected("unknown_command", detail, is_sample=True, setting="source and command_from")
         for command in reading.command:
             if not (math.isnan(command) or within(command, self.command_min, self.command_max)):
                 limits = f"command_min = {self.command_min:g} to command_max = {self.command_max:g}"

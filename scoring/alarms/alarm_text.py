@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from fantwin.schemas.enums import FanState, InvalidReason, Severity, Statistic, Transition
 from fantwin.schemas.fan_names import NO_NAMES, FanNames
 from fantwin.schemas.messages import Alarm
-from fantwin.schemas.units import RAD_S_PER_UNIT, SpeedUnit
+from fantwin.schemas.units import RAD_S_PER_UNIT, SpeedUnit, short_number
 from fantwin.scoring.diagnosis.causes import CANNOT_TELL, CAUSES, is_of_standstill
 
 RETURNING = "like a healthy fan again (the alarm clears after ten seconds of it)"
@@ -64,7 +64,7 @@ class AlarmUnits:
     def shown_speed(self, speed_rad_s: float) -> str:
         """A speed in the unit that people are shown, without the unit."""
         speed = speed_rad_s / RAD_S_PER_UNIT[self.speed]
-        return f"{speed:.0f}" if speed >= 10 else f"{speed:.2g}"
+        return short_number(speed, 2)
 
     def deviation(self, alarm: Alarm) -> str:
         """Deviation of a fan from its healthy state, by its speed or by its torque balance."""
@@ -74,8 +74,9 @@ class AlarmUnits:
             error = self.shown_speed(SIGMAS * alarm.residual_std_rad_s)
             return f"{size} {self.speed} {side} than when healthy (± {error})"
         side = "more" if alarm.torque_balance_command > 0 else "less"
-        size, error = abs(alarm.torque_balance_command), SIGMAS * alarm.torque_balance_std_command
-        return f"takes {size:.2g} {self.command or 'of command'} {side} than when healthy (± {error:.2g})"
+        sizes = abs(alarm.torque_balance_command), SIGMAS * alarm.torque_balance_std_command
+        size, error = (short_number(each, 2) for each in sizes)
+        return f"takes {size} {self.command or 'of command'} {side} than when healthy (± {error})"
 
 
 class AlarmText:

@@ -98,8 +98,8 @@ class Falls(Saved):
         self._has_turned &= self._has_stood | (gap_s <= np.maximum(self._fans.held_s, 0.5 * self._fans.coasts_s))
 
     def of(self, fan: int) -> Fall | None:
-        """The fall of a fan that falls or stands; None if it was not seen."""
-        if not self._has_turned[fan]:
+        """The fall of a fan that falls or stands; None if it was not seen, or lies between two samples."""
+        if not self._has_turned[fan] or self._bin_s > self._fans.coasts_s[fan] + self._fans.held_s[fan]:
             return None
         held_s = max(float(self._fans.held_s[fan]), self._bin_s)
         return Fall(float(self._lasted_s[fan]), float(self._rest_s[fan]), float(self._fans.coasts_s[fan]), held_s)

@@ -19,6 +19,7 @@ from dataclasses import dataclass
 from enum import Enum
 
 from fantwin.schemas.messages import Diagnosis
+from fantwin.schemas.units import short_number
 from fantwin.scoring.diagnosis.causes import (
     BLOCKED,
     MIN_PROBABILITY,
@@ -85,9 +86,9 @@ def standstill_causes(standing: Standing, fall: Fall | None, command: float = ma
     weights, words = PRIORS[standing], standing.value
     is_known = math.isfinite(command)
     if weights is RUNS_ON:
-        words = f"{words} although {f'the command of {command:.3g}' if is_known else 'its command'} stops it"
+        words = f"{words} although {f'the command of {short_number(command)}' if is_known else 'its command'} stops it"
     else:
-        words = f"{words} although commanded to {f'{command:.3g}' if is_known else 'turn'}"
+        words = f"{words} although commanded to {short_number(command) if is_known else 'turn'}"
     if standing == Standing.CAME_TO_REST and fall is not None and fall.coasts_s > 0.0:
         weights = _weighed(weights, fall)
         words = f"{words}; it ran on for {fall.lasted_s:.1f} s, without power it would for {fall.coasts_s:.1f} s"

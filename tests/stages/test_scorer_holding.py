@@ -175,7 +175,7 @@ def test_a_tacho_of_many_wrong_readings_is_said_and_raises_no_alarm() -> None:
 
 
 CHIP = Tacho(kind="average", window_s=0.05, update_s=1.5)
-WRONG = (2.0 * TWIN_SPEED, 0.5 * TWIN_SPEED, 9917.0 * np.pi / 30.0, 65535.0 * np.pi / 30.0)
+WRONG = (0.0, 2.0 * TWIN_SPEED, 0.5 * TWIN_SPEED, 9917.0 * np.pi / 30.0, 65535.0 * np.pi / 30.0)
 
 
 @pytest.mark.parametrize(
@@ -192,12 +192,12 @@ def test_one_wrong_reading_is_no_alarm_at_any_rate_and_a_slower_fan_is_found(rat
     reading = np.arange(220 * shown) // shown
     speed = TWIN_SPEED + noise(220, seed=3)[reading]
     for kind, wrong in enumerate(WRONG):
-        speed[reading % (45 * len(WRONG)) == 45 * kind + 44] = wrong
-    core = core_of(tachos=(tacho,))
+        speed[reading % (38 * len(WRONG)) == 38 * kind + 37] = wrong
+    core = core_of(tachos=(tacho,), standstill=STANDSTILL)
     _, alarms = feed(core, [resampled(speed, rate_hz, tachos=(tacho,))])
     assert alarms == []
     speed[reading >= 200] *= 0.9
-    core = core_of(tachos=(tacho,))
+    core = core_of(tachos=(tacho,), standstill=STANDSTILL)
     _, alarms = feed(core, [resampled(speed, rate_hz, tachos=(tacho,))])
     raised = [(each.t_ns - EPOCH_NS) / NS_PER_S for each in alarms if each.transition == Transition.RAISED]
     assert len(raised) == 1

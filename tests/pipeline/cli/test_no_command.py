@@ -70,9 +70,13 @@ def alarms_of(folder: Path, name: str) -> list[dict]:
 
 def test_one_that_is_five_per_cent_slower_and_one_that_stands_are_found_and_no_other(folder: Path) -> None:
     assert alarms_of(folder, "other") == []
-    found = {alarm["fan"]: alarm["raised_ns"] / 1e9 - HOUR_S for alarm in reversed(alarms_of(folder, "faulty"))}
+    alarms = alarms_of(folder, "faulty")
+    found = {alarm["fan"]: alarm["raised_ns"] / 1e9 - HOUR_S for alarm in reversed(alarms)}
     assert set(found) == {1, 4}
     assert all(0.0 <= after_s <= 300.0 for after_s in found.values()), found
+    stands = next(alarm["message"] for alarm in alarms if alarm["fan"] == 4)
+    assert "does not turn although commanded to " in stands and "e+" not in stands
+    assert "ran on" not in stands, "how it fell lies between two samples"
 
 
 def test_an_import_without_a_command_offers_what_stands_for_it_by_its_error_and_says_what_is_not_found(
