@@ -65,7 +65,7 @@ def test_a_twin_of_one_fan_serves_each_fan_of_a_table(twin):
 
 
 def test_calibration_by_tables_is_that_of_the_command(twin, tmp_path):
-    tables = [table_of(seed, 15.0) for seed in (4, 5)]
+    tables = [table_of(seed, 10.0) for seed in (4, 5)]
     calibrated = fantwin.calibrate(twin, tables, false_alarms_per_day=8, extrapolate=True)
     file = twin.save(tmp_path / "own.onnx")
     recordings = [imported(table, tmp_path / f"{number}.mcap") for number, table in enumerate(tables)]
@@ -77,7 +77,7 @@ def test_calibration_by_tables_is_that_of_the_command(twin, tmp_path):
         assert of_tables[name] == of_command[name], name
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert not calibrated.score(table_of(6, 20.0))["alarm"].to_numpy().any()
+        assert not calibrated.score(table_of(6, 10.0))["alarm"].to_numpy().any()
 
 
 def test_evaluate_is_that_of_the_command_and_data_that_made_the_twin_do_not_test_it(twin, tmp_path):

@@ -151,7 +151,7 @@ def test_a_fan_that_stands_is_not_judged_while_its_line_is_silent() -> None:
 def test_a_fan_that_starts_after_a_long_stop_is_not_suspect_for_the_time_in_which_it_stood() -> None:
     fan = Fan(core_of(config={"false_alarms_per_day": 1.0}), rate_hz=1)
     fan.runs(30.0)
-    fan.runs(1800.0, 0.0, InvalidReason.STOPPED, predicted=np.nan)
+    fan.runs(600.0, 0.0, InvalidReason.STOPPED, predicted=np.nan)
     score = fan.runs(5.0)
     assert (score.state == FanState.NORMAL).all() and score.score.max() < 0.3
 

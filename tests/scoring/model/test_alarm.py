@@ -93,8 +93,8 @@ def test_the_alarm_of_a_small_fault_follows_it_for_long_also_when_it_grows_and_c
     fans = replace(twin_of(2, tachos=(COUNTING,)).fans, noise_rad_s=np.full(2, 0.8))
     made, later = MadeFans(fans, 1.0, steady, seed=2, own=0.0), np.array([0.02, 0.3])
     decision = made.decision()
-    plays(made, decision, 300.0)
-    assert sorted(each[1:] for each in with_drop(made, decision, 0.02, 900.0)) == [(0, True), (1, True)]
+    plays(made, decision, 150.0)
+    assert sorted(each[1:] for each in with_drop(made, decision, 0.02, 600.0)) == [(0, True), (1, True)]
     assert with_drop(made, decision, later, 60.0) == []
     np.testing.assert_allclose(decision.fault[0], -later, rtol=0.3)
     assert sorted(each[1:] for each in plays(made, decision, 60.0)) == [(0, False), (1, False)]
@@ -104,7 +104,7 @@ def test_an_alarm_stays_while_anything_is_left_of_its_fault_or_it_becomes_its_op
     """A fault that becomes its opposite, a fan that loses nearly all of its speed, one of which a third of the fault
     remains, and one with a drive of its own and a tacho that counts."""
     fans = twin_of(4, tachos=(Tacho(), Tacho(), Tacho(), COUNTING)).fans
-    made = MadeFans(replace(fans, has_own_drive=np.arange(4) == 3), 0.1, steady, seed=2, own=0.0)
+    made = MadeFans(replace(fans, has_own_drive=np.arange(4) == 3), 0.2, steady, seed=2, own=0.0)
     decision, first, then = made.decision(), np.array([0.3, 0.9, 0.3, 0.2]), np.array([-0.2, 0.9, 0.1, 0.2])
     plays(made, decision, 20.0)
     raised = [each for shares in (first, then) for each in with_drop(made, decision, shares, 30.0)]

@@ -69,9 +69,9 @@ def test_what_a_rotor_does_by_its_torque_balance_is_named_and_clears_while_the_c
     of_top = (fans.viscous + fans.drag * top) * top + fans.friction
     gain, drag, brake = (np.array(each) for each in ([0.88, 1.0, 1.0], [1.0, 1.3, 1.0], [0.0, 0.0, 0.05]))
     rng, healthy, real = np.random.default_rng(3), 0.5 * top, 0.5 * top
-    for number in range(1300):
+    for number in range(1100):
         torque = of_top * (0.15 + 0.8 * ((number // 15) % 2))
-        is_faulty = 300 <= number < 900
+        is_faulty = 300 <= number < 700
         for _ in range(20):
             needed = (fans.viscous + fans.drag * healthy) * healthy + fans.friction
             healthy = healthy + (torque - needed) / fans.inertia * 0.005
@@ -80,7 +80,7 @@ def test_what_a_rotor_does_by_its_torque_balance_is_named_and_clears_while_the_c
             real = real + (driven - own) / fans.inertia * 0.005
         one = bin_of(number, 100_000_000, len(causes), healthy, command=torque)
         deciding.take(with_reading(one, real - healthy + rng.normal(0.0, fans.noise_rad_s)))
-        if number == 899:
+        if number == 699:
             assert [deciding.alarms.causes(fan)[0].cause for fan in range(len(causes))] == causes
     assert deciding.active.tolist()[:2] == [False, False], "40 s after the repair"
 

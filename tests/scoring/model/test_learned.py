@@ -18,7 +18,7 @@ from tests.support.healthy_running import made_fans, running
 
 FANS = 24
 BIN_NS = bin_ns_of(running(1, 1.0, 0).period_ns, 0.0)
-RUN_S = 300.0
+RUN_S = 180.0
 """long enough for what the air does"""
 
 
