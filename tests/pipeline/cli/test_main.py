@@ -80,6 +80,8 @@ import fantwin.pipeline.cli.watch.one_stage
 show()
 main._register(["alarms", "status"])
 show()
+import fantwin.twin.build
+show()
 """
 
 
@@ -105,13 +107,14 @@ def test_the_list_of_commands_imports_none_of_them_also_for_a_mistyped_one() -> 
 
 def test_a_command_and_a_stage_import_nothing_but_what_they_need() -> None:
     """They are to start at once, and most of that time is imports."""
-    _, (command, stage, beside) = run(REGISTERS)
+    _, (command, stage, beside, training) = run(REGISTERS)
     rooms = ("scoring", "stages", "twin", "pipeline.launch", "pipeline.runtime.stage")
     watching_and_judging = (*(f"fantwin.{room}" for room in rooms), "rich", "scipy", "onnxr")
     assert [name for name in command if name.startswith(watching_and_judging)] == []
     assert of_commands(stage) - of_commands(command) <= {"exposure", "main", "options", "watch.one_stage", "watch.up"}
     assert {"rich", "cryptography"}.isdisjoint(stage)
     assert {"cryptography", "scipy", "onnxruntime", "pandas", "matplotlib", "rerun", "torch"}.isdisjoint(beside)
+    assert {"scipy.stats", "scipy.signal", "onnxruntime", "pandas", "matplotlib", "torch"}.isdisjoint(training)
 
 
 INTERRUPTED_WHEN_IT_IMPORTS = """
