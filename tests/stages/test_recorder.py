@@ -48,7 +48,7 @@ def card(sequence: int) -> ModelCard:
     )
 
 
-@settings(deadline=None, max_examples=2)
+@settings(deadline=None, max_examples=3)
 @given(st.tuples(*(any_message(topic.message) for topic in TOPICS)))
 def test_every_topic_it_is_given_is_recorded_with_its_bytes(tmp_path_factory, messages):
     run = context(tmp_path_factory.mktemp("recorder"))
