@@ -163,7 +163,7 @@ class DateColumn:
         Those without a zone are as if they were in UTC.
 
         Raises:
-            UserError: none could be read, their order is open, or a zone is the name of several.
+            UserError: their order is open, or a zone is the name of several.
         """
         if self._unknown_zone:
             raise UserError(
@@ -173,11 +173,6 @@ class DateColumn:
         t_ns = np.asarray(self._t_ns)
         zoned = np.frombuffer(self._zoned, dtype=np.bool_)
         known = t_ns != NO_TIME
-        if not known.any():
-            raise UserError(
-                f"{self._path}: column {self._name!r} has no times in iso, but for example {self._first_cell!r}; use "
-                "numbers in s, ms, us or ns, or dates such as 2026-01-31 13:45:00.250"
-            )
         if self.is_time_of_day:
             return _unwrapped(t_ns, known, self._hours_lost), zoned, "times of day without a date"
         if not self._dates:

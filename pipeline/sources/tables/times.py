@@ -143,12 +143,14 @@ class TimeColumn:
 
     def values(self) -> Array:
         """(rows,) times in ns. Raises UserError if none could be read."""
-        if self._unit == DATE_UNIT:
-            return self._date_values()
-        t_ns = np.asarray(self._t_ns)
+        t_ns = self._date_values() if self._unit == DATE_UNIT else np.asarray(self._t_ns)
         known = t_ns != NO_TIME
         if self._far > np.count_nonzero(known):
-            self._refuse_furthest()
+            finer = _FINER_UNIT.get(self._unit)
+            hint = f"is it in ms, us or ns? use --time {self.name}:{finer}" if finer else "choose another time column"
+            raise UserError(
+                f"{self._path}: column {self.name!r} in {self._unit} gives times beyond the year 2116: {hint}"
+            )
         if not known.any():
             raise UserError(
                 f"{self._path}: column {self.name!r} has no times in {self._unit or DATE_UNIT}, but for example "
@@ -156,22 +158,21 @@ class TimeColumn:
             )
         if self._numbers.problem:
             raise self._numbers.problem
-        self.format = f"numbers in {self._unit}{' since 1970' if t_ns[np.argmax(known)] > _YEAR_2000_NS else ''}"
+        if self._unit != DATE_UNIT:
+            self.format = f"numbers in {self._unit}{' since 1970' if t_ns[np.argmax(known)] > _YEAR_2000_NS else ''}"
         return t_ns
 
     def _date_values(self) -> Array:
         t_ns, zoned, self.format = self._dates.values()
-        known = t_ns != NO_TIME
-        naive = known & ~zoned & (not self._dates.is_time_of_day)
+        naive = (t_ns != NO_TIME) & ~zoned & (not self._dates.is_time_of_day)
         if naive.any() and self._zone:
-            t_ns[naive], notes = as_utc(self._path, self.name, t_ns[naive], self._zone)
+            t_ns[naive], notes = as_utc(self.name, t_ns[naive], self._zone)
             self.notes += notes
             self.format += f", {self._zone.key}"
         elif naive.any():
             self.notes.append(f"dates of {self.name!r} have no time zone: UTC assumed; --zone Europe/Berlin names one")
-        is_far = known & (np.abs(t_ns) >= FURTHEST_T_NS)
-        if 2 * np.count_nonzero(is_far) > np.count_nonzero(known):
-            self._refuse_furthest()
+        is_far = (t_ns != NO_TIME) & (np.abs(t_ns) >= FURTHEST_T_NS)
+        self._far = int(np.count_nonzero(is_far))
         t_ns[is_far] = NO_TIME
         return t_ns
 
@@ -186,11 +187,6 @@ class TimeColumn:
         if self._is_given or self._by_file or self._unit != "s":
             return None
         return "times in s", f"--time {shlex.quote(f'{self.name}:ms')}"
-
-    def _refuse_furthest(self) -> None:
-        finer = _FINER_UNIT.get(self._unit)
-        hint = f"is it in ms, us or ns? use --time {self.name}:{finer}" if finer else "choose another time column"
-        raise UserError(f"{self._path}: column {self.name!r} in {self._unit} gives times beyond the year 2116: {hint}")
 
 
 def time_names(layout: Layout, given: str) -> tuple[list[str], str]:

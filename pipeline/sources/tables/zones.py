@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from datetime import UTC, datetime, timedelta
-from pathlib import Path
 from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 import numpy as np
@@ -26,7 +25,7 @@ def zone_of(name: str) -> ZoneInfo:
         ) from error
 
 
-def as_utc(path: Path, column: str, local_ns: Array, zone: ZoneInfo) -> tuple[Array, list[str]]:
+def as_utc(column: str, local_ns: Array, zone: ZoneInfo) -> tuple[Array, list[str]]:
     """(n,) times in ns since 1970, and notes, from local ones in the order of the file, as if they were in UTC."""
     quarters, index = np.unique(local_ns // _QUARTER_NS, return_inverse=True)
     first, second = (
