@@ -193,7 +193,7 @@ def read_files(paths: Sequence[Path], wanted: Wanted) -> Table:
     Raises:
         UserError: one cannot be read, or they do not go together.
     """
-    if len(paths) > 1 and not any(map(_log_or_series, paths)):
+    if len(paths) > 1 and not any(map(log_format, paths)) and not any(map(_log_or_series, paths)):
         files = [open_file(path, wanted) for path in paths]
         joined = JoinedFile(files)
         has_fans = [

@@ -7,7 +7,7 @@ counted (`Repairs`). How a file is read: `table_file`.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import astuple, dataclass, field
+from dataclasses import astuple, dataclass, field, fields
 from pathlib import Path
 
 import numpy as np
@@ -22,23 +22,28 @@ from fantwin.schemas.units import NS_PER_S, period_in_words
 GAP_IN_MEDIAN_PERIODS = 5.0
 
 
+def _counted(text: str) -> int:
+    """A count of irregularities, and what people are told of it."""
+    return field(default=0, metadata={"text": text})
+
+
 @dataclass(frozen=True)
 class Repairs:
     """Counts of irregularities in a table, in rows unless stated otherwise."""
 
     rows: int = 0
-    without_time: int = 0
-    """dropped: their time cannot be read"""
-    out_of_order: int = 0
-    """sorted by time"""
-    repeated: int = 0
-    """merged into the row of the same time: mean speed, last command"""
-    before_command: int = 0
-    """dropped: no command was known yet"""
-    commands_held: int = 0
-    """cells without a command: the previous command is held"""
-    speeds_missing: int = 0
-    """cells without a speed: NaN"""
+    without_time: int = _counted("rows dropped: their time cannot be read")
+    out_of_order: int = _counted("rows out of order, sorted by time")
+    repeated: int = _counted("rows with the time of another, merged: mean speed, last command")
+    before_command: int = _counted("rows before the first command dropped")
+    commands_held: int = _counted("cells without a command: the previous command is held")
+    speeds_missing: int = _counted("cells without a speed, not filled")
+
+    @property
+    def in_words(self) -> list[str]:
+        """A line each kind that was found."""
+        counts = [(getattr(self, each.name), each.metadata.get("text")) for each in fields(self)]
+        return [f"{count} {text}" for count, text in counts if count and text]
 
     def plus(self, *others: Repairs) -> Repairs:
         """The counts of several tables together."""
@@ -111,8 +116,8 @@ class Table:
         """Notes for people, one line per kind of irregularity."""
         notes = [*self.remarks, *self.repairs.in_words]
         if self.gaps:
-            longer_s = GAP_IN_MEDIAN_PERIODS * self.median_period_s
-            notes.append(f"{self.gaps} gaps longer than {period_in_words(longer_s)}, not filled")
+            longest = period_in_words(GAP_IN_MEDIAN_PERIODS * self.median_period_s)
+            notes.append(f"{self.gaps} gaps longer than {longest}, not filled")
         if 2 * self.repairs.repeated > self.repairs.rows:
             notes.append("most times repeat: the time column is too coarse; choose another, or use --period")
         return tuple(notes)
