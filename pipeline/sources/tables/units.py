@@ -84,16 +84,16 @@ def is_unit(text: str) -> bool:
 
 
 def unit_in_name(name: str) -> str:
-    """The unit in the name of a column or series: rpm anywhere, else at its end, as in `time (us)`, `duty_pct{a=b}` or
-    `speed_rad_s`; empty: none."""
+    """The unit in the name of a column or series: in brackets at its end, as in `time (us)`, else rpm anywhere, else at
+    its end, as in `duty_pct{a=b}` or `speed_rad_s`; empty: none."""
     name = _TAGS.sub("", name)
+    found = _AT_END.search(name)
+    if found and found["in"] and (unit := "K" if found["in"] == "K" else known_unit(found["in"])):
+        return unit
     if speed := _SPEED_IN_NAME.search(name):
         return f"{speed['angle']}/s" if speed["angle"] else ELECTRICAL if speed["e"] else "rpm"
-    if found := _AT_END.search(name):
-        text = found["in"] if found["in"] is not None else found["last"]
-        is_letter = found["in"] is None and text.lower() in _LETTERS_IN_NAMES
-        return "K" if found["in"] == "K" else "" if is_letter else known_unit(text)
-    return ""
+    last = (found["last"] or "") if found else ""
+    return "" if last.lower() in _LETTERS_IN_NAMES else known_unit(last)
 
 
 def in_unit_of(channel: str, name: str, values: Array, unit: str) -> tuple[Array, str]:

@@ -13,6 +13,7 @@ import pytest
 
 from fantwin.pipeline.cli.simulation.scenario import FileScenario, Scenario
 from fantwin.pipeline.recordings.training_runs import read_runs
+from fantwin.pipeline.sources.tables.units import unit_in_name
 from tests.support.fan_rows import COLUMNS, COMMAND, EPOCH_S, RPM, SECONDS, SPEED, START, N, Table, require_imported
 from tests.support.fantwin_command import error_of, fantwin
 from tests.support.written_recordings import raw_columns
@@ -156,6 +157,25 @@ DAMAGED_CELLS = {
 @pytest.mark.parametrize("name", TABLES)
 def test_a_table_becomes_a_recording_of_its_numbers_and_times(name: str, tmp_path: Path) -> None:
     require_imported(TABLES[name], tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("name", "unit"),
+    [
+        ("Fan1 [RPM]", "rpm"),
+        ("fan_rpm_0", "rpm"),
+        ("CPUFanRPM", "rpm"),
+        ("eRPM[0]", "erpm"),
+        ("rpm sensor (Hz)", "hz"),
+        ("speed_rad_s", "rad/s"),
+        ("node_hwmon_temp_celsius{sensor=temp1}", "celsius"),
+        ("air [K]", "K"),
+        ("interpmode", ""),
+        ("krpm", ""),
+    ],
+)
+def test_a_name_says_its_unit_or_none(name: str, unit: str) -> None:
+    assert unit_in_name(name) == unit
 
 
 @pytest.mark.parametrize("other", [*DAMAGED_ROWS, *DAMAGED_CELLS])
