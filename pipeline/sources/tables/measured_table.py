@@ -41,26 +41,13 @@ class Repairs:
 
     @property
     def in_words(self) -> list[str]:
-        """A line each kind that was found."""
+        """A line for each kind that was found."""
         counts = [(getattr(self, each.name), each.metadata.get("text")) for each in fields(self)]
         return [f"{count} {text}" for count, text in counts if count and text]
 
     def plus(self, *others: Repairs) -> Repairs:
         """The counts of several tables together."""
         return Repairs(*(sum(counts) for counts in zip(*map(astuple, (self, *others)), strict=True)))
-
-    @property
-    def in_words(self) -> list[str]:
-        """A line for each kind that was seen."""
-        counts = (
-            (self.without_time, "rows dropped: their time cannot be read"),
-            (self.out_of_order, "rows out of order, sorted by time"),
-            (self.repeated, "rows with the time of another, merged: mean speed, last command"),
-            (self.before_command, "rows before the first command dropped"),
-            (self.commands_held, "cells without a command: the previous command is held"),
-            (self.speeds_missing, "cells without a speed, not filled"),
-        )
-        return [f"{count} {text}" for count, text in counts if count]
 
 
 @dataclass(frozen=True, eq=False)
