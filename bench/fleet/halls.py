@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import os
-import subprocess
-import sys
 import time
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
@@ -13,8 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from bench.fleet.redfish_controllers import Hall, Plan
-from bench.printing import progress
 from bench.runtime.stage_memory import free_endpoint
 from fantwin.pipeline.acquisition.raw_samples import RawSamples
 from fantwin.schemas.units import NS_PER_S
@@ -49,30 +45,6 @@ def samples_by_kind(
             "apart, s (99 %)": float(np.quantile(apart_s, 0.99)) if len(apart_s) else float("nan"),
             "at most": float(apart_s.max()) if len(apart_s) else float("nan"),
         }
-
-
-def run_fantwin(words: str) -> str:
-    """Run a command that has to succeed; what it prints."""
-    done = subprocess.run(
-        [sys.executable, "-m", "fantwin", *words.split()], capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, done.stderr
-    return done.stdout
-
-
-def twin_of_hall(plan: Plan, folder: Path, period_s: float, seconds: float, how: str) -> Path:
-    """A calibrated twin of the fans, from tables of what three of them did, sampled like the hall. how: options."""
-    progress("learning the twin")
-    hall, twin = Hall(plan), folder / "twin.onnx"
-    for fan in range(3):
-        at_s = np.arange(0.0, seconds, period_s)
-        rows = [f"{t:g},{u:g},{y:g}" for t, (u, y) in ((t, hall.fan(fan + 1, 0, float(t))) for t in at_s)]
-        (folder / f"{fan}.csv").write_text("\n".join(["t,u,y", *rows, ""]), encoding="ascii")
-        table = f"import {folder}/{fan}.csv --time t:s --command u --speed y:rpm -o {folder}/{fan}.mcap"
-        run_fantwin(table)
-    run_fantwin(f"train {folder}/0.mcap --validate {folder}/1.mcap {how} -o {twin}")
-    run_fantwin(f"calibrate {twin} {folder}/1.mcap {folder}/2.mcap --false-alarms-per-day 1 --extrapolate")
-    return twin
 
 
 def free_port() -> int:

@@ -1,6 +1,7 @@
 """Hundreds of exporters in one process, as one target a node, for benches.
 
-Five exporters in turn, with the names that they really use. From a time on some nodes are dead, silent, broken or lie:
+Five exporters in turn, with the names that they really use. Fans follow their command with a lag of two seconds. From a
+time on some nodes are dead, silent, broken or lie, and some fans are slower:
 
     python -m bench.fleet.metrics_of_nodes '{"port": 9100, "controllers": 400}'
 """
@@ -9,18 +10,35 @@ from __future__ import annotations
 
 import json
 import math
+import random
 import sys
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from bench.fleet.redfish_controllers import FANS, Hall, Plan
-
 BAD = ("dead", "silent", "broken", "lying")
+FANS = 2
 SILENT_S = 60.0
+RPM_PER_PERCENT, LAG_S, NOISE_RPM = 150.0, 2.0, 15.0
+SPEED_LOSS = 0.15
+
+
+@dataclass
+class Plan:
+    """What is served. Lists: numbers of nodes."""
+
+    port: int
+    controllers: int
+    broken: list[int] = field(default_factory=list[int])
+    silent: list[int] = field(default_factory=list[int])
+    lying: list[int] = field(default_factory=list[int])
+    dead: list[int] = field(default_factory=list[int])
+    faulty: list[int] = field(default_factory=list[int])
+    """those whose first fan becomes slower"""
 
 
 class Exporter(NamedTuple):
@@ -63,12 +81,24 @@ EXPORTERS = {
 }
 
 
-def page(hall: Hall, number: int, *, is_bad: Callable[[str], bool]) -> str:
+def fan_at(number: int, fan: int, now_s: float) -> tuple[float, float]:
+    """Command in per cent and speed in rpm of a fan of a node at a time."""
+    pace = 2.0 * math.pi / (120.0 + number % 7)
+    phase = number / 3.0 + fan
+    lagging = math.atan(pace * LAG_S)
+    moved = 55.0 + 30.0 * math.cos(lagging) * math.sin(pace * now_s + phase - lagging)
+    rpm = RPM_PER_PERCENT * moved + random.gauss(0.0, NOISE_RPM)
+    return round(55.0 + 30.0 * math.sin(pace * now_s + phase)), round(rpm)
+
+
+def page(number: int, *, is_bad: Callable[[str], bool]) -> str:
     """What the exporter of a node shows."""
     exporter = list(EXPORTERS.values())[number % len(EXPORTERS)]
     lines: list[str] = []
     for fan in range(FANS):
-        command, rpm = hall.fan(number, fan, time.time())
+        command, rpm = fan_at(number, fan, time.time())
+        if is_bad("faulty") and fan == 0:
+            rpm = round(rpm * (1.0 - SPEED_LOSS))
         if is_bad("broken") and fan == FANS - 1:
             rpm = float("nan")
         lines += [f"{exporter.speed.format(fan + 1)} {1e9 if is_bad('lying') else rpm}"]
@@ -78,21 +108,19 @@ def page(hall: Hall, number: int, *, is_bad: Callable[[str], bool]) -> str:
 
 def serve(plan: Plan, bad_from: Path) -> None:
     """Serve all nodes, `/metrics?node=7`. bad_from: the bad and faulty ones are so once this file exists."""
-    hall = Hall(plan)
 
     class Handler(BaseHTTPRequestHandler):
         protocol_version = "HTTP/1.1"
 
         def do_GET(self) -> None:
             number = int(self.path.rpartition("=")[2])
-            plan.fault_at = 0.0 if bad_from.exists() else math.inf
 
             def is_bad(kind: str) -> bool:
                 return number in getattr(plan, kind) and bad_from.exists()
 
             if is_bad("silent"):
                 time.sleep(SILENT_S)
-            body = page(hall, number, is_bad=is_bad).encode()
+            body = page(number, is_bad=is_bad).encode()
             self.send_response(500 if is_bad("dead") else 200)
             self.send_header("Content-Type", "text/plain; version=0.0.4")
             self.send_header("Content-Length", str(len(body)))

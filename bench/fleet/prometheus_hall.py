@@ -28,9 +28,8 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from bench.fleet.halls import cpu_s, free_port, received, run_fantwin, samples_by_kind, twin_of_hall
-from bench.fleet.metrics_of_nodes import BAD, EXPORTERS
-from bench.fleet.redfish_controllers import FANS, Plan
+from bench.fleet.halls import cpu_s, free_port, received, samples_by_kind
+from bench.fleet.metrics_of_nodes import BAD, EXPORTERS, FANS, Plan, fan_at
 from bench.printing import JsonOption, progress, show
 from bench.runtime.stage_memory import free_endpoint, memory_mb
 from fantwin.pipeline.acquisition.raw_samples import RawSamples
@@ -69,7 +68,7 @@ def main(
         getattr(plan, kind).append((7 + 11 * number) % controllers)
     plan.faulty = [(3 + 17 * number) % controllers for number in range(faulty)]
     with tempfile.TemporaryDirectory() as folder:
-        twin = twin_of_hall(plan, Path(folder), period_s, LEARNED_PERIODS * period_s, "") if scored else None
+        twin = _twin(Path(folder), period_s) if scored else None
         about, rows = _measured(plan, Path(folder), period_s, seconds, twin, known_for)
     show({"acquisition": [about], "samples by kind of node": rows}, [], as_json=json_output)
 
@@ -152,6 +151,30 @@ def _measured(
     return about, list(samples_by_kind(groups, times_ns, seconds / period_s, first=ORDINARY))
 
 
+def _run_fantwin(words: str) -> str:
+    """Run a command that has to succeed; what it prints."""
+    done = subprocess.run(
+        [sys.executable, "-m", "fantwin", *words.split()], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def _twin(folder: Path, period_s: float) -> Path:
+    """A calibrated twin of the fans, from tables of what three of them did, sampled like the hall."""
+    progress("learning the twin")
+    twin = folder / "twin.onnx"
+    for fan in range(3):
+        at_s = np.arange(0.0, LEARNED_PERIODS * period_s, period_s)
+        rows = [f"{t:g},{u:g},{y:g}" for t, (u, y) in ((t, fan_at(fan + 1, 0, float(t))) for t in at_s)]
+        (folder / f"{fan}.csv").write_text("\n".join(["t,u,y", *rows, ""]), encoding="ascii")
+        table = f"import {folder}/{fan}.csv --time t:s --command u --speed y:rpm -o {folder}/{fan}.mcap"
+        _run_fantwin(table)
+    _run_fantwin(f"train {folder}/0.mcap --validate {folder}/1.mcap -o {twin}")
+    _run_fantwin(f"calibrate {twin} {folder}/1.mcap {folder}/2.mcap --false-alarms-per-day 1 --extrapolate")
+    return twin
+
+
 def _configuration(plan: Plan, folder: Path, url: str, twin: Path | None) -> tuple[Path, dict[str, int], float]:
     """What `init` writes once all fans are there, with the commands that it cannot know."""
     path = folder / "site.toml"
@@ -164,7 +187,7 @@ def _configuration(plan: Plan, folder: Path, url: str, twin: Path | None) -> tup
         path.unlink(missing_ok=True)
         began_s = time.monotonic()
         try:
-            run_fantwin(f"init --prometheus {url} -c {path}")
+            _run_fantwin(f"init --prometheus {url} -c {path}")
         except AssertionError:  # nothing was scraped yet
             return False
         took_s = time.monotonic() - began_s

@@ -1,7 +1,7 @@
 """Hundreds of baseboard controllers in one process, each at a loopback address of its own (Linux), for benches.
 
-Five shapes of payload of real makers, in turn. Fans follow their command with a lag of two seconds; some controllers
-are broken, slow, silent or lie:
+Five shapes of payload of real makers, in turn, of simulated fans (`hall_fans.py`); some controllers are broken, slow,
+silent or lie:
 
     python -m bench.fleet.redfish_controllers '{"port": 8443, "controllers": 400}'
 """
@@ -10,8 +10,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import math
-import random
 import ssl
 import sys
 import time
@@ -19,13 +17,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-FANS = 2
+from bench.fleet.hall_fans import HallFans
+
 CHASSIS = "/redfish/v1/Chassis/1"
-ONE_DUTY = 4
-"""shape whose fans have one duty"""
-RPM_PER_PERCENT, LAG_S, NOISE_RPM = 150.0, 2.0, 15.0
+RATED_RPM, LIE_RPM = 15_000.0, 1e9
 SLOW_S = 2.5
-SPEED_LOSS = 0.15
+SIMULATED_S = 300.0
 SHAPES = {
     "Thermal, ReadingRPM, a vendor's duty": "/Oem/Vendor/Duty",
     "ThermalSubsystem, SetPoint": "",
@@ -48,9 +45,6 @@ class Plan:
     silent: list[int] = field(default_factory=list[int])
     lying: list[int] = field(default_factory=list[int])
     dead: list[int] = field(default_factory=list[int])
-    faulty: list[int] = field(default_factory=list[int])
-    fault_at: float = math.inf
-    """time since 1970 from which the first fan of each faulty controller is slower"""
 
     def address(self, number: int) -> str:
         """Where a controller is."""
@@ -62,35 +56,32 @@ def link(path: str) -> dict[str, str]:
     return {"@odata.id": path}
 
 
+def answer(number: int, path: str, fans: list[tuple[float, float]], *, is_broken: bool = False) -> tuple[int, Any]:
+    """Status and object that a controller gives for a path. fans: command in per cent and speed in rpm of each."""
+    if is_broken and path.endswith(("/Fans/2", "fantach_FAN2", "/Oem/Fans")):
+        return 500, {}
+    documents: dict[str, Any] = {"/redfish/v1": {"Id": "Root", "Chassis": link("/redfish/v1/Chassis")}}
+    others = [link("/redfish/v1/Chassis/Gone")] if is_broken else []
+    documents["/redfish/v1/Chassis"] = {"Members": [*others, link(CHASSIS)]}
+    documents |= (_oem, _set_point, _pwms, _sensors, _metrics)[number % len(SHAPES)](fans)
+    found = documents.get(path.rstrip("/"))
+    return (404, {}) if found is None else (200, found)
+
+
 class Hall:
-    """All controllers of a plan."""
+    """All controllers of a plan, from when it was made."""
 
     def __init__(self, plan: Plan) -> None:
         self.plan = plan
-
-    def fan(self, number: int, fan: int, now_s: float) -> tuple[float, float]:
-        """Command in per cent and speed in rpm at a time."""
-        pace = 2.0 * math.pi / (120.0 + number % 7)
-        phase = number / 3.0 + (fan if number % len(SHAPES) != ONE_DUTY else 0)
-        percent = round(55.0 + 30.0 * math.sin(pace * now_s + phase))
-        lagging = math.atan(pace * LAG_S)
-        moved = 55.0 + 30.0 * math.cos(lagging) * math.sin(pace * now_s + phase - lagging)
-        rpm = RPM_PER_PERCENT * moved + random.gauss(0.0, NOISE_RPM)
-        if fan == 0 and number in self.plan.faulty and now_s >= self.plan.fault_at:
-            rpm *= 1.0 - SPEED_LOSS
-        return percent, 1e9 if number in self.plan.lying else round(rpm)
+        self._fans = HallFans(plan.controllers, SIMULATED_S, seed=1)
+        self._began_s = time.monotonic()
 
     def answer(self, number: int, path: str) -> tuple[int, Any]:
-        """Status and object."""
-        fans = [self.fan(number, fan, time.time()) for fan in range(FANS)]
-        if number in self.plan.broken and path.endswith(("/Fans/2", "fantach_FAN2", "/Oem/Fans")):
-            return 500, {}
-        documents = {"/redfish/v1": {"Id": "Root", "Chassis": link("/redfish/v1/Chassis")}}
-        others = [link("/redfish/v1/Chassis/Gone")] if number in self.plan.broken else []
-        documents["/redfish/v1/Chassis"] = {"Members": [*others, link(CHASSIS)]}
-        documents |= (_oem, _set_point, _pwms, _sensors, _metrics)[number % len(SHAPES)](fans)
-        found = documents.get(path.rstrip("/"))
-        return (404, {}) if found is None else (200, found)
+        """Status and object now."""
+        fans = self._fans.at(number, time.monotonic() - self._began_s)
+        if number in self.plan.lying:
+            fans = [(percent, LIE_RPM) for percent, _ in fans]
+        return answer(number, path, fans, is_broken=number in self.plan.broken)
 
 
 def _oem(fans: list[tuple[float, float]]) -> dict[str, Any]:
@@ -106,7 +97,7 @@ def _set_point(fans: list[tuple[float, float]]) -> dict[str, Any]:
     each = {
         f"{there}/Fans/{n}": {
             "Id": f"{n}",
-            "SpeedPercent": {"Reading": round(rpm / RPM_PER_PERCENT), "SpeedRPM": rpm},
+            "SpeedPercent": {"Reading": round(100.0 * rpm / RATED_RPM), "SpeedRPM": rpm},
             "SpeedControlPercent": {"SetPoint": percent},
         }
         for n, (percent, rpm) in enumerate(fans, 1)

@@ -23,7 +23,7 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from bench.fleet.halls import cpu_s, free_port, received, samples_by_kind, twin_of_hall
+from bench.fleet.halls import cpu_s, free_port, received, samples_by_kind
 from bench.fleet.redfish_controllers import SHAPES, Plan
 from bench.printing import JsonOption, progress, show
 from bench.runtime.stage_memory import free_endpoint, memory_mb
@@ -32,19 +32,12 @@ from fantwin.pipeline.bus.session import join_bus
 from fantwin.pipeline.config.loading import load_config
 from fantwin.pipeline.config.settings import Config
 from fantwin.pipeline.site.site_watcher import SiteWatcher
-from fantwin.schemas.codec import decode
-from fantwin.schemas.enums import Transition
-from fantwin.schemas.messages import Alarm
-from fantwin.schemas.topics import tray_key
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from tests.support.running_chain import RunningCommand, eventually
 
 STARTS_S = 300.0
-FAULT_AFTER_S = 200.0
-"""since the controllers were started: the fans are known by then"""
-LEARNED_S = 1200.0
 ORDINARY = "ordinary"
 
 
@@ -54,24 +47,17 @@ def main(
     period_s: Annotated[float, typer.Option(help="Between two readings.")] = 1.0,
     seconds: Annotated[float, typer.Option(help="That are measured.")] = 60.0,
     tls: Annotated[bool, typer.Option("--tls", help="By HTTPS.")] = False,
-    faulty: Annotated[
-        int, typer.Option(help="Controllers with a fan that becomes 15 % slower; fans are then scored, too.")
-    ] = 0,
     json_output: JsonOption = False,
 ) -> None:
     """Print what acquisition takes, and by kind of controller which of the due samples came, and when."""
     plan = Plan(free_port(), controllers)
     for number, kind in enumerate(_BAD * bad):
         getattr(plan, kind).append((7 + 11 * number) % controllers)
-    plan.faulty = [(3 + 17 * number) % controllers for number in range(faulty)]
-    plan.fault_at = time.time() + FAULT_AFTER_S
     with tempfile.TemporaryDirectory() as folder:
-        twin = twin_of_hall(plan, Path(folder), period_s, LEARNED_S, "--model physical") if faulty else None
-        plan.fault_at = time.time() + FAULT_AFTER_S
         if tls:
             plan.certificate = _certificate(plan, Path(folder))
         with _served(plan) as server:
-            about, rows = _measured(plan, Path(folder), period_s, seconds, server, twin)
+            about, rows = _measured(plan, Path(folder), period_s, seconds, server)
     show({"acquisition": [about], "samples by kind of controller": rows}, [], as_json=json_output)
 
 
@@ -79,16 +65,14 @@ _BAD = ("broken", "slow", "silent", "lying", "dead")
 
 
 def _measured(
-    plan: Plan, folder: Path, period_s: float, seconds: float, server: int, twin: Path | None
+    plan: Plan, folder: Path, period_s: float, seconds: float, server: int
 ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     path = folder / "site.toml"
-    path.write_text(_configuration(plan, period_s, twin), encoding="utf-8")
+    path.write_text(_configuration(plan, period_s), encoding="utf-8")
     config = load_config(path, stages=())
     names = [tray.name for tray in config.trays]
     with join_bus(config) as bus:
         watcher, arriving = SiteWatcher(bus, config.site), RawSamples(bus, config.site, names)
-        raised: list[tuple[str, int]] = []
-        bus.subscribe(tray_key(config.site, "*", "alarm"), lambda _key, payload: _add_alarm(raised, payload))
         progress("starting acquisition")
         began_s = time.monotonic()
         up = RunningCommand(["up", "-c", path, "--json"])
@@ -105,10 +89,10 @@ def _measured(
             process = next(
                 view.health.process_id for view in watcher.stages() if view.alive and view.health.stage == "acquisition"
             )
-            before_s = [cpu_s(process), cpu_s(server)]
+            began_cpu_s = [cpu_s(process), cpu_s(server)]
             progress(f"{len(seen)} controllers after {started_s:.0f} s; measuring for {seconds:g} s")
             times_ns, delays_s = received(arriving, seconds)
-            used_s = [cpu_s(process) - before_s[0], cpu_s(server) - before_s[1]]
+            used_s = [cpu_s(process) - began_cpu_s[0], cpu_s(server) - began_cpu_s[1]]
             about = {
                 "controllers": plan.controllers,
                 "period, s": period_s,
@@ -122,27 +106,10 @@ def _measured(
                 "99 %, ms": 1e3 * float(np.quantile(delays_s, 0.99)),
                 "controllers' core, %": 100.0 * used_s[1] / seconds,
             }
-            if twin:
-                about |= _alarms(plan, raised)
             up.end()
         finally:
             up.kill()
     return about, list(_rows(plan, config, times_ns, seconds / period_s))
-
-
-def _add_alarm(raised: list[tuple[str, int]], payload: bytes) -> None:
-    alarm = decode(Alarm, payload)
-    if alarm.transition == Transition.RAISED:
-        raised.append((alarm.header.tray, alarm.fan))
-
-
-def _alarms(plan: Plan, raised: Sequence[tuple[str, int]]) -> dict[str, Any]:
-    faulty = {(plan.address(number).replace(".", "-"), 0) for number in plan.faulty}
-    return {
-        "faults": len(faulty),
-        "found": len(faulty & set(raised)),
-        "other alarms": len([each for each in raised if each not in faulty]),
-    }
 
 
 def _rows(plan: Plan, config: Config, times_ns: Mapping[str, list[int]], due: float) -> Iterator[dict[str, Any]]:
@@ -155,7 +122,7 @@ def _rows(plan: Plan, config: Config, times_ns: Mapping[str, list[int]], due: fl
     yield from samples_by_kind(groups, times_ns, due, first=ORDINARY)
 
 
-def _configuration(plan: Plan, period_s: float, twin: Path | None) -> str:
+def _configuration(plan: Plan, period_s: float) -> str:
     scheme = "https" if plan.certificate else "http"
     trays = ""
     for shape, command in enumerate(SHAPES.values()):
@@ -163,15 +130,12 @@ def _configuration(plan: Plan, period_s: float, twin: Path | None) -> str:
         source = {"kind": "redfish", "url": f"{scheme}://{{host}}:{plan.port}", "command": command}
         keys = "".join(f"{key} = {json.dumps(value)}\n" for key, value in source.items() if value)
         verify = f"verify = {json.dumps(plan.certificate)}\n" if plan.certificate else ""
-        of_twin = f"twin = {json.dumps(str(twin))}\n" if twin else ""
         trays += (
             f'[[tray]]\nhosts = {json.dumps(hosts)}\nfans = 2\nspeed_unit = "rpm"\nspeed_max = 50000\n'
-            f"command_max = 100\n{of_twin}[tray.source]\n{keys}{verify}period_s = {period_s:g}\n"
+            f"command_max = 100\n[tray.source]\n{keys}{verify}period_s = {period_s:g}\n"
         )
-    stages = ["acquisition", *(("resampler", "twin_integrator", "scorer") if twin else ())]
     bus = f'bus = {{ endpoint = "{free_endpoint()}" }}'
-    launcher = f"launcher = {{ stages = {json.dumps(stages)} }}"
-    return f'run_folder = "runs"\n{bus}\n{launcher}\n{trays}'
+    return f'run_folder = "runs"\n{bus}\nlauncher = {{ stages = ["acquisition"] }}\n{trays}'
 
 
 @contextmanager
