@@ -40,6 +40,8 @@ _OF_ALL = re.compile(
     r"^\* `--(help|json)`.*\n|^\*\*(Usage|Options|Arguments)\*\*:\n\n(```console\n.*\n```\n\n)?", re.MULTILINE
 )
 """what each command has alike"""
+_CHOICE = re.compile(r"(<([\w|-]+)>`): ([\w, -]+)\.(?:  (\[.*\]))?$", re.MULTILINE)
+"""an argument, its choices, and its help"""
 _OPTION = re.compile(r"^\* `(-[\w-]+(?:, --[\w-]+)?).*\n?", re.MULTILINE)
 
 
@@ -66,7 +68,14 @@ def _about(click: Any, name: str) -> str:
         obj=click.commands[name], ctx=typer.Context(click), indent=2, name=name, call_prefix="fantwin"
     )
     examples = _EXAMPLE.sub(lambda found: f"    {' '.join(found[1].split())}\n", about)
-    return f"{_OF_ALL.sub('', examples).strip()}\n"
+    return f"{_CHOICE.sub(_choice, _OF_ALL.sub('', examples)).strip()}\n"
+
+
+def _choice(found: re.Match[str]) -> str:
+    """An argument, without a help that only says the choices again."""
+    if found[2].split("|") != found[3].split(", "):
+        return found[0]
+    return f"{found[1]}: {found[4]}" if found[4] else found[1]
 
 
 def _without(shared: set[str], about: str) -> str:
