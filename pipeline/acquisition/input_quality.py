@@ -143,6 +143,8 @@ class InputQuality:
         self._mostly_faulty = False
         self._steps_ns = deque([round(period_s * NS_PER_S)], maxlen=3)
         """newest steps between inputs"""
+        self._has_input = False
+        """since the source is waited for"""
 
     def connection_changed(self) -> None:
         """The source was connected or disconnected: what came before says nothing about what follows."""
@@ -153,6 +155,7 @@ class InputQuality:
 
     def start_waiting(self, t_ns: int) -> None:
         """Silence counts from this time on."""
+        self._has_input = False
         self._input_t_ns = self._valid_t_ns = t_ns
 
     def wait_no_longer_than_since(self, t_ns: int) -> None:
@@ -161,7 +164,9 @@ class InputQuality:
 
     def add_input(self, t_ns: int) -> None:
         """Note that input has arrived."""
-        self._steps_ns.append(min(t_ns - self._input_t_ns, LONGEST_STEP_NS))
+        if self._has_input:
+            self._steps_ns.append(min(t_ns - self._input_t_ns, LONGEST_STEP_NS))
+        self._has_input = True
         self._input_t_ns = t_ns
 
     def add_valid(self) -> None:

@@ -213,7 +213,8 @@ def _ranges(
         yield False, f"no speed of {tray.names.labels(unknown)}: {tray.source.no_speed}"
     known_commands = command[np.isfinite(command)]  # a fan's may be unknown, but not all
     if without := np.flatnonzero(~np.isfinite(command).any(axis=0)).tolist():
-        yield None, f"{tray.names.labels(without)}: no command is known, so not judged: say in source where it is"
+        where = "say in source where it is, or write command_from"
+        yield None, f"{tray.names.labels(without)}: no command is known, so not judged: {where}"
     low, high = float(known_commands.min()), float(known_commands.max())
     if twin and not (twin.card.command_range[0] <= high and low <= twin.card.command_range[1]):
         known = "{:g} to {:g}".format(*twin.card.command_range)

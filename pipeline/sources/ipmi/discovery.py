@@ -42,5 +42,6 @@ def _discover(url: str, password_file: Path | None, folder: Path) -> Found:
     keys = keys_in_rpm(config.host, [each.name for each in fans], 100.0, {"kind": "ipmi", **asked, "fan": rows})
     notes = [f"fan {number} is {each.name}: {each.value:g} rpm" for number, each in enumerate(fans)]
     others = ", ".join(each.name for each in sensors if each.unit == "percent")
-    lacking = f"no command is known: name a sensor in per cent by command of source.fan ({others or 'it has none'})"
+    sensor = f"name a sensor in per cent by command of source.fan ({others or 'it has none'})"
+    lacking = f"no command is known: {sensor}, or write command_from"
     return Found("ipmi", f"ipmi {config.host}", keys, tuple(notes), (lacking,))

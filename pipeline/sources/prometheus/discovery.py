@@ -125,7 +125,8 @@ def _trays(
         notes = [
             f"fan {number} is {fan}: {each[-1][1]:.0f} rpm" for number, (fan, (_, each)) in enumerate(fans.items())
         ]
-        lacking = f"no command is known of {', '.join(missing)}: name its series by command of source.fan"
+        where = "name its series by command of source.fan, or write command_from"
+        lacking = f"no command is known of {', '.join(missing)}: {where}"
         yield Found(
             "prometheus", f"{wanted[NAME]} of {keys['name']}", keys, tuple(notes), (lacking,) if missing else ()
         )

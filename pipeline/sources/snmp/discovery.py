@@ -58,5 +58,5 @@ def _discover(text: str, password_file: Path | None, folder: Path) -> Found:
         f"fan {number} is {names.get(index, index)}: {values.get(index, 'nothing')} shown"
         for number, index in enumerate(fans)
     ]
-    lacking = "no command is known: name an object of the maker's MIB by command of source.fan"
+    lacking = "no command is known: name an object of the maker's MIB by command of source.fan, or write command_from"
     return Found("snmp", f"snmp {host}", keys, tuple(notes), (lacking,))

@@ -193,7 +193,7 @@ def test_a_fan_without_a_command_is_named_and_shown_by_its_speed_alone() -> None
     for raw in line:
         raw.command[:, 1] = np.nan
     said = _findings(line, config_of().trays[0], config_of(), None, {})
-    assert (None, "fan 1: no command is known, so not judged: say in source where it is") in said
+    assert (None, "fan 1: no command is known, so not judged: say in source where it is, or write command_from") in said
     (shown,) = [text for _, text in said if text.startswith("fan 1: speeds")]
     assert "nan" not in shown
 
