@@ -80,6 +80,7 @@ class StaticFit:
             iterations=0,
             warnings=(),
             misfits=(),
+            closed_loop=np.zeros(fans, np.bool_),
         )
 
     @property
