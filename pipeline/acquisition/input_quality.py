@@ -151,7 +151,7 @@ class InputQuality:
         self._recent.clear()
         self._faulty = 0
         self._examples.clear()
-        self._mostly_faulty = False
+        self._mostly_faulty = self._has_input = False
 
     def start_waiting(self, t_ns: int) -> None:
         """Silence counts from this time on."""
@@ -184,7 +184,7 @@ class InputQuality:
 
         settings: of the tray, to be checked where the fault does not say which one it is.
         """
-        silence_s = max(SILENCE_S, SILENT_STEPS * max(self._steps_ns) / NS_PER_S)
+        silence_s = max(SILENCE_S, SILENT_STEPS * sorted(self._steps_ns)[len(self._steps_ns) // 2] / NS_PER_S)
         if now_ns - self._input_t_ns > silence_s * NS_PER_S:
             return f"nothing received for {silence_s:.3g} s; is the source running, connected and sending?"
         has_valid = now_ns - self._valid_t_ns <= silence_s * NS_PER_S

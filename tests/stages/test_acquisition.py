@@ -229,6 +229,17 @@ def test_a_line_that_is_down_or_silent_for_two_seconds_is_a_problem_until_it_sen
     assert core.problem() == ""
 
 
+def test_the_silence_of_a_slow_line_is_judged_by_its_own_steps() -> None:
+    core = make_core()
+    core.step(LinkUp())
+    for number in range(4):
+        feed(core, [sample(number)], t_ns=15 * number * S)
+    core.tick(80 * S)
+    assert core.problem() == ""
+    core.tick(90 * S)
+    assert core.problem().startswith("/dev/ttyTEST: nothing received for 37.5 s; is the source running")
+
+
 class SetClock:
     """A host whose wall clock is set."""
 
