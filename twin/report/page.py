@@ -30,6 +30,8 @@ PARAMETER_MEANING = {
     "lowest_command": ("lowest", "lowest command that has an effect, below it the fan keeps its speed"),
     "friction": ("friction", "of the command, does not turn the rotor"),
     "kick_command": ("kick", "command with which the drive starts the rotor"),
+    "time_constant_s": ("T", "time constant, s, at least the shortest that the samples show"),
+    "unknown_time": ("any time", "1 where commands change at any time between two samples, 0 where with them"),
 }
 AT_REST_SHARE = 0.01
 """of the top speed: a lower one is at rest"""
@@ -58,7 +60,11 @@ def report_page(content: Content, assessment: Assessment | None = None, alarms: 
         each=content.unit.rad_s,
         assessment=assessment or assess(content),
         kind=kind_title(content.card.kind),
-        parameter_meaning=PARAMETER_MEANING,
+        parameter_meaning=PARAMETER_MEANING
+        | {
+            name: (f"at {command:.4g}", f"speed at the command {command:.4g}, rad/s")
+            for name, command in zip(content.card.parameter_names[2:], content.card.steady_commands, strict=False)
+        },
         physics_used=content.card.used_parameters,
         level_of=level_of,
         refined=any(it.in_force != it.value for fan in content.fans for it in fan.parameters),

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fantwin.twin.models import physics
-from fantwin.twin.models.model import TwinModel
+from fantwin.twin.models.model import MayBeStatic, TwinModel
 from fantwin.twin.runs import Array, Run
 
 SETTLED = 0.01
@@ -62,6 +62,8 @@ def static_curve(
     tolerance = SAME_COMMAND * (high - low)
     holds = [hold for piece in pieces for hold in _holds(piece, fan, parameters, tolerance, top_speed_rad_s)]
     levels = np.linspace(low, high, LEVELS)
+    if isinstance(model, MayBeStatic) and (curve := model.steady_curve(parameters[np.newaxis])) is not None:
+        return StaticCurve(tuple(holds), np.column_stack((levels, curve.speed_rad_s(levels[:, np.newaxis])[:, 0])))
     settle_s = STEADY_TIME_CONSTANTS * settling_time_constant_s(0.25 * top_speed_rad_s, parameters)
     steps = int(min(max(settle_s * rate_hz, 1.0), MOST_STEPS))
     command = np.tile(levels, (steps, 1))

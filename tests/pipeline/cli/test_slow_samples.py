@@ -55,6 +55,15 @@ def test_train_and_evaluate_say_what_a_static_twin_is_and_what_it_finds(folder: 
     assert result["assessment"] == "as declared", result["headline"]
 
 
+def test_its_report_has_its_curve_and_parameters(folder: Path) -> None:
+    page = folder / "report.html"
+    result = fantwin("report", folder / "twin.onnx", folder / "other.mcap", "-o", page)
+    assert result.exit_code == 0, result.output
+    text = page.read_text()
+    assert "The speed over the command; samples every 15 s hardly show the motion." in text
+    assert "time constant, s, at least the shortest that the samples show" in text
+
+
 def test_ten_per_cent_more_drag_is_found_within_minutes_and_healthy_fans_have_no_alarm(folder: Path) -> None:
     assert alarms_of(folder, "other") == []
     first = alarms_of(folder, "faulty")[0]
