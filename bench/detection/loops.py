@@ -1,5 +1,6 @@
-"""Twins and alarms of fans under the controllers of real ones: what each loop costs.
+"""Parameters, twins and alarms of fans under the controllers of real ones: what each loop costs.
 
+First, fans of known parameters are identified from ten minutes under each loop. Then twins are made and judged.
 Every loop has a tray of DC fans, the same fans under each. Its twin is trained on ten minutes under that loop,
 validated on ten more and calibrated on these and ten others, as `fantwin commission` without a sweep does it. Then come
 healthy hours, and runs in which one fan in four has a fault from FAULT_AFTER_S on.
@@ -28,24 +29,19 @@ from fantwin.schemas.messages import Alarm, Array, Grid, Prediction, Score
 from fantwin.simulation.plant import tray_of_fans
 from fantwin.twin.build import train_twin
 from fantwin.twin.errors import TwinError
-from tests.support.controlled_fans import LOOPS, Fault, runs_of, samples, tiled
+from fantwin.twin.fitting.identification import identify
+from tests.support.controlled_fans import LOOPS, Fault, plain_fans, runs_of, samples, tiled, true_parameters
 
 RATE_HZ, FANS, FANS_SEED, START_NS = 5.0, 12, 7, 1_700_000_000_000_000_000
 PERIOD_NS = round(1e9 / RATE_HZ)
 TRAINING_S, FAULT_AFTER_S, FAULTY_S, ITERATIONS = 600.0, 200.0, 600.0, 6
+IS_FAULTY = np.arange(FANS) % 4 == 1
 FAULTS: dict[str, dict[str, Any]] = {
     "drag +10 %": {"drag": 1.1},
     "blade lost": {"drag": 0.8},
     "blocked": {"blocks": True},
     "supply -5 %": {"supply": 0.95},
     "bearing": {"brake_v": 0.6, "grows_s": 600.0},
-}
-RIGHT = {
-    "drag +10 %": ("drag_up",),
-    "blade lost": ("drag_down",),
-    "blocked": ("blocked",),
-    "supply -5 %": ("gain_down",),
-    "bearing": ("friction_up",),
 }
 
 
@@ -86,7 +82,7 @@ class Judged:
         self._predicted, self._scorer = Predicted(twin), stage("scorer", twin)
         self.fan_hours, self.raised = 0.0, dict[int, list[float]]()
         self.first: dict[int, str] = {}
-        self.later: dict[int, str] = {}
+        self.last: dict[int, str] = {}
 
     def take(self, command: Array, speed_rad_s: Array) -> None:
         """Judge a block."""
@@ -104,7 +100,7 @@ class Judged:
             cause = one.causes[0].cause
             if cause != "cannot_tell":
                 self.first.setdefault(one.fan, cause)
-            self.later[one.fan] = cause
+            self.last[one.fan] = cause
 
 
 def trained(loops: Sequence[str], folder: Path) -> dict[str, tuple[Path, dict[str, Any]]]:
@@ -149,55 +145,77 @@ def trained(loops: Sequence[str], folder: Path) -> dict[str, tuple[Path, dict[st
     return made
 
 
+def identified(loops: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """How far J, alpha and C_D are from the truth: median and spread of their relative errors, and the share of fans
+    off by more than two standard errors; or why there are none."""
+    fans = plain_fans(8, FANS_SEED)
+    true, found = true_parameters(fans), dict[str, dict[str, Any]]()
+    many = [runs_of(loops, fans, TRAINING_S, 2.0 * RATE_HZ, seed) for seed in (11, 12)]
+    for loop in loops:
+        progress(f"identification under {loop}")
+        try:
+            each = [identify([runs[loop]]) for runs in many]
+        except TwinError as error:
+            found[loop] = {"refused": str(error)}
+            continue
+        errors = np.concatenate([one.parameters[:, :3] - true for one in each])
+        beyond = np.abs(errors) > 2.0 * np.concatenate([one.standard_errors[:, :3] for one in each])
+        shares = errors / np.tile(true, (len(each), 1))
+        found[loop] = {
+            "in a loop": float(np.mean([one.closed_loop for one in each])),
+            "median": np.median(shares, axis=0).round(3).tolist(),
+            "spread": shares.std(axis=0).round(3).tolist(),
+            "beyond 2 s.e.": beyond.mean(axis=0).round(2).tolist(),
+        }
+    return found
+
+
+def judged_runs(twins: dict[str, Path], kind: str, seconds: float) -> dict[str, Judged]:
+    """A run under each loop, in which some fans have a fault. kind: empty for none."""
+    loops = list(twins)
+    what = [Fault(np.tile(IS_FAULTY, len(loops)), FAULT_AFTER_S, **FAULTS[kind])] if kind else []
+    judged = {loop: Judged(twin) for loop, twin in twins.items()}
+    many = tiled(tray_of_fans(FANS, FANS_SEED), len(loops))
+    for both in samples(loops, many, seconds, RATE_HZ, 50 + len(kind), faults=what):
+        for loop, command, speed in zip(loops, *(np.split(of, len(loops), axis=1) for of in both), strict=True):
+            judged[loop].take(command, speed)
+    return judged
+
+
+def of_faults(one: Judged) -> dict[str, Any]:
+    """Delays and causes of the faulty fans of a run, and the alarms of the others."""
+    faulty = np.flatnonzero(IS_FAULTY).tolist()
+    after = {fan: [t_s - FAULT_AFTER_S for t_s in times] for fan, times in one.raised.items()}
+    return {
+        "delays_s": [next((since_s for since_s in after.get(fan, []) if since_s >= 0.0), None) for fan in faulty],
+        "first": [one.first.get(fan, "") for fan in faulty],
+        "last": [one.last.get(fan, "") for fan in faulty],
+        "false": {fan: times for fan, times in after.items() if fan not in faulty or times[0] < 0.0},
+    }
+
+
 def main(
     output: Annotated[Path, typer.Argument(help="JSON to write.")],
     loops: Annotated[str, typer.Option(help="With semicolons; default all.")] = ";".join(LOOPS),
     hours: Annotated[float, typer.Option(help="Healthy hours of each tray of 12 fans.")] = 2.0,
     folder: Annotated[Path, typer.Option(help="Of the twins; those in it are used again.")] = Path("loops-twins"),
     faults: Annotated[str, typer.Option(help="With semicolons.")] = ";".join(FAULTS),
+    identification: Annotated[bool, typer.Option(help="Measure the parameters as well.")] = True,
 ) -> None:
-    """Measure."""
+    """Measure, and write after each part what was found."""
     chosen = loops.split(";")
-    found: dict[str, dict[str, Any]] = {}
+    found: dict[str, Any] = {"identification": identified(chosen)} if identification else {}
     folder.mkdir(parents=True, exist_ok=True)
-    twins = trained(chosen, folder)
-    chosen = [loop for loop in chosen if loop in twins]
-    many = tiled(tray_of_fans(FANS, FANS_SEED), len(chosen))
-    found = {loop: {**twins[loop][1], "faults": {}} for loop in chosen}
+    made = trained(chosen, folder)
+    twins = {loop: twin for loop, (twin, _) in made.items()}
+    found["twins"] = {loop: about for loop, (_, about) in made.items()}
     for kind in ("", *filter(None, faults.split(";"))):
         progress(kind or "healthy hours")
-        is_faulty = np.arange(FANS) % 4 == 1
-        seconds, what = 3600.0 * hours, []
+        judged = judged_runs(twins, kind, FAULT_AFTER_S + FAULTY_S if kind else 3600.0 * hours)
         if kind:
-            what = [Fault(np.tile(is_faulty, len(chosen)), FAULT_AFTER_S, **FAULTS[kind])]
-            seconds = FAULT_AFTER_S + FAULTY_S
-        judged = {loop: Judged(twins[loop][0]) for loop in chosen}
-        for commands, speeds in samples(chosen, many, seconds, RATE_HZ, 50 + len(kind), faults=what):
-            for loop, command, speed in zip(
-                chosen, *(np.split(of, len(chosen), axis=1) for of in (commands, speeds)), strict=True
-            ):
-                judged[loop].take(command, speed)
-        for loop, one in judged.items():
-            if not kind:
-                found[loop]["fan_hours"] = one.fan_hours
-                found[loop]["false"] = dict(one.raised)
-                found[loop]["false_causes"] = one.first
-                continue
-            faulty = np.flatnonzero(is_faulty).tolist()
-            delays = [
-                min((t for t in one.raised.get(fan, []) if t >= FAULT_AFTER_S), default=np.inf) - FAULT_AFTER_S
-                for fan in faulty
-            ]
-            found[loop]["faults"][kind] = {
-                "delays": delays,
-                "first": [one.first.get(fan, "") for fan in faulty],
-                "later": [one.later.get(fan, "") for fan in faulty],
-                "false": {
-                    fan: times[:3]
-                    for fan, times in one.raised.items()
-                    if fan not in faulty or min(times) < FAULT_AFTER_S
-                },
-            }
+            found[kind] = {loop: of_faults(one) for loop, one in judged.items()}
+        else:
+            found["healthy"] = {loop: {"fan_hours": one.fan_hours, "false": one.raised} for loop, one in judged.items()}
         output.write_text(json.dumps(found, indent=1))
 
 
