@@ -30,6 +30,8 @@ from fantwin.pipeline.sources.wanted import Wanted
 from fantwin.schemas.units import NS_PER_S, period_in_words
 
 _START = 4096
+_USUAL_POLES = 14
+"""of motors of which a preview does not know them"""
 
 
 @contextmanager
@@ -107,10 +109,11 @@ def preview_of(path: Path, wanted: Wanted) -> Preview:
     file = open_file(path, wanted)
     profile = profile_of(file)
     names = list(file.names if file.numbers is None else file.numbers)
+    why_none = ""
     try:
         chosen = chosen_fans(path, file, wanted, profile)
-    except UserError:
-        chosen = FanColumns((), ())
+    except UserError as error:
+        why_none, chosen = str(error), FanColumns((), ())
     of_log = () if file.is_rows else file.notes  # once all topics are read together, there are more, on their times
     columns = file.read([*names, *(name for name in chosen.names if name not in names)])
     notes = [str(each.problem) for each in columns.values() if each.problem]
@@ -123,11 +126,12 @@ def preview_of(path: Path, wanted: Wanted) -> Preview:
             known = [] if wanted.speed else chosen.notes
             chosen = used_fans(path, chosen, {name: column.values for name, column in columns.items()})
             unit, _ = speed_unit(chosen, columns, profile)
-            notes += _notes_of_import(path, wanted, known)
+            poles = wanted.poles or (_USUAL_POLES if unit.startswith(ELECTRICAL) else None)
+            notes += _notes_of_import(path, replace(wanted, poles=poles), known)
         except UserError as error:
             notes.append(str(error))
     else:
-        notes += _without_time(file, columns)
+        notes += [*_without_time(file, columns), *([why_none] if wanted.speed or profile else [])]
     title = f"{profile.title}: {file.title}" if profile else file.title
     labels = (label or speed for label, speed in zip(chosen.labels or chosen.speed, chosen.speed, strict=True))
     return Preview(
@@ -143,8 +147,7 @@ def preview_of(path: Path, wanted: Wanted) -> Preview:
 
 def _notes_of_import(path: Path, wanted: Wanted, known: Sequence[str]) -> list[str]:
     """What an import says of the file, without what is known. Raises UserError."""
-    poles = wanted.reading.poles or 2  # changes no note
-    table = read_file(path, replace(wanted, reading=replace(wanted.reading, poles=poles)))
+    table = read_file(path, wanted)
     return [note for note in (table.assumed, *table.notes) if note and note not in known]
 
 
@@ -171,7 +174,7 @@ def _options(wanted: Wanted, chosen: FanColumns, unit: str) -> tuple[str, ...]:
     """Options of the command that imports these fans."""
     if not chosen.speed:
         return ()
-    poles = "14" if unit in (ELECTRICAL, ELECTRICAL_HUNDREDS) else ""
+    poles = "POLES" if unit in (ELECTRICAL, ELECTRICAL_HUNDREDS) else ""
     said = {
         "--command": chosen.command if len(set(chosen.command)) > 1 else chosen.command[:1],
         "--speed": [f"{name}:{unit}" if unit else name for name in chosen.speed],

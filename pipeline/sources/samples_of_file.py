@@ -17,10 +17,11 @@ from fantwin.pipeline.sources.tables.clocks import Clock, continued
 from fantwin.pipeline.sources.tables.fan_columns import FanColumns, fan_columns, used_fans
 from fantwin.pipeline.sources.tables.measured_table import Table, table_of
 from fantwin.pipeline.sources.tables.profiles import Profile, profile_of
-from fantwin.pipeline.sources.tables.units import SPEED_UNITS, in_unit_of, rad_s_per, unit_in_name
+from fantwin.pipeline.sources.tables.units import ELECTRICAL, SPEED_UNITS, in_unit_of, rad_s_per, unit_in_name
 from fantwin.pipeline.sources.wanted import Wanted
 from fantwin.schemas.channels import BY_NAME
 from fantwin.schemas.messages import Array
+from fantwin.schemas.units import RAD_S_PER_UNIT
 
 _MOST_NAMED = 8
 _NO_READING = (-1, 65535, 4294967295)
@@ -30,7 +31,9 @@ _NAMES_OF_SPEEDS = {"a", "c", "v", "s", "h", "min"}
 _FEWEST_ROWS = 8
 """of a table whose newest row is the first"""
 _FAR_BEYOND = 3.0
-"""times the largest other speed, above which one of these is no reading"""
+"""times most other speeds, above which one of these is no reading"""
+_BEYOND_RPM = 100_000.0
+"""of any fan"""
 
 
 def chosen_fans(path: Path, file: ColumnFile, wanted: Wanted, profile: Profile | None) -> FanColumns:
@@ -44,7 +47,9 @@ def chosen_fans(path: Path, file: ColumnFile, wanted: Wanted, profile: Profile |
         return fan_columns(where, file.names, wanted.command, wanted.speed, wanted.channels)
     known = profile.fans_in(file) if profile else FanColumns((), ())
     if wanted.command or wanted.speed or not known.speed or profile is None:
-        raise UsageError("an import needs --command and --speed; --preview shows the columns")
+        speeds = profile.speeds_in(file) if profile else ()
+        why = f"{where}: no command of {listed(speeds)}; " if speeds and not known.speed else ""
+        raise UsageError(f"{why}an import needs --command and --speed; --preview shows the columns")
     named = fan_columns(where, file.names, known.command, known.speed, wanted.channels)
     fans = zip(known.labels, known.command, known.speed, strict=True)
     said = [f"{label or speed}: command {command!r}, speed {speed!r}" for label, command, speed in fans]
@@ -80,12 +85,16 @@ def samples_of(path: Path, file: ColumnFile, wanted: Wanted) -> Table:
     unit, of_units = speed_unit(chosen, columns, profile)
     for channel, names in chosen.others.items():
         for name in dict.fromkeys(filter(None, names)):
-            values[name], note = in_unit_of(channel, name, values[name], _unit(name, columns))
-            of_units += [note] if note else []
+            of_file = _unit(name, columns) or (profile.units.get(name, "") if profile else "")
+            values[name], note = in_unit_of(channel, name, values[name], of_file)
             left_out.append(_beyond(channel, name, values))
-    table = table_of(
-        path, chosen, values, t_ns, *rad_s_per(unit or "rad/s", wanted.poles), longest_part=not file.is_rows
-    )
+            taken = f"{channel} from {name!r}: {_span(values[name])} {BY_NAME[channel].unit}"
+            of_units += filter(None, (note, taken))
+    rad_s, shown = rad_s_per(unit or "rad/s", wanted.poles)
+    if wanted.poles and not unit.startswith(ELECTRICAL):
+        of_units.append(f"--poles is for speeds in erpm, and has no effect on {shown}")
+    left_out += _impossible(chosen, values, rad_s)
+    table = table_of(path, chosen, values, t_ns, rad_s, shown, longest_part=not file.is_rows)
     example = f"--speed {shlex.quote(f'{(*wanted.speed, *chosen.speed)[0]}:rpm')}"
     remarks = (
         *file.notes,
@@ -109,14 +118,18 @@ def speed_unit(chosen: FanColumns, columns: Mapping[str, Column], profile: Profi
     Raises:
         UsageError: the file has speeds in several.
     """
-    in_file = ("" if (unit := _unit(name, columns)) in _NAMES_OF_SPEEDS else unit for name in chosen.speed)
-    units = [chosen.unit] if chosen.unit else list(dict.fromkeys(in_file))
+    in_file = {name: "" if (unit := _unit(name, columns)) in _NAMES_OF_SPEEDS else unit for name in chosen.speed}
+    units = [chosen.unit] if chosen.unit else list(dict.fromkeys(in_file.values()))
     if len(units) > 1 or units[0] not in ("", *SPEED_UNITS):
         raise UsageError(
             f"speeds in {', '.join(unit or 'no unit' for unit in units)}, as the file says: give one unit of a speed, "
             f"as in --speed {shlex.quote(f'{chosen.speed[0]}:rpm')}, or import them apart"
         )
-    return profile.unit_of(chosen.speed, units[0]) if profile else (units[0], [])
+    unit, notes = profile.unit_of(chosen.speed, units[0]) if profile else (units[0], [])
+    others = [name for name, of_file in in_file.items() if of_file and of_file != unit.removesuffix("/100")]
+    if others:
+        notes.append(f"{listed(others)}: in {in_file[others[0]]} by the file, and read in {unit}, as you say")
+    return unit, notes
 
 
 def _unit(name: str, columns: Mapping[str, Column]) -> str:
@@ -198,12 +211,12 @@ def _stops(
 
 
 def _error_codes(chosen: FanColumns, values: dict[str, Array]) -> Iterator[LeftOut]:
-    """Take away speeds that are no readings: an error code beyond all others."""
+    """Take away speeds that are no readings: an error code beyond most others."""
     for name in dict.fromkeys(chosen.speed):
         for code in _NO_READING:
             is_code = values[name] == code
             others = values[name][np.isfinite(values[name]) & ~is_code]
-            if len(others) and (code < 0 <= others.min() or code > _FAR_BEYOND * others.max() > 0):
+            if not len(others) or code < 0 <= others.min() or code > _FAR_BEYOND * np.quantile(others, 0.75):
                 yield _without(values, name, is_code, f"an error code, {code}")
 
 
@@ -214,11 +227,25 @@ def _beyond(channel: str, name: str, values: dict[str, Array]) -> LeftOut:
     return _without(values, name, is_beyond, f"beyond {of.lowest:g} to {of.highest:g} {of.unit}: what is its unit?")
 
 
+def _impossible(chosen: FanColumns, values: dict[str, Array], rad_s: float) -> Iterator[LeftOut]:
+    """Take away speeds beyond any fan, where most are not. rad_s: of one unit of them."""
+    for name in dict.fromkeys(chosen.speed):
+        rpm = values[name] * rad_s / RAD_S_PER_UNIT["rpm"]
+        beyond = np.abs(rpm) > _BEYOND_RPM
+        if 2 * np.count_nonzero(beyond) < np.count_nonzero(rpm > 0):
+            yield _without(values, name, beyond, f"up to {np.nanmax(rpm):,.0f} rpm")
+
+
 def _without(values: dict[str, Array], name: str, rows: Array, why: str) -> LeftOut:
     """Take away some values of a column."""
     if rows.any():
         values[name] = np.where(rows, np.nan, values[name])
     return LeftOut(name, int(np.count_nonzero(rows)), why)
+
+
+def _span(values: Array) -> str:
+    known = values[np.isfinite(values)]
+    return f"{known.min():.4g} to {known.max():.4g}" if len(known) else "no values in"
 
 
 def _rates(columns: Mapping[str, Column], chosen: FanColumns) -> list[str]:

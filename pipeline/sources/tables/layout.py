@@ -305,7 +305,7 @@ def _head(
     """Line of the names, names, second names, units, and what the lines before say."""
     rest = list(above)
     units: list[str] = []
-    if len(rest) > 1 and all(is_unit(cell) for cell in rest[-1][1] if cell) and len(rest[-2][1]) > 1:
+    if len(rest) > 1 and _are_units(rest[-1][1]) and len(rest[-2][1]) > 1:
         units = [cell.strip("[]() ") for cell in rest.pop()[1]]
     if not rest:
         return 0, [], [], units, {}
@@ -326,6 +326,12 @@ def _head(
                 names = [f"{top} {name}".strip() for top, name in zip(_held(second), names, strict=True)]
     about = {row[0].strip("# \t"): row[1] for _, row in rest if len(row) >= 2 and row[0]}
     return head, names, second, units, about
+
+
+def _are_units(cells: Sequence[str]) -> bool:
+    """Whether most cells of a line are units: programs have some of their own."""
+    filled = list(filter(None, cells))
+    return 2 * sum(map(is_unit, filled)) > len(filled)
 
 
 def _held(cells: Sequence[str]) -> list[str]:

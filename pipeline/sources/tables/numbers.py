@@ -184,6 +184,8 @@ class NumberColumn:
         self._values = array("d")
         self._marks = Marks()
         self._in_part = 0
+        self._has_plain = False
+        """whether a number had no unit"""
         self._texts = array("q")
         """rows of cells with text"""
         self._first_texts: list[str] = []
@@ -196,6 +198,7 @@ class NumberColumn:
             if self._decimal != "." or self._is_final:
                 raise ValueError
             values = np.array([float(cell) if cell else math.nan for cell in cells])
+            self._has_plain = self._has_plain or bool(np.isfinite(values).any())
         except ValueError:
             values = np.empty(len(cells))
             for self._in_part, cell in enumerate(cells):
@@ -245,17 +248,22 @@ class NumberColumn:
         text = text.strip()
         if self._decimal == "." and not self._is_final:
             try:
-                return float(text)
+                value = float(text)
             except ValueError:
                 pass
+            else:
+                self._has_plain = self._has_plain or math.isfinite(value)
+                return value
         if text.lower() in NOT_MEASURED:
             return math.nan
         cell = cell_of(text)
-        if cell is None or (cell.unit and self._marks.unit and cell.unit.lower() != self._marks.unit.lower()):
+        is_first = not self._has_plain and not self._marks.unit
+        if cell is None or (cell.unit and not is_first and cell.unit.lower() != self._marks.unit.lower()):
             self._texts.append(len(self._values) + self._in_part)
             if len(self._first_texts) < _TEXTS_KEPT:
                 self._first_texts.append(text)
             return math.nan
+        self._has_plain = self._has_plain or not cell.unit
         self._marks.add(text, cell)
         if cell.mark in _OTHER and cell.mark != self._decimal and not self._is_final:
             self._contradicted(cell.mark)

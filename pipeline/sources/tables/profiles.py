@@ -27,7 +27,7 @@ class Profile:
         unit: of speeds, where the names do not have it.
         time: patterns of the time columns, `DATE+TIME` in two. time_unit: of numbers in them.
         dates: order of the parts of a date.
-        channels: patterns, by the name of their channel.
+        channels: patterns, by the name of their channel. units: of such columns, by name, where it does not have them.
         note: what a user has to know.
     """
 
@@ -41,6 +41,7 @@ class Profile:
     time_unit: str = ""
     dates: str = ""
     channels: Mapping[str, tuple[str, ...]] = field(default_factory=dict[str, tuple[str, ...]])
+    units: Mapping[str, str] = field(default_factory=dict[str, str])
     note: str = ""
 
     def is_of(self, file: ColumnFile) -> bool:
@@ -103,7 +104,8 @@ _BLACKBOX = Profile(
     time=(r"time(?: \(us\))?",),
     time_unit="us",
     command=(r"motor\[(?P<fan>\d+)\]",),
-    channels={"supply_voltage_v": (r"vbatLatest \(V\)",), "current_a": (r"amperageLatest \(A\)",)},
+    channels={"supply_voltage_v": (r"vbatLatest \(V\)", r"vbatLatest"), "current_a": (r"amperageLatest \(A\)",)},
+    units={"vbatLatest": "V/100"},
     note="no speeds in it: switch on bidirectional DShot, or debug_mode RPM_FILTER, before the flight",
 )
 _OF_TOPIC = r"(?:(?P<before>.*/)?{}\.)?"
@@ -114,7 +116,7 @@ PROFILES = (
         "HWiNFO",
         head=("Date", "Time", r".+\[(RPM|°C|V|W|MHz|%)\]"),
         time=("Date", "Time"),
-        command=(r"(?P<fan>.*Fan ?\d*) \[%\]", r"(?P<fan>.+?)(?: Fan)? (?:PWM|Duty|Control) \[%\]"),
+        command=(r"(?P<fan>.+?)(?: Fan)? (?:PWM|Duty|Control) \[%\]", r"(?P<fan>.+) \[%\]"),
         speed=(r"(?P<fan>.+) \[RPM\]",),
         unit="rpm",
     ),

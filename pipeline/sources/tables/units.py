@@ -6,6 +6,8 @@ import math
 import re
 from typing import NamedTuple
 
+import numpy as np
+
 from fantwin.pipeline.errors import UsageError
 from fantwin.schemas.channels import BY_NAME
 from fantwin.schemas.messages import Array
@@ -14,12 +16,14 @@ from fantwin.schemas.units import NS_PER_S, RAD_S_PER_UNIT
 RAD_S_PER_TABLE_UNIT = {**RAD_S_PER_UNIT, "hz": 2 * math.pi, "deg/s": math.pi / 180}
 ELECTRICAL, ELECTRICAL_HUNDREDS = "erpm", "erpm/100"
 """electrical revolutions a minute, which need the number of poles"""
-SPEED_UNITS = (*RAD_S_PER_TABLE_UNIT, ELECTRICAL, ELECTRICAL_HUNDREDS)
+_THOUSANDS = "krpm"
+SPEED_UNITS = (*RAD_S_PER_TABLE_UNIT, _THOUSANDS, ELECTRICAL, ELECTRICAL_HUNDREDS)
 NS_PER_UNIT = {"s": NS_PER_S, "ms": 1_000_000, "us": 1_000, "ns": 1, "min": 60 * NS_PER_S, "h": 3600 * NS_PER_S}
 
 _SPEEDS = {
     "rpm": ("rpm", "r/min", "rev/min", "u/min", "1/min", "min-1", "min^-1", "tr/min", "g/min", "omw/min"),
-    "rad/s": ("rad/s", "rad/sec", "rad s-1"),
+    _THOUSANDS: ("krpm", "rpm x1000", "1000 rpm"),
+    "rad/s": ("rad/s", "rad/sec", "rad s-1", "rad.s", "rad.s-1", "rad·s-1"),
     "hz": ("hz", "rps", "1/s", "rev/s", "r/s"),
     "deg/s": ("deg/s", "°/s", "deg/sec", "dps"),
     ELECTRICAL: ("erpm",),
@@ -43,10 +47,10 @@ class Scale(NamedTuple):
 
 
 CHANNEL_SCALES = {
-    "supply_voltage_v": {"v": Scale(), "volt": Scale(), "volts": Scale(), "mv": Scale(1e-3)},
+    "supply_voltage_v": {"v": Scale(), "volt": Scale(), "volts": Scale(), "mv": Scale(1e-3), "v/100": Scale(1e-2)},
     "current_a": {"a": Scale(), "amp": Scale(), "amps": Scale(), "ma": Scale(1e-3)},
     "temperature_c": {
-        **dict.fromkeys(("c", "°c", "ºc", "degc", "celsius"), Scale()),
+        **dict.fromkeys(("c", "°c", "ºc", "degc", "deg c", "celsius"), Scale()),
         **dict.fromkeys(("f", "°f", "ºf", "degf", "fahrenheit"), Scale(5 / 9, -160 / 9)),
         **dict.fromkeys(("m°c", "mc"), Scale(1e-3)),
         "k": Scale(1.0, -273.15),
@@ -54,7 +58,23 @@ CHANNEL_SCALES = {
 }
 _COMMANDS = ("%", "pct", "percent", "‰")
 _OTHERS = ("w", "kw", "khz", "mhz", "ghz", "mb", "gb", "pa", "kpa", "gf", "kgf", "n", "nm", "n·m", "ω", "ohm", "db")
-_OTHERS_TOO = ("lbf", "mah", "ah", "wh", "m/s", "mm", "kb/s", "mb/s", "yes/no", "fps")
+_OTHERS_TOO = (
+    "lbf",
+    "mah",
+    "ah",
+    "wh",
+    "m/s",
+    "mm",
+    "kb/s",
+    "mb/s",
+    "yes/no",
+    "fps",
+    "n.m",
+    "n.mm",
+    "n·mm",
+    "bar",
+    "m3/h",
+)
 """no k, m, g, b or t: behind a number they may be thousands, millions and more"""
 _SPELLED = {word: unit for units in (_SPEEDS, _TIMES) for unit, words in units.items() for word in words}
 _KNOWN = {
@@ -80,7 +100,7 @@ def known_unit(text: str) -> str:
 def is_unit(text: str) -> bool:
     """Whether a cell of a line holds a unit: one that is known, or any short text in brackets."""
     inside = text.strip("[]() ")
-    return bool(known_unit(inside)) or (inside != text and len(inside) <= 8) or text in ("-", "–")
+    return bool(known_unit(inside)) or (text[0] in "[(" and len(inside) <= 8) or text in ("-", "–")
 
 
 def unit_in_name(name: str) -> str:
@@ -97,13 +117,12 @@ def unit_in_name(name: str) -> str:
 
 
 def in_unit_of(channel: str, name: str, values: Array, unit: str) -> tuple[Array, str]:
-    """The values of a column in the unit of its channel; and a note, where they were converted, or where their unit is
-    of another kind."""
+    """The values of a column in the unit of its channel, NaN where theirs is of another kind; and a note on either."""
     if not unit or channel not in CHANNEL_SCALES:
         return values, ""
     scale = CHANNEL_SCALES[channel].get(unit.lower())
     if scale is None:
-        return values, f"{name!r} is in {unit}, and is taken as {channel}, in {BY_NAME[channel].unit}"
+        return np.full_like(values, np.nan), f"{name!r} is in {unit}, which is no unit of {channel}: left out"
     if scale == Scale():
         return values, ""
     return values * scale.factor + scale.offset, f"{name!r} converted from {unit} to {BY_NAME[channel].unit}"
@@ -111,6 +130,8 @@ def in_unit_of(channel: str, name: str, values: Array, unit: str) -> tuple[Array
 
 def rad_s_per(unit: str, poles: int | None) -> tuple[float, str]:
     """rad/s of one unit, and the unit that people are shown. poles: magnetic ones, for electrical speeds."""
+    if unit == _THOUSANDS:
+        return 1000.0 * RAD_S_PER_TABLE_UNIT["rpm"], "rpm"
     if unit not in (ELECTRICAL, ELECTRICAL_HUNDREDS):
         return RAD_S_PER_TABLE_UNIT[unit], unit
     if poles is None:

@@ -97,6 +97,12 @@ PROGRAMS = {
         after=f"{HWINFO}\n,,CPU: name,Board: chip,Board: chip,",
         encoding="cp1252",
     ),
+    "HWiNFO: names in another language": Table(
+        'Date,Time,"GPU 风扇1 [RPM]","GPU 风扇1 [%]","GPU Last [%]"',
+        "{d.day}.{d.month}.{d.year},{d:%H:%M:%S}.000,{s},{c},55",
+        (),
+        ("columns of HWiNFO: GPU 风扇1: command 'GPU 风扇1 [%]', speed 'GPU 风扇1 [RPM]'",),
+    ),
     "Grafana: a row a value, by series": Table(
         "Series;Time;Value\n"
         + body("fan1;{d:%Y-%m-%dT%H:%M:%S}+00:00;{s}")
@@ -131,6 +137,13 @@ PROGRAMS = {
         "",
         ("--poles", "14"),
         ("columns of Betaflight blackbox: eRPM[0]:",),
+        every_s=0.002,
+    ),
+    "blackbox_decode of a voltage without its unit": Table(
+        blackbox(BLACKBOX.replace(" (V)", ""), "0, {us}, {c}, , {e}, 0, 2194"),
+        "",
+        ("--poles", "14"),
+        ("'vbatLatest' converted from V/100 to V", "supply_voltage_v from 'vbatLatest': 21.94 to 21.94 V"),
         every_s=0.002,
     ),
     "blackbox_decode of builds that say (/100)": Table(
@@ -281,6 +294,16 @@ PREVIEWS = {
         "06/09/2026 can be read in 2 ways, and no row tells: give --dates dmy",
         "to import it: nothing as it is",
     ),
+    "speeds whose command nobody knows": (
+        Table('Date,Time,"CPU [RPM]","CPU Total [%]"', "{d.day}.{d.month}.{d.year},{d:%H:%M:%S}.000,{s},{c}"),
+        "no command of CPU [RPM]",
+        "--command COLUMN --speed COLUMN -o",
+    ),
+    "electrical speeds, of which the poles are missing": (
+        Table(blackbox(BLACKBOX, "0, {us}, {c}, , {e}, 0, 12.1")),
+        "supply_voltage_v from 'vbatLatest (V)': 12.1 to 12.1 V",
+        "--channel 'supply_voltage_v=vbatLatest (V)' --poles POLES",
+    ),
     "speeds with their unit": (Table("t [s],duty [%],speed [Hz]", "{t},{c},{s}"), "", "COLUMN --speed COLUMN -o"),
 }
 
@@ -293,6 +316,7 @@ def test_a_preview_says_what_an_import_would_do(name: str, tmp_path: Path) -> No
     shown = fantwin("import", path, "--preview").stdout
     assert note in shown
     assert command_line in shown.splitlines()[-1]
+    assert "--poles is for" not in shown
 
 
 def test_fans_are_called_as_the_program_calls_them(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from fantwin.pipeline.cli.simulation.scenario import FileScenario, Scenario
 from fantwin.pipeline.recordings.training_runs import read_runs
 from fantwin.pipeline.sources.tables.units import unit_in_name
 from tests.support.fan_rows import COLUMNS, COMMAND, EPOCH_S, RPM, SECONDS, SPEED, START, N, Table, require_imported
-from tests.support.fantwin_command import error_of, fantwin
+from tests.support.fantwin_command import as_typed, error_of, fantwin
 from tests.support.written_recordings import raw_columns
 
 PLAIN, DATED = "t,fan1,pwm1", "Time,fan1,pwm1"
@@ -63,6 +63,9 @@ TABLES = {
         ("UTF-8, columns separated by ',', names in line 3",),
     ),
     "a line of units": Table("Time,pwm1,fan1\ns,%,rpm", "{t},{c},{s}", NO_UNIT),
+    "a line of units, some of which nobody knows": Table(
+        "Time,pwm1,fan1,torque,set\ns,%,krpm,ozf.in,Nm", "{t},{c},{s}e-3,1,2", NO_UNIT
+    ),
     "groups of columns": Table(
         "t,fan1,,fan2,\n,rpm,pwm,rpm,pwm",
         "{t},{s},{c},{half},{c}",
@@ -151,6 +154,7 @@ DAMAGED_CELLS = {
     "{t},1.74 krpm,{c}": "1 cell with text that is no number, first '1.74 krpm'",
     "{t},-1,{c}": "fan1: 1 values left out, an error code, -1",
     "{t},65535,{c}": "fan1: 1 values left out, an error code, 65535",
+    "{t},203390,{c}": "fan1: 1 values left out, up to 203,390 rpm",
 }
 
 
@@ -215,10 +219,6 @@ REFUSED = {
         with_times([str(k if k < 40 else k - 20) for k in SECONDS]),
         "time goes back by 19.000 s at row 41, from 39.000 s to 20.000 s: the clock was set, or a second run begins",
     ),
-    "a speed in per cent": (
-        "\n".join(["t,fan1 [%],pwm1", *(f"{k},{k},40" for k in SECONDS)]),
-        "speeds in %, as the file says: give one unit of a speed, as in --speed 'fan1 [%]:rpm'",
-    ),
 }
 
 
@@ -227,8 +227,7 @@ def test_what_cannot_be_told_is_refused_with_the_cell_and_the_option(name: str, 
     content, expected = REFUSED[name]
     path = tmp_path / "table.csv"
     path.write_text(content, encoding="utf-8")
-    words = ("--command", "pwm1", "--speed", "fan1 [%]") if "[%]" in content else COLUMNS
-    assert expected in error_of("import", path, *words, "-o", tmp_path / "r.mcap")
+    assert expected in error_of("import", path, *COLUMNS, "-o", tmp_path / "r.mcap")
     assert not (tmp_path / "r.mcap").exists()
 
 
@@ -241,18 +240,41 @@ def test_marks_that_only_later_rows_show_are_those_of_the_whole_column(tmp_path:
     np.testing.assert_allclose(speed, np.append(1016 + np.arange(1000) % 3, 1016.5))
 
 
-def test_channels_are_in_their_units_and_plausible(tmp_path: Path) -> None:
+CHANNELS = {
+    "temp_mC": ("temperature_c", 45_000, 45.0, "'temp_mC' converted from mC to °C"),
+    "vbat [mV]": ("supply_voltage_v", 12_100, 12.1, "supply_voltage_v from 'vbat [mV]': 12.1 to 12.1 V"),
+    "vbat": ("supply_voltage_v", 16_320, np.nan, "V: what is its unit?"),
+    "Ibus": ("current_a", 45, 45.0, "current_a from 'Ibus': 45 to 45 A"),
+    "power [W]": ("current_a", 45, np.nan, "'power [W]' is in W, which is no unit of current_a: left out"),
+}
+
+
+@pytest.mark.parametrize("name", CHANNELS)
+def test_channels_are_converted_to_their_units_or_left_out(name: str, tmp_path: Path) -> None:
+    channel, cell, value, note = CHANNELS[name]
     path, recording = tmp_path / "table.csv", tmp_path / "r.mcap"
-    path.write_text("\n".join(["t,rpm,pwm1,temp_mC,vbat", *(f"{k},{1000 + k},{k % 3},45000,16320" for k in range(20))]))
-    channels = ("--channel", "temperature_c=temp_mC", "--channel", "supply_voltage_v=vbat")
-    said = fantwin("import", path, "--command", "pwm1", "--speed", "rpm", *channels, "-o", recording).stdout
-    assert "'temp_mC' converted from mC to °C" in said
-    assert "vbat: 20 values left out, beyond " in said
-    assert "V: what is its unit?" in said
+    path.write_bytes(Table(f"{PLAIN},{name}", f"{{t}},{{s}},{{c}},{cell}").content)
+    assert note in fantwin("import", path, *COLUMNS, "--channel", f"{channel}={name}", "-o", recording).stdout
     (run,) = read_runs(recording).runs
-    np.testing.assert_allclose(run.speed_rad_s[:, 0] / RPM, 1000 + np.arange(20))
-    np.testing.assert_allclose(run.auxiliary["temperature_c"], 45.0)
-    assert np.isnan(run.auxiliary["supply_voltage_v"]).all()
+    np.testing.assert_allclose(run.auxiliary[channel], np.full((N, 1), value), rtol=1e-6)
+
+
+SPEEDS = {
+    "speed [Hz]:rpm": "speed [Hz]: in hz by the file, and read in rpm, as you say",
+    "fan_rpm": "--poles is for speeds in erpm, and has no effect on rpm",
+    "fan1 [%]": "speeds in %, as the file says: give one unit of a speed, as in --speed 'fan1 [%]:rpm'",
+    "thrust_gf": "speeds in gf, as the file says: give one unit of a speed",
+    "pwm1": "'pwm1' is named as command and as speed",
+}
+
+
+@pytest.mark.parametrize("speed", SPEEDS)
+def test_units_that_contradict_a_speed_are_said_or_refused(speed: str, tmp_path: Path) -> None:
+    path = tmp_path / "table.csv"
+    path.write_bytes(Table(f"t,pwm1,{speed.removesuffix(':rpm')}", "{t},{c},{s}").content)
+    shown = as_typed("import", path, "--command", "pwm1", "--speed", speed, "--poles", "14", "-o", tmp_path / "r.mcap")
+    assert SPEEDS[speed] in shown.stdout + shown.stderr
+    assert (tmp_path / "r.mcap").exists() == (shown.returncode == 0)
 
 
 def test_a_simulated_line_plays_such_a_table(tmp_path: Path) -> None:
