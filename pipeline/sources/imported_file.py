@@ -131,7 +131,8 @@ def preview_of(path: Path, wanted: Wanted) -> Preview:
         except UserError as error:
             notes.append(str(error))
     else:
-        notes += [*_without_time(file, columns), *([why_none] if wanted.speed or profile else [])]
+        is_near = wanted.speed or (profile and profile.speeds_in(file))
+        notes += [*_without_time(file, columns), *([why_none] if is_near else [])]
     title = f"{profile.title}: {file.title}" if profile else file.title
     labels = (label or speed for label, speed in zip(chosen.labels or chosen.speed, chosen.speed, strict=True))
     return Preview(

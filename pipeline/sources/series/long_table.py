@@ -17,7 +17,8 @@ import numpy as np
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.sources.column_file import NO_TIME
 from fantwin.pipeline.sources.series.series_file import Label, SeriesFile, named
-from fantwin.pipeline.sources.tables.layout import Heading, Layout, all_rows_of, rows_of, wider_in_words
+from fantwin.pipeline.sources.tables.layout import Heading, Layout, all_rows_of
+from fantwin.pipeline.sources.tables.rows import OddRows, rows_of
 from fantwin.pipeline.sources.tables.table_file import read_cells
 from fantwin.pipeline.sources.tables.times import time_names, usual_time
 from fantwin.pipeline.sources.wanted import Wanted
@@ -68,14 +69,15 @@ def long_table(layout: Layout, wanted: Wanted) -> SeriesFile | None:
         return None
     at = [columns.names.index(key) for key in columns.keys]
     known: dict[tuple[str, ...], int] = {}
-    wider: list[str] = []
+    odd = OddRows()
     of_row = array("i")
 
     def rows() -> Iterator[list[str]]:
+        nonlocal odd
+        odd = OddRows()
         known.clear()
-        wider.clear()
         del of_row[:]
-        for row in _annotated_rows(layout, columns.names) if is_annotated(layout) else rows_of(layout, wider):
+        for row in _annotated_rows(layout, columns.names) if is_annotated(layout) else rows_of(layout, odd):
             of_row.append(known.setdefault(tuple(row[k] for k in at), len(known)))
             if len(known) > MOST_SERIES:
                 raise _TooManyError
@@ -90,7 +92,9 @@ def long_table(layout: Layout, wanted: Wanted) -> SeriesFile | None:
     t_ns, series = times.values(), np.asarray(of_row)
     has_time = t_ns != NO_TIME
     is_keyed = all(_LIKE_A_KEY.fullmatch(key) for key in columns.keys)
-    if not is_annotated(layout) and not _is_long(t_ns[has_time], series[has_time], len(known), is_keyed=is_keyed):
+    is_only = is_keyed and len(columns.values) == 1 and len(known) > 1  # a table of fans has two columns of numbers
+    is_long = is_annotated(layout) or is_only
+    if not is_long and not _is_long(t_ns[has_time], series[has_time], len(known), is_keyed=is_keyed):
         return None
     for problem in filter(None, (column.problem for column in numbers.values())):
         raise problem
@@ -100,7 +104,7 @@ def long_table(layout: Layout, wanted: Wanted) -> SeriesFile | None:
     texts = {name: column.texts(has_time) for name, column in numbers.items()}
     notes = [
         *times.notes,
-        *wider_in_words(layout, wider),
+        *odd.in_words(layout),
         *(f"{name!r}: {text}" for name, text in texts.items() if text),
     ]
     found = [
@@ -111,9 +115,7 @@ def long_table(layout: Layout, wanted: Wanted) -> SeriesFile | None:
     ]
     if not found:
         raise UserError(f"{layout.path}: a row a value, and none of the values is a number")
-    return SeriesFile(
-        f"long table, {len(found)} series by {by}", named(found), (*times.notes, *wider_in_words(layout, wider), *notes)
-    )
+    return SeriesFile(f"long table, {len(found)} series by {by}", named(found), notes)
 
 
 def _with_names(layout: Layout, names: Sequence[str]) -> Layout:

@@ -12,21 +12,25 @@ import io
 import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import islice
+from itertools import islice, pairwise
 from pathlib import Path
 
 from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.sources.tables.dates import is_date_or_time
+from fantwin.pipeline.sources.tables.json_rows import is_json, json_rows
 from fantwin.pipeline.sources.tables.numbers import Marks, file_decimal, is_number
-from fantwin.pipeline.sources.tables.units import is_unit, unit_in_name
+from fantwin.pipeline.sources.tables.units import is_unit, known_unit, unit_in_name
 
 LONGEST_LINE = 1 << 20
 """characters"""
 BLANKS = " "
 """as a delimiter: runs of blanks"""
+JSON = ":"
+"""as a delimiter: the file is no text in columns, but JSON"""
 _DELIMITERS = {",": "','", ";": "';'", "\t": "tabs", "|": "'|'", BLANKS: "blanks"}
+"""that are looked for"""
 _SAMPLE_BYTES = 1 << 18
 _SAMPLE_LINES = 400
 _LEAST_ALIKE = 0.6
@@ -34,8 +38,9 @@ _LEAST_ALIKE = 0.6
 _LONGEST_SENTENCE = 6
 """words of a cell; a longer one is a sentence, not a name"""
 _RULER = re.compile(r"[-=+:|\s,;]*[-=][-=+:|\s,;]*")
-_END_OF_HEAD = "***End_of_Header***"
-"""before the names in files of LabVIEW"""
+_LABVIEW = re.compile(r"\*\*\*End_of_Header\*\*\*\s*X_Value")
+"""end of a head and begin of the names"""
+_LABVIEW_UNITS = "Y_Unit_Label\t"
 _SEP_LINE = re.compile(r"\s*\"?sep=(.)\"?\s*", re.IGNORECASE)
 _BOMS = {codecs.BOM_UTF8: "utf-8-sig", codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16"}
 _ENCODINGS = {"utf-8": "UTF-8", "utf-8-sig": "UTF-8", "utf-16": "UTF-16", "utf-16-le": "UTF-16"}
@@ -115,6 +120,8 @@ class Layout:
     @property
     def in_words(self) -> str:
         """Words for people: encoding, delimiter, and where the names are."""
+        if self.delimiter == JSON:
+            return f"JSON, a row an object, {len(self.columns)} keys"
         where = f"names in line {self.head}" if self.head else "no line of names"
         return f"{self.title}, columns separated by {_DELIMITERS.get(self.delimiter, repr(self.delimiter))}, {where}"
 
@@ -129,70 +136,38 @@ def find_layout(path: Path) -> Layout:
         start = file.read(_SAMPLE_BYTES)
     encoding = _encoding(path, start)
     text = codecs.getincrementaldecoder(encoding)(_AS_WINDOWS).decode(start)
+    if is_json(text):
+        return _layout(path, encoding, "", JSON, list(enumerate(islice(json_rows(path), _SAMPLE_LINES), 1)))
     lines = list(islice(io.StringIO(text, newline=""), _SAMPLE_LINES))
     if len(start) == _SAMPLE_BYTES and len(lines) > 1 and not lines[-1].endswith("\n"):
         lines.pop()  # cut by the end of the sample
-    title = "Windows-1252" if encoding == "utf-8" and not _is_utf_8(start) else _ENCODINGS[encoding]
+    title = _ENCODINGS[encoding]
+    if encoding == "utf-8" and not _is_utf_8(start):
+        title = (
+            "Windows-1252" if lines[0].isascii() or not _is_utf_8(start.split(b"\n")[0]) else "UTF-8 and other bytes"
+        )
     separator = _SEP_LINE.fullmatch(lines[0]) if lines else None
-    ends = [k + 1 for k, line in enumerate(lines) if line.startswith(_END_OF_HEAD)]
-    skipped = max(ends, default=int(separator is not None))
+    ends = (k + 1 for k, both in enumerate(pairwise(lines)) if _LABVIEW.match("".join(both)))
+    skipped = next(ends, int(separator is not None))
     if not "".join(lines[skipped:]).strip():
         raise UserError(f"{path}: a line must name the columns, but the file is empty")
-    delimiter = separator[1] if separator else _delimiter(path, lines)
+    delimiter = separator[1] if separator else _delimiter(path, lines[skipped:])
     rows = enumerate(_split(path, lines[skipped:], delimiter), 1 + skipped)
     stripped = [(number, [cell.strip() for cell in row]) for number, row in rows]
-    return _layout(path, encoding, title, delimiter, [(number, row) for number, row in stripped if any(row)])
-
-
-def rows_of(layout: Layout, wider: list[str] | None = None) -> Iterator[list[str]]:
-    """The rows of a table, without those that are empty or repeat its names, each at least as wide as its names.
-
-    wider: gets what is beyond the last name in rows that have more cells: they may be shifted, and are left out.
-
-    Raises:
-        UserError: it cannot be read, names other columns further down, or most rows have more cells than names.
-    """
-    rows = 0
-    wider = [] if wider is None else wider
-    width, names, first = len(layout.columns), list(layout.written), layout.written[0]
-    for row in islice(all_rows_of(layout), layout.first_row - 1, None):
-        if len(row) < width:
-            row.extend([""] * (width - len(row)))
-        if len(row) > width and any(row[width:]):
-            wider.append(",".join(row[width:]))
-        elif first and row[0] == first and not any(map(is_number, row)):
-            _require_same_names(layout, names, row)
-        elif any(row):
-            rows += 1
-            yield row
-    if len(wider) > rows:
-        raise UserError(
-            f"{layout.path}: rows have more cells than the {width} names of line {layout.head}: if numbers have "
-            "decimal commas, export the table with another delimiter, such as ;"
-        )
-
-
-def wider_in_words(layout: Layout, wider: Sequence[str]) -> list[str]:
-    """A note on rows that `rows_of` left out."""
-    names = f"more cells than the {len(layout.columns)} names"
-    return [f"{len(wider)} rows left out: {names}, first {wider[0]!r}"] if wider else []
-
-
-def _require_same_names(layout: Layout, names: Sequence[str], row: Sequence[str]) -> None:
-    """Raise UserError where a line of names within the rows names other columns."""
-    again = [cell.strip("# \t") for cell in row]
-    while len(again) > len(names) and not again[-1]:
-        again.pop()
-    if again != list(names):
-        other = next((name for name in again if name not in names), "none")
-        raise UserError(
-            f"{layout.path}: the columns change in a further line of names, which has {other!r}: cut the file there "
-            "and import the parts"
-        )
+    layout = _layout(path, encoding, title, delimiter, [(number, row) for number, row in stripped if any(row)])
+    units = next((line.split("\t") for line in lines[:skipped] if line.startswith(_LABVIEW_UNITS)), [])
+    units += [""] * len(layout.columns)
+    columns = [
+        replace(each, unit=each.unit or known_unit(unit)) for each, unit in zip(layout.columns, units, strict=False)
+    ]
+    return replace(layout, columns=tuple(columns))
 
 
 def all_rows_of(layout: Layout) -> Iterator[list[str]]:
     """All rows of the file, those before the names, too. Raises UserError."""
+    if layout.delimiter == JSON:
+        yield from json_rows(layout.path)
+        return
     with layout.path.open(encoding=layout.encoding, errors=_AS_WINDOWS, newline="") as file:
         yield from _split(layout.path, _lines(layout.path, file), layout.delimiter)
 
@@ -270,9 +245,10 @@ def _layout(path: Path, encoding: str, title: str, delimiter: str, lines: Sequen
     alike = [[_kind(cell) for cell in row] for row in usual if len(row) == width]
     kinds = [_most_common(column) for column in zip(*alike, strict=True)]
     first = next((k for k, (_, row) in enumerate(lines) if _is_row(row, kinds)), len(lines))
+    first = _first_below_names(lines, first, kinds) if delimiter != JSON else 1
     if not any(kind in ("number", "time") for kind in kinds):
         first = next((k for k, (_, row) in enumerate(lines) if len(row) == width), 0) + 1
-    above = [(number, row) for number, row in lines[:first] if not all(map(_RULER.fullmatch, filter(None, row)))]
+    above = [(number, row) for number, row in lines[:first] if not _is_ruler(list(filter(None, row)))]
     head, written, second, units, about = _head(above, width)
     written = written or [f"column {k + 1}" for k in range(width)]
     if delimiter == BLANKS and len(written) == width - 1 and kinds[:2] == ["time", "time"]:
@@ -326,6 +302,22 @@ def _head(
                 names = [f"{top} {name}".strip() for top, name in zip(_held(second), names, strict=True)]
     about = {row[0].strip("# \t"): row[1] for _, row in rest if len(row) >= 2 and row[0]}
     return head, names, second, units, about
+
+
+def _first_below_names(lines: Sequence[tuple[int, list[str]]], first: int, kinds: Sequence[str]) -> int:
+    """The first row, which may have a text where others have numbers: those under a line of texts that are as wide, and
+    alike the others in some cell."""
+    rows = [row for _, row in lines[:first]]
+    alike = [any(_kind(cell) == kind != "text" for cell, kind in zip(row, kinds, strict=False) if kind) for row in rows]
+    below = next((k + 1 for k in reversed(range(first)) if not alike[k]), 0)
+    is_named = 0 < below < first and len(rows[below - 1]) == len(kinds) and all(rows[below - 1])
+    return below if is_named and all(len(row) == len(kinds) for row in rows[below:]) else first
+
+
+def _is_ruler(filled: Sequence[str]) -> bool:
+    """Whether a line is one, or the title of a section between two."""
+    is_title = len(filled) > 1 and all(len(each) > 1 for each in (filled[0], filled[-1]))
+    return all(map(_RULER.fullmatch, (filled[0], filled[-1]) if is_title else filled))
 
 
 def _are_units(cells: Sequence[str]) -> bool:

@@ -20,7 +20,10 @@ from fantwin.pipeline.errors import UserError
 from fantwin.pipeline.sources.tables.units import known_unit
 from fantwin.schemas.messages import Array
 
-NOT_MEASURED = {"", "nan", "na", "n/a", "#n/a", "null", "none", "nil", "-", "--", "---", "undefined", "inf", "-inf"}
+NOT_MEASURED = {
+    *("", "nan", "na", "n/a", "#n/a", "null", "none", "nil", "-", "--", "---", "undefined", "inf", "-inf"),
+    *("unavailable", "unknown", "offline"),
+}
 _NUMBER = re.compile(
     r"([-+\u2212]?)\s*((?:\d[\d.,'\u2019 \u00a0\u202f\u2009]*)?\d[.,]?|[.,]\d+)((?:[eE][-+]?\d+)?)\s*(\D.*)?"
 )
@@ -107,7 +110,8 @@ class Marks:
         point, comma: one whose decimal mark that is.
         unsure: one that leaves it open.
         ungrouped: whether a number of four digits or more has no thousands separator.
-        small: whether a whole number below 1000 has no mark, as where marks separate thousands.
+        small: whether a whole number below 1000 has no mark, as where marks separate thousands. plain: whether any has
+            none.
         unit: behind the numbers, as the table writes it.
     """
 
@@ -116,6 +120,7 @@ class Marks:
     unsure: str = ""
     ungrouped: bool = False
     small: bool = False
+    plain: bool = False
     unit: str = ""
 
     @classmethod
@@ -136,6 +141,7 @@ class Marks:
             self.comma = self.comma or text
         elif cell.mark:
             self.unsure = self.unsure or text
+        self.plain = self.plain or not cell.mark
         whole = re.split("[.,]", cell.digits)[0]
         self.ungrouped = self.ungrouped or (len(whole) > 3 and whole[0] != "0")
         self.small = self.small or (not cell.mark and len(whole) <= 3 and whole.strip("0") != "")
@@ -151,17 +157,20 @@ class Marks:
 
     @property
     def is_doubtful(self) -> bool:
-        """Whether marks may separate thousands: whole numbers without a mark are below 1000, all others have three
-        digits behind it."""
-        return bool(self.unsure and self.small and not (self.point or self.comma or self.ungrouped))
+        """Whether marks may be of either kind between columns with commas: all have three digits behind them, and other
+        numbers are below 1000 if marks are points, or there are none if they are commas."""
+        is_open = self.small if "." in self.unsure else not self.plain
+        return bool(self.unsure and is_open and not (self.point or self.comma or self.ungrouped))
 
 
 def file_decimal(marks: Sequence[Marks], delimiter: str) -> str:
     """The decimal mark of a file by all its columns; empty: they do not show it, or differ."""
+    if delimiter == ":":
+        return "."
     shown = {found for each in marks if (found := each.decimal)}
     if len(shown) == 1:
         return shown.pop()
-    doubtful = any(each.is_doubtful and "." in each.unsure for each in marks)
+    doubtful = any(each.is_doubtful for each in marks)
     return "." if delimiter == "," and not shown and not doubtful else ""
 
 

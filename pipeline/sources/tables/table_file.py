@@ -15,9 +15,10 @@ import numpy as np
 
 from fantwin.pipeline.errors import UsageError, UserError
 from fantwin.pipeline.sources.column_file import NO_TIME, Column, ColumnFile
-from fantwin.pipeline.sources.tables.layout import Layout, rows_of, wider_in_words
+from fantwin.pipeline.sources.tables.layout import Layout
 from fantwin.pipeline.sources.tables.numbers import NumberColumn, OtherMarkError
 from fantwin.pipeline.sources.tables.profiles import profile_of
+from fantwin.pipeline.sources.tables.rows import OddRows, rows_of
 from fantwin.pipeline.sources.tables.times import TimeColumn, time_names, usual_time
 from fantwin.pipeline.sources.tables.units import NS_PER_UNIT
 from fantwin.pipeline.sources.wanted import Wanted
@@ -49,11 +50,12 @@ class TableFile(ColumnFile):
 
     def read(self, names: Sequence[str]) -> Mapping[str, Column]:
         """See ColumnFile."""
-        wider: list[str] = []
+        odd = OddRows()
 
         def rows() -> Iterator[list[str]]:
-            wider.clear()
-            return rows_of(self._layout, wider)
+            nonlocal odd
+            odd = OddRows()
+            return rows_of(self._layout, odd)
 
         times, columns, count = read_cells(self._layout, self._time, names, self._wanted, rows)
         problem = None
@@ -74,7 +76,7 @@ class TableFile(ColumnFile):
             *of_times,
             *([self.title] if self._layout.head != 1 else []),
             *twice,
-            *wider_in_words(self._layout, wider),
+            *odd.in_words(self._layout),
         ]
         has_time = t_ns != NO_TIME
         found: dict[str, Column] = {}

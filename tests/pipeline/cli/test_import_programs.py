@@ -6,6 +6,7 @@ Each has the form of public files and reports: docs/reference/tried.md.
 from __future__ import annotations
 
 import json
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -62,6 +63,26 @@ def prometheus() -> str:
         for name, sensor, values in (("node_hwmon_fan_rpm", "fan1", SPEED), ("node_hwmon_pwm", "pwm1", COMMAND))
     ]
     return json.dumps({"status": "success", "data": {"resultType": "matrix", "result": result}})
+
+
+HOME = ("--command", "number.pwm", "--speed", "sensor.rpm:rpm")
+
+
+def changes(head: str = "", row: str = "", by: str = "\n") -> str:
+    """States of entities at their changes: commands, after a state that is no number, are few."""
+    rows = [("fan.rack", "on", 0.0)]
+    for t, (s, c) in enumerate(zip(SPEED.tolist(), COMMAND.tolist(), strict=True)):
+        rows += [] if t % 20 else [("number.pwm", str(c), t)]
+        rows += [("sensor.rpm", str(s), t)]
+    dated = (
+        {"id": id_, "x": x, "d": f"{datetime.fromtimestamp(EPOCH_S[0] + t, UTC):%Y-%m-%dT%H:%M:%S}Z"}
+        for id_, x, t in rows
+    )
+    if row:
+        return by.join([head, *(row.format(**each) for each in dated)])
+    return by.join(
+        json.dumps({"entity_id": each["id"], "state": each["x"], "last_changed": each["d"]}) for each in dated
+    )
 
 
 def blackbox(head: str, row: str) -> str:
@@ -121,6 +142,16 @@ PROGRAMS = {
         "entity_id,state,last_changed",
         "number.fan_pwm,{c},{d:%Y-%m-%dT%H:%M:%S}.000Z\nsensor.fan_rpm,{s},{d:%Y-%m-%dT%H:%M:%S}.000Z",
         ("--command", "number.fan_pwm", "--speed", "sensor.fan_rpm"),
+    ),
+    "Home Assistant: changes alone, in the order of time": Table(
+        changes(head="entity_id,state,last_changed", row="{id},{x},{d}"), "", HOME, t_s=EPOCH_S
+    ),
+    "Home Assistant: the answer of its interface": Table(f"[[{changes(by=', ')}]]", "", HOME, t_s=EPOCH_S),
+    "an object a line, and a line that is cut off": Table(
+        "",
+        '{{"t": {t}, "fan": {{"rpm": {s}, "on": true}}, "duty": {c}}}',
+        ("--command", "duty", "--speed", "fan.rpm"),
+        after='{"t": 60, "f',
     ),
     "InfluxDB: annotated, each result with its head": Table(
         influx(ANNOTATIONS, again=True), "", INFLUX_COLUMNS, t_s=EPOCH_S

@@ -85,6 +85,21 @@ TABLES = {
         ("several columns are called 'fan': the first is read; the next is 'fan [2]'",),
     ),
     "LabVIEW: heads before the names": Table(LABVIEW, "{t}.0\t{s}\t{c}"),
+    "LabVIEW: decimal commas, and units in a head": Table(
+        LABVIEW.replace("X0", "Y_Unit_Label\trpm\t%\nX0"), "{t},000000\t{s},000000\t{c},000000", NO_UNIT
+    ),
+    "a log that begins within a line": Table(
+        "1,840",
+        "{t},{s},{c}",
+        ("--time", "column 1:s", "--command", "column 3", "--speed", "column 2:rpm"),
+        ("1 rows left out: fewer cells than the 3 columns, first '1,840'",),
+    ),
+    "a row that is cut off": Table(
+        "t,pwm1,fan1",
+        "{t},{c},{s}",
+        notes=("1 rows with fewer cells than the 3 names: the others are taken as missing",),
+        other="{t},{c}",
+    ),
     # times
     "12 hours": Table(DATED, "{d:%m/%d/%Y %I:%M:%S %p},{s},{c}", notes=("month, day, year",), every_s=7560.0),
     "names of months and zones": Table(DATED, "{d:%d-%b-%Y %H:%M:%S} CEST,{s},{c}", t_s=EPOCH_S - 7200),
@@ -202,6 +217,14 @@ REFUSED = {
     "points that may separate thousands, between commas": (
         "\n".join([PLAIN, *(f"{k},{'890' if k % 9 == 0 else f'1.{320 + k % 5}'},40" for k in SECONDS)]),
         f"column 'fan1': '1.321' is 1321 or 1.321: {MARK}",
+    ),
+    "quoted commas with three digits behind each": (
+        "\n".join([PLAIN, *(f'{k},{s},"4{k % 10},125"' for k, s in enumerate(SPEED))]),
+        f"column 'pwm1': '40,125' is 40125 or 40.125: {MARK.replace('. or --decimal ,', ', or --decimal .')}",
+    ),
+    "JSON that is neither a list of objects nor an object a line": (
+        '{"fan1": {"rpm": 900, "pwm": 30},\n "when": "2026-06-09"}',
+        "JSON, of which an object a line or a list of objects is read, and this is neither: `jq -c '.KEY[]' table.csv",
     ),
     "both marks as decimal marks, and a cell that could have either": (
         "\n".join(["t;fan1;pwm1", *(f"{k};{'1,016' if k == 50 else '12,5' if k % 2 else '12.5'};40" for k in SECONDS)]),
