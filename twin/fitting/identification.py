@@ -212,11 +212,24 @@ def _filtered_start(pieces: Sequence[Run], top_speed_rad_s: Array, progress: Pro
 
 
 def _why_not(pieces: Sequence[Run], fan: int) -> str:
-    """Why the speed of a fan seems not to follow its command: it may be earlier than the command, by some samples."""
+    """Why the speed of a fan seems not to follow its command: gaps may leave nothing of it, its supply may fail, or it
+    may be earlier than the command, by some samples."""
+    longest = max(len(piece.command) for piece in pieces)
+    if longest <= 2 * MOST_AHEAD:
+        return f"gaps cut the recording into runs of {longest} samples at most: record without gaps"
+    command, speed = _pooled(pieces, fan)
+    is_lost = (speed == 0.0) & (command > np.median(command[speed != 0.0]))
+    if np.count_nonzero(is_lost) > 1:
+        return (
+            f"the speed is 0 in {np.count_nonzero(is_lost)} samples at commands from {command[is_lost].min():g}, and "
+            "not at lower ones: did its supply fail? Leave these rows out"
+        )
     steps = [np.diff((piece.command[:, fan], np.nan_to_num(piece.speed_rad_s[:, fan]))) for piece in pieces]
     size = np.sqrt(np.prod(sum(np.square(step).sum(axis=1) for step in steps)))
+    if not size > 0.0:
+        return "no command, or no speed, changes within a run: gaps cut the recording at each change"
     alike = [
-        sum(float(command[ahead:] @ speed[: len(speed) - ahead]) for command, speed in steps) / size
+        sum(float(command[ahead:] @ speed[: max(0, len(speed) - ahead)]) for command, speed in steps) / size
         for ahead in range(MOST_AHEAD + 1)
     ]
     ahead = int(np.argmax(alike))

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from bench.training.published_fan import published_fan
+from fantwin.schemas.messages import Array
 from fantwin.twin.errors import TwinError
 from fantwin.twin.fitting.identifiability import short_warnings
 from fantwin.twin.fitting.identification import Identification, identify
@@ -94,6 +95,26 @@ def test_a_speed_that_is_ahead_of_its_command_is_refused_with_what_the_times_of_
     speed_rad_s = np.roll(3.0 * command, -2, axis=0) + rng.normal(0.0, 0.5, command.shape)
     with pytest.raises(TwinError, match="fan 0: the speed changes about 2 s before the command does"):
         identify([Run("early", np.arange(len(command), dtype=np.float64), command, speed_rad_s)])
+
+
+STEPS = np.array([20.0, 40.0, 60.0, 80.0, 90.0, 100.0])
+
+
+@pytest.mark.parametrize(
+    ("command", "lost", "words"),
+    [
+        (np.tile(STEPS, (8, 1)), 0, "gaps cut the recording into runs of 6 samples at most"),
+        (np.resize(STEPS, (8, 1)).repeat(20, axis=1), 0, "no command, or no speed, changes within a run"),
+        (np.tile(STEPS.repeat(5), (8, 1)), 9, "the speed is 0 in 72 samples at commands from 90"),
+    ],
+)
+def test_gaps_and_a_supply_that_fails_are_said(command: Array, lost: int, words: str) -> None:
+    """Runs of a fan that settles within a sample. command: (runs, samples)."""
+    speed_rad_s = 3.0 * command + np.random.default_rng(1).normal(0.0, 1.0, command.shape)
+    speed_rad_s[:, command.shape[1] - lost :] = 0.0
+    t_s = 2.0 * np.arange(command.shape[1])
+    with pytest.raises(TwinError, match=words):
+        identify([Run("", 1000.0 * k + t_s, command[k, :, None], speed_rad_s[k, :, None]) for k in range(8)])
 
 
 def test_a_recording_of_few_time_constants_is_said_to_be_too_short_before_anything_else() -> None:
