@@ -276,7 +276,7 @@ def _table(part: Contents) -> Table:
             missing,
             str(counts.duplicated),
             *("" if t_ns is None else format_clock(t_ns) for t_ns in (counts.first_ns, counts.last_ns)),
-            "" if rate_hz is None else f"{rate_hz:.1f}",
+            "" if rate_hz is None else f"{rate_hz:.1f}" if rate_hz >= 1.0 else f"{rate_hz:.2g}",
         )
     for topic, messages in sorted(part.others.items()):
         table.add_row(escape(topic), str(messages), "", "", "", "", "", style="dim")

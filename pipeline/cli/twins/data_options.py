@@ -62,7 +62,7 @@ TestOption: TypeAlias = Annotated[
 ]
 FansOption: TypeAlias = Annotated[str | None, typer.Option(help="Only these fans, counted from 0, e.g. 0,2-5.")]
 
-TACHO_ADVICE = "see `tacho` in [[tray]], or --window for recordings that do not say"
+TACHO_ADVICE = "see `tacho` in [[tray]], or import the table again with --tacho"
 TACHO_CONSEQUENCE = (
     "hint: if so, the delay of the tacho is taken for inertia, and what follows, warnings too, may come from that"
 )
