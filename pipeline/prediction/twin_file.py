@@ -121,8 +121,8 @@ def _of_tray(tray: TrayConfig, path: Path, twin: TwinFile) -> TwinFile:
     if twin.tachos != of_tray and any(tacho.window_s > 0.0 for tacho in twin.tachos):
         raise StageError(
             f"{path}: the twin was trained on readings by {_text(twin.tachos)}, but those of the tray are by "
-            f"{_text(of_tray)}: correct tacho (of a table: import it again with --tacho), or train a twin on recordings "
-            "of this tray"
+            f"{_text(of_tray)}: correct tacho (of a table: import it again with --tacho), or train a twin on "
+            "recordings of this tray"
         )
     return twin
 

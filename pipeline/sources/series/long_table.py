@@ -32,6 +32,8 @@ _TOO_MANY_BACK = 0.1
 _MOSTLY = 0.5
 _ANNOTATION = "#"
 _FIELD, _VALUE, _TIME = "_field", "_value", "_time"
+_ENTITY, _STATE = "entity_id", "state"
+"""of Home Assistant"""
 _NOT_TAGS = {"", "result", "table", "_start", "_stop", _TIME, _VALUE, _FIELD}
 _NUMBER_TYPES = ("long", "double", "unsignedLong")
 _LIKE_A_KEY = re.compile(
@@ -154,6 +156,8 @@ def _of_any(layout: Layout, time: str | None) -> _Columns | None:
     of_time = time_names(layout, time)[0] if time else []
     if not time or not all(name in layout.all_names for name in of_time):
         return None
+    if {_ENTITY, _STATE} <= set(layout.names):
+        return _Columns(tuple(layout.names), time, (_ENTITY,), (_STATE,))
     others = [each for each in layout.columns if each.name and each.name not in of_time]
     numbers = [each for each in others if each.kind == "number"]
     likely = [each.name for each in numbers if len(numbers) > 1 and _is_number_of_fan(each)]

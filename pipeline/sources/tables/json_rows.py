@@ -69,11 +69,16 @@ def _loaded(text: str) -> Any:
 
 
 def _in_one(value: Any) -> list[Mapping[str, Any]]:
-    """The objects of a list, or of lists within it; none: it has others."""
-    if not isinstance(value, list):
-        return []
-    inner = [each for part in value for each in (part if isinstance(part, list) else [part])]
-    return inner if all(isinstance(each, Mapping) for each in inner) else []
+    """The objects of a list, or of lists within it; none: it has others. Home Assistant names an entity only in the
+    first object of its list."""
+    found: list[Mapping[str, Any]] = []
+    for part in value if isinstance(value, list) else ():
+        inner = part if isinstance(part, list) else [part]
+        if not all(isinstance(each, Mapping) for each in inner):
+            return []
+        named = {key: inner[0][key] for key in ("entity_id",) if inner and key in inner[0]}
+        found += [named | each for each in inner]
+    return found
 
 
 def _flat(value: Any, name: str = "") -> Iterator[tuple[str, str]]:

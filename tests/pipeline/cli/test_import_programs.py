@@ -68,21 +68,30 @@ def prometheus() -> str:
 HOME = ("--command", "number.pwm", "--speed", "sensor.rpm:rpm")
 
 
-def changes(head: str = "", row: str = "", by: str = "\n") -> str:
-    """States of entities at their changes: commands, after a state that is no number, are few."""
-    rows = [("fan.rack", "on", 0.0)]
-    for t, (s, c) in enumerate(zip(SPEED.tolist(), COMMAND.tolist(), strict=True)):
-        rows += [] if t % 20 else [("number.pwm", str(c), t)]
-        rows += [("sensor.rpm", str(s), t)]
-    dated = (
-        {"id": id_, "x": x, "d": f"{datetime.fromtimestamp(EPOCH_S[0] + t, UTC):%Y-%m-%dT%H:%M:%S}Z"}
-        for id_, x, t in rows
-    )
-    if row:
-        return by.join([head, *(row.format(**each) for each in dated)])
-    return by.join(
-        json.dumps({"entity_id": each["id"], "state": each["x"], "last_changed": each["d"]}) for each in dated
-    )
+STATES = [
+    ("fan.rack", "on", 0.0),
+    *(("number.pwm", c, t) for t, c in enumerate(COMMAND.tolist()) if not t % 20),
+    *(("sensor.rpm", s, t) for t, s in enumerate(SPEED.tolist())),
+]
+"""of Home Assistant: of its commands the changes alone"""
+
+
+def iso(t: float) -> str:
+    """The date of a time of the rows."""
+    return datetime.fromtimestamp(EPOCH_S[0] + t, UTC).isoformat()
+
+
+def answer_of_home_assistant() -> str:
+    """A list of states for each entity, which only the first of them names."""
+    of_each: dict[str, list[dict[str, object]]] = {}
+    for entity, state, t in STATES:
+        date = iso(t)
+        known = of_each.setdefault(entity, [])
+        full: dict[str, object] = (
+            {} if known else {"entity_id": entity, "attributes": {"unit_of_measurement": "?"}, "last_updated": date}
+        )
+        known.append(full | {"state": str(state), "last_changed": date})
+    return json.dumps(list(of_each.values()), indent=1)
 
 
 def blackbox(head: str, row: str) -> str:
@@ -144,9 +153,17 @@ PROGRAMS = {
         ("--command", "number.fan_pwm", "--speed", "sensor.fan_rpm"),
     ),
     "Home Assistant: changes alone, in the order of time": Table(
-        changes(head="entity_id,state,last_changed", row="{id},{x},{d}"), "", HOME, t_s=EPOCH_S
+        "\n".join(
+            [
+                "entity_id,state,last_changed",
+                *(f"{entity},{x},{iso(t)}" for entity, x, t in sorted(STATES, key=lambda each: each[2])),
+            ]
+        ),
+        "",
+        HOME,
+        t_s=EPOCH_S,
     ),
-    "Home Assistant: the answer of its interface": Table(f"[[{changes(by=', ')}]]", "", HOME, t_s=EPOCH_S),
+    "Home Assistant: the answer of its interface": Table(answer_of_home_assistant(), "", HOME, t_s=EPOCH_S),
     "an object a line, and a line that is cut off": Table(
         "",
         '{{"t": {t}, "fan": {{"rpm": {s}, "on": true}}, "duty": {c}}}',
