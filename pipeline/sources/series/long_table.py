@@ -37,7 +37,8 @@ _ENTITY, _STATE = "entity_id", "state"
 _NOT_TAGS = {"", "result", "table", "_start", "_stop", _TIME, _VALUE, _FIELD}
 _NUMBER_TYPES = ("long", "double", "unsignedLong")
 _LIKE_A_KEY = re.compile(
-    r"(?i)(.*[._ ])?(fan|series|sensor|metric|field|name|id|slot|motor|esc|instance|channel|unit|device|host|tags?)"
+    r"(?i)(.*[._ ])?(fan|series|sensor|metric|field|name|id|slot|motor|esc|instance|channel|unit|device|host|tags?"
+    r"|itemid)"
 )
 
 

@@ -50,12 +50,14 @@ def _records(path: Path) -> Iterator[Mapping[str, str]]:
     if path.stat().st_size > MOST_BYTES:
         raise UserError(f"{path}: larger than {MOST_BYTES >> 20} MiB; write an object a line, with `jq -c '.[]'`")
     whole = _loaded(path.read_text(encoding="utf-8-sig", errors="replace"))
+    if whole is None:
+        raise UserError(f"{path}: damaged JSON, or cut off: `jq . {path.name}` names the place")
     lists = whole.values() if isinstance(whole, Mapping) else [whole]
-    rows = next((each for each in map(_in_one, lists) if each), None)
+    rows = next((each for each in map(_in_one, lists) if len(each) > 1), None)
     if rows is None:
         raise UserError(
             f"{path}: JSON, of which an object a line or a list of objects is read, and this is neither: "
-            f"`jq -c '.KEY[]' {path.name} > rows.jsonl` makes one"
+            f"make one, for example with `jq -c '.KEY[]' {path.name} > rows.jsonl`"
         )
     yield from (dict(_flat(each)) for each in rows)
 

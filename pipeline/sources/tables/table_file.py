@@ -66,7 +66,10 @@ class TableFile(ColumnFile):
         of_times = times.notes if times else []
         if times:
             self.times, self.assumed = f"{times.name}, {times.format}", times.assumed
-            of_times = [*([f"times of {times.name!r}: {times.format}"] if times.is_notable else []), *of_times]
+            of_times = [
+                *([f"times of {times.name!r}: {times.format}"] if times.is_notable and times.format else []),
+                *of_times,
+            ]
         twice = [
             f"several columns are called {name!r}: the first is read; the next is {f'{name} [2]'!r}"
             for name in names

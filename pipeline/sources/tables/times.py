@@ -27,7 +27,7 @@ _YEAR_2000_NS = 946_684_800 * NS_PER_S
 _DAY, _NS_PER_DAY, _DAYS_TO_1970 = "days", 86_400 * NS_PER_S, 25_569
 _FIRST_DAY, _LAST_DAY = 30_000, 60_000
 """dates as spreadsheets count them, from 1982 to 2064"""
-_USUAL = ("time", "timestamp", "t", "date", "datetime", "zeit", "_time", "datum", "elapsed", "ts", "x_value")
+_USUAL = ("time", "timestamp", "t", "date", "datetime", "zeit", "_time", "datum", "elapsed", "ts", "x_value", "clock")
 """names of columns of times"""
 TIME_UNITS = (*NS_PER_UNIT, DATE_UNIT)
 

@@ -164,6 +164,21 @@ PROGRAMS = {
         t_s=EPOCH_S,
     ),
     "Home Assistant: the answer of its interface": Table(answer_of_home_assistant(), "", HOME, t_s=EPOCH_S),
+    "Zabbix: the answer to history.get": Table(
+        json.dumps(
+            {
+                "jsonrpc": "2.0",
+                "result": [
+                    {"itemid": item, "clock": str(int(EPOCH_S[0]) + t), "value": str(each), "ns": "7"}
+                    for t, both in enumerate(zip(SPEED, COMMAND, strict=True))
+                    for item, each in zip(("231", "232"), both, strict=True)
+                ],
+            }
+        ),
+        "",
+        ("--command", "value{232}", "--speed", "value{231}:rpm"),
+        t_s=EPOCH_S,
+    ),
     "an object a line, and a line that is cut off": Table(
         "",
         '{{"t": {t}, "fan": {{"rpm": {s}, "on": true}}, "duty": {c}}}',

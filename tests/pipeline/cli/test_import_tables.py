@@ -224,7 +224,11 @@ REFUSED = {
     ),
     "JSON that is neither a list of objects nor an object a line": (
         '{"fan1": {"rpm": 900, "pwm": 30},\n "when": "2026-06-09"}',
-        "JSON, of which an object a line or a list of objects is read, and this is neither: `jq -c '.KEY[]' table.csv",
+        "JSON, of which an object a line or a list of objects is read, and this is neither: make one, for example with `jq -c '.KEY[]' table.csv",
+    ),
+    "JSON that is cut off": (
+        '[{"t": 0, "fan1": 900},\n{"t": 1,',
+        "damaged JSON, or cut off: `jq . table.csv` names the place",
     ),
     "both marks as decimal marks, and a cell that could have either": (
         "\n".join(["t;fan1;pwm1", *(f"{k};{'1,016' if k == 50 else '12,5' if k % 2 else '12.5'};40" for k in SECONDS)]),
