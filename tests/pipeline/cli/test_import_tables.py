@@ -224,7 +224,7 @@ REFUSED = {
     ),
     "JSON that is neither a list of objects nor an object a line": (
         '{"fan1": {"rpm": 900, "pwm": 30},\n "when": "2026-06-09"}',
-        "JSON, of which an object a line or a list of objects is read, and this is neither: make one, for example with `jq -c '.KEY[]' table.csv",
+        "and this is neither: make one, for example with `jq -c '.KEY[]' table.csv > rows.jsonl`",
     ),
     "JSON that is cut off": (
         '[{"t": 0, "fan1": 900},\n{"t": 1,',
