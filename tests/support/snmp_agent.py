@@ -6,7 +6,7 @@ import asyncio
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any, cast
+from typing import Any
 
 from pysnmp.carrier.asyncio.dgram import udp
 from pysnmp.entity import config, engine
@@ -59,7 +59,7 @@ def snmp_agent(agent: Agent, port: int) -> Iterator[None]:
         config.add_vacm_user(served, 3, USER, "authPriv", (1, 3, 6), (1, 3, 6))
         there = context.SnmpContext(served)
         there.unregister_context_name(b"")
-        there.register_context_name(b"", cast(Any, agent))  # pyright: ignore[reportArgumentType]
+        there.register_context_name(b"", agent)  # pyright: ignore[reportArgumentType]
         cmdrsp.GetCommandResponder(served, there)
         cmdrsp.BulkCommandResponder(served, there)
         await asyncio.sleep(0)  # the transport opens its socket
