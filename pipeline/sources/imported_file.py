@@ -55,8 +55,10 @@ def open_file(path: Path, wanted: Wanted) -> ColumnFile:
         return file
     layout = find_layout(path)
     table = TableFile(layout, wanted)
-    asked = (*wanted.command, *(with_unit(each, table.names, SPEED_UNITS)[0] for each in wanted.speed))
-    if not is_annotated(layout) and not any(each not in table.names for each in asked) and (asked or profile_of(table)):
+    speeds = {with_unit(each, table.names, SPEED_UNITS)[0] for each in wanted.speed}
+    asked = speeds | set(wanted.command)
+    is_there = asked <= set(table.names) and speeds.isdisjoint(wanted.command)  # of a long table, one may be both
+    if not is_annotated(layout) and is_there and (asked or profile_of(table)):
         return table
     try:
         return long_table(layout, wanted) or table

@@ -76,8 +76,6 @@ def fan_columns(
     fans = [fan for fan in of_speed if fan in of_command]
     if not fans:
         raise UserError(f"{where}: no fan has both {command[0]} and {speeds[0]}")
-    if twice := [of_speed[fan] for fan in fans if of_speed[fan] == of_command[fan]]:
-        raise UsageError(f"{where}: {twice[0]!r} is named as command and as speed: a fan needs a column of each")
     left_out = [name for fan, name in (*of_command.items(), *of_speed.items()) if fan not in fans]
     others = {channel: _for_fans(where, names, given, fans, channel) for channel, given in auxiliary.items()}
     return FanColumns(
