@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import time
 from collections.abc import Iterator
@@ -22,6 +23,17 @@ settings.load_profile("house")
 # Quiet hours and times in messages are those of the host, and hosts differ.
 os.environ["TZ"] = "UTC"
 time.tzset()
+
+
+def pytest_collectstart() -> None:
+    """Look for no garbage among what is being imported: it is half a million objects, and stays."""
+    gc.disable()
+
+
+def pytest_collection_finish() -> None:
+    """Look for it again, but not among those."""
+    gc.freeze()
+    gc.enable()
 
 
 @pytest.hookimpl(trylast=True)
