@@ -33,7 +33,8 @@ SHORTEST = 0.02
 STARTS = ((SHORTEST, 1.0), (SHORTEST, 0.0), (0.2, 1.0), (0.5, 1.0), (1.0, 1.0), (1.0, 0.0), (2.0, 0.5))
 PART_SAMPLES, MOST_PARTS = 500, 12
 """samples of a part of the runs, and parts from which the time constant is found; speeds are from all"""
-FORGETS = 3
+FORGETS, FEWEST = 3, 10
+"""first samples of a part, which are not compared, and fewest of a fan that are"""
 ROBUST_PASSES, HUBER = 3, 3.0
 MAD = 1.4826
 """standard deviation of a normal distribution in its median absolute deviation"""
@@ -114,6 +115,9 @@ def fit_static(runs: Sequence[Run]) -> StaticFit:
     period_s = float(np.median(np.concatenate([np.diff(piece.t_s) for piece in pieces])))
     model = StaticModel(_knots(np.concatenate([piece.command.ravel() for piece in pieces])))
     fits = [_FanFit(model, pieces, fan, period_s) for fan in range(pieces[0].fans)]
+    for fan, each in enumerate(fits):
+        if len(each.measured()) < FEWEST:
+            raise TwinError(f"fan {fan}: fewer than {FEWEST} measured speeds after steps without a gap")
     found = [each.best() for each in fits]
     residuals = [each.residual(parameters) for each, parameters in zip(fits, found, strict=True)]
     tops = [float(np.abs(each.measured()).max()) for each in fits]
