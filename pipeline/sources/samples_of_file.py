@@ -95,7 +95,8 @@ def samples_of(path: Path, file: ColumnFile, wanted: Wanted) -> Table:
         of_units.append(f"--poles is for speeds in erpm, and has no effect on {shown}")
     left_out += _impossible(chosen, values, rad_s)
     table = table_of(path, chosen, values, t_ns, rad_s, shown, longest_part=not file.is_rows)
-    if twice := [speed for command, speed in zip(chosen.command, chosen.speed, strict=True) if command == speed]:
+    twice = [speed for command, speed in zip(chosen.command, chosen.speed, strict=True) if command == speed]
+    if wanted.has_command and twice:
         raise UsageError(f"{path}: {twice[0]!r} is named as command and as speed: a fan needs a column of each")
     example = f"--speed {shlex.quote(f'{(*wanted.speed, *chosen.speed)[0]}:rpm')}"
     remarks = (

@@ -25,6 +25,7 @@ class Wanted:
         zone: time zone of dates without one.
         decimal: decimal mark of the numbers.
         poles: magnetic poles of the motors, for electrical speeds.
+        has_command: false where the file has none, and `command` names the speeds in its place.
 
     Raises:
         UsageError: there is no such order or mark, or both times and their period are given.
@@ -39,6 +40,7 @@ class Wanted:
     zone: str = ""
     decimal: str = ""
     poles: int | None = None
+    has_command: bool = True
 
     def __post_init__(self) -> None:
         if self.time and self.period:

@@ -178,7 +178,7 @@ def _without_command(paths: Sequence[Path], wanted: Wanted, name: str | None) ->
         UsageError: none was chosen.
     """
     columns = [each.rpartition(":")[0] if each.rpartition(":")[2] in SPEED_UNITS else each for each in wanted.speed]
-    table = read_files(paths, replace(wanted, command=columns))
+    table = read_files(paths, replace(wanted, command=columns, has_command=False))
     found = stand_ins_of(table.speed_rad_s, table.auxiliary)
     if name is None:
         offers = "".join(f"; or {each.words(table.fans)}" for each in found)

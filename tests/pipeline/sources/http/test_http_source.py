@@ -70,7 +70,7 @@ def ask(source: HttpSource, body: Any = None, path: str = "", **headers: str) ->
 
 def test_an_answer_says_what_became_of_each_sample() -> None:
     source = source_of()
-    wrong = [SAMPLE | {"command": [2, 0]}, SAMPLE | {"speed": [1]}, {"speed": 1}]
+    wrong = [SAMPLE | {"command": [2, 0]}, SAMPLE | {"speed": [1]}, {"command": [0, 0]}]
     with running(source) as events:
         assert ask(source, SAMPLE)[:2] == (200, {"accepted": 1, "refused": 0})
         status, answer, _ = ask(source, [SAMPLE, *wrong, {"command": [0, 0], "speed": [9000, 1]}])
