@@ -19,7 +19,7 @@ from fantwin.simulation.plant import varied
 FANS = 2
 """of a server"""
 STEP_S, SHOWN_S = 0.05, 1.0
-STEP_RPM = 10.0
+STEP_RPM, FIRST_RPM = 10.0, 6_000.0
 FAN = FourPinParameters(
     speed_max_rad_s=15_000.0 * RPM,
     speed_min_rad_s=2_500.0 * RPM,
@@ -60,10 +60,11 @@ class HallFans:
         rng = np.random.default_rng([seed, 1])
         fans = FANS * servers
         plant = FourPinFans(varied(FAN, VARYING_PARAMETERS, fans, 1, VARIATION), np.random.default_rng([seed, 2]), FANS)
+        plant.speed_rad_s = np.full(fans, FIRST_RPM * RPM)  # the hall has been running
         duty = integral = np.full(servers, 40.0)
         load_c, load = np.full(servers, 50.0), rng.random(servers)
         jumps_s, controls_s, shows_s = rng.uniform(5.0, 300.0, servers), rng.random(servers), rng.random(fans)
-        shown, last = np.zeros(fans), np.zeros((round(1.0 / STEP_S), fans))
+        shown, last = np.full(fans, FIRST_RPM), np.full((round(1.0 / STEP_S), fans), FIRST_RPM)
         steps = round(seconds / STEP_S)
         self.duty, self.rpm = np.zeros((steps, servers), np.float32), np.zeros((steps, fans), np.float32)
         for step in range(steps):

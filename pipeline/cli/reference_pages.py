@@ -68,7 +68,8 @@ def _about(click: Any, name: str) -> str:
         obj=click.commands[name], ctx=typer.Context(click), indent=2, name=name, call_prefix="fantwin"
     )
     examples = _EXAMPLE.sub(lambda found: f"    {' '.join(found[1].split())}\n", about)
-    return f"{_CHOICE.sub(_choice, _OF_ALL.sub('', examples)).strip()}\n"
+    own = _CHOICE.sub(_choice, _OF_ALL.sub("", examples)).replace(" range>`", ">`")  # the bounds follow
+    return f"{own.strip()}\n"
 
 
 def _choice(found: re.Match[str]) -> str:
