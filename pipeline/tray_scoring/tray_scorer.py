@@ -235,7 +235,8 @@ class TrayScorer(Saved):
             is_now = against.kind[row] > 0
             self._kind = np.where(is_now, against.kind[row], self._kind)
             is_loose = (self._kind == NO_READING) & decision.missing.explains_silence
-            self._stands = against.active[row] & ~is_loose & (self._stands | (is_now & ~decision.wrong.may_be))
+            may_be_wrong = decision.wrong.may_be & one.judged  # of the last reading that was compared with the twin
+            self._stands = against.active[row] & ~is_loose & (self._stands | (is_now & ~may_be_wrong))
         score = decision.score
         is_steady = one.judged & ~self._stands & ~decision.has_alarm & (score < ScoreColumns.SUSPECT_FROM)
         self.wear.update(one.t_ns, is_steady, lambda: decision.model.age)

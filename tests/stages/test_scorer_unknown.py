@@ -165,3 +165,13 @@ def test_commissioning_ends_the_alarm_of_a_fan_whose_line_is_silent() -> None:
     fan.take(request_of(Action.COMMISSION))
     fan.runs(1.0, np.nan, InvalidReason.STALE)
     assert not fan.alarms[-1].active
+
+
+def test_a_fan_that_stands_beyond_the_range_of_its_twin_has_an_alarm_whatever_its_last_judged_reading_was() -> None:
+    fan = Fan(core_of(standstill=STANDS), 1)
+    fan.runs(60.0)
+    fan.runs(1.0, TWIN_SPEED * 1.2)  # far, and the last that is compared with the twin: it may be wrong
+    fan.runs(30.0, reason=InvalidReason.OUT_OF_RANGE)
+    fan.runs(10.0, 0.0, InvalidReason.OUT_OF_RANGE, noise_rad_s=0.0)
+    assert [alarm.transition for alarm in fan.alarms][:1] == [Transition.RAISED]
+    assert "does not turn although commanded" in fan.alarms[0].message
