@@ -69,8 +69,8 @@ HOME = ("--command", "number.pwm", "--speed", "sensor.rpm:rpm")
 
 
 STATES = [
-    ("fan.rack", "on", 0.0),
-    *(("number.pwm", c, t) for t, c in enumerate(COMMAND.tolist()) if not t % 20),
+    ("fan.rack", "on", -0.5),
+    *(("number.pwm", c, t - 0.125) for t, c in enumerate(COMMAND.tolist()) if not t % 20),
     *(("sensor.rpm", s, t) for t, s in enumerate(SPEED.tolist())),
 ]
 """of Home Assistant: of its commands the changes alone"""
@@ -161,6 +161,7 @@ PROGRAMS = {
         ),
         "",
         HOME,
+        ("long table, 2 series by 'entity_id'", "'state': 1 cell with text that is no number, first 'on' in row 1"),
         t_s=EPOCH_S,
     ),
     "Home Assistant: the answer of its interface": Table(answer_of_home_assistant(), "", HOME, t_s=EPOCH_S),

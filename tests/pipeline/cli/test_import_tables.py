@@ -86,7 +86,9 @@ TABLES = {
     ),
     "LabVIEW: heads before the names": Table(LABVIEW, "{t}.0\t{s}\t{c}"),
     "LabVIEW: decimal commas, and units in a head": Table(
-        LABVIEW.replace("X0", "Y_Unit_Label\trpm\t%\nX0"), "{t},000000\t{s},000000\t{c},000000", NO_UNIT
+        LABVIEW.replace("X0", "Y_Unit_Label\trpm\t%\nX0").replace("fan1\tpwm1", "speed\tset"),
+        "{t},000000\t{s},000000\t{c},000000",
+        ("--command", "set", "--speed", "speed"),
     ),
     "a log that begins within a line": Table(
         "1,840",
