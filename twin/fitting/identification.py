@@ -104,7 +104,7 @@ def identify(runs: Sequence[Run], *, progress: Progress = unreported) -> Identif
     """Identify every fan of the runs. Raises TwinError when the data do not determine the parameters."""
     fans = common_fans(runs)
     pieces = [piece for run in runs for piece in run.split_at_gaps()]
-    closed_loop = np.array([_in_a_loop(pieces, fan) for fan in range(fans)])
+    closed_loop = np.array([in_a_loop(pieces, fan) for fan in range(fans)])
     top_speed = np.array([_top_speed_rad_s(_pooled(pieces, fan)[1]) for fan in range(fans)])
     start, lambda_per_s = _filtered_start(pieces, top_speed, progress)
     speed = np.array([np.nanmedian(_pooled(pieces, fan)[1]) for fan in range(fans)])
@@ -147,7 +147,7 @@ def identify(runs: Sequence[Run], *, progress: Progress = unreported) -> Identif
     )
 
 
-def _in_a_loop(pieces: Sequence[Run], fan: int) -> bool:
+def in_a_loop(pieces: Sequence[Run], fan: int) -> bool:
     """Whether the command of a fan answers its speed. Raises TwinError where nothing else has moved it."""
     require_excitation(pieces, fan)
     is_closed = feedback_share(pieces, fan) > 0.0

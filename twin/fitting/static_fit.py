@@ -17,7 +17,8 @@ from scipy.optimize import lsq_linear, minimize
 from fantwin.schemas.tacho import INSTANTANEOUS
 from fantwin.schemas.twin_card import BalanceCard
 from fantwin.twin.errors import TwinError
-from fantwin.twin.fitting.identification import Identification, require_excitation
+from fantwin.twin.fitting.damped_least_squares import Flags
+from fantwin.twin.fitting.identification import Identification, in_a_loop
 from fantwin.twin.fitting.reference_choice import LEAST_GAIN, AtReference
 from fantwin.twin.models.static import STATIC_PARAMETERS, StaticModel, follow
 from fantwin.twin.reference import at_reference, reference_of
@@ -54,6 +55,7 @@ class StaticFit:
     rmse_rad_s: Array
     r2: Array
     top_speed_rad_s: Array
+    closed_loop: Flags
     period_s: float
 
     @property
@@ -81,7 +83,7 @@ class StaticFit:
             iterations=0,
             warnings=(),
             misfits=(),
-            closed_loop=np.zeros(fans, np.bool_),
+            closed_loop=self.closed_loop,
         )
 
     @property
@@ -108,10 +110,13 @@ class StaticFit:
 
 
 def fit_static(runs: Sequence[Run]) -> StaticFit:
-    """The static model of every fan. Raises TwinError where a command or a speed never changes."""
+    """The static model of every fan.
+
+    Raises:
+        TwinError: a command or a speed never changes, or only as a controller answers noise.
+    """
     pieces = [piece for run in runs for piece in run.split_at_gaps()]
-    for fan in range(common_fans(runs)):
-        require_excitation(pieces, fan)
+    closed_loop = np.array([in_a_loop(pieces, fan) for fan in range(common_fans(runs))])
     period_s = float(np.median(np.concatenate([np.diff(piece.t_s) for piece in pieces])))
     model = StaticModel(_knots(np.concatenate([piece.command.ravel() for piece in pieces])))
     fits = [_FanFit(model, pieces, fan, period_s) for fan in range(pieces[0].fans)]
@@ -130,6 +135,7 @@ def fit_static(runs: Sequence[Run]) -> StaticFit:
         rmse_rad_s=np.sqrt(squares),
         r2=1.0 - squares / spread,
         top_speed_rad_s=np.array(tops),
+        closed_loop=closed_loop,
         period_s=period_s,
     )
 

@@ -7,7 +7,8 @@ import pytest
 
 from fantwin.schemas.units import RAD_S_PER_UNIT
 from fantwin.twin.build import evaluate, train_twin
-from fantwin.twin.fitting.static_fit import static_instead
+from fantwin.twin.errors import TwinError
+from fantwin.twin.fitting.static_fit import fit_static, static_instead
 from fantwin.twin.runs import Run
 from tests.support.slow_lines import slow_line
 
@@ -39,7 +40,7 @@ def test_the_kind_follows_from_time_constant_and_samples_and_none_is_refused(
     period_s: float, time_constant_s: float, synchronous: bool, kind: str
 ) -> None:
     twin = train_twin([run_of(period_s, time_constant_s, 1, synchronous=synchronous)], [], "physical", name="x")
-    assert twin.card.kind == kind
+    assert (twin.card.kind, twin.card.closed_loop) == (kind, (False,))
     held_out = run_of(period_s, time_constant_s, 2, synchronous=synchronous)
     noise = 0.003 * float(held_out.speed_rad_s.mean())
     found = evaluate(twin, [held_out]).pooled
@@ -54,3 +55,28 @@ def test_a_speed_that_does_not_follow_its_command_has_no_static_twin() -> None:
     shuffled = Run("x", run.t_s, np.random.default_rng(1).permutation(run.command), run.speed_rad_s)
     assert static_instead([run], [], None) is not None
     assert static_instead([shuffled], [], None) is None
+
+
+def loop_of(set_points_rad_s: list[float]) -> Run:
+    """A fan sampled every 15 s, whose controller answers the speed that the load disturbs."""
+    samples = 700
+    wanted = np.repeat(set_points_rad_s, samples // len(set_points_rad_s))
+    load = 6.0 * np.random.default_rng(1).standard_normal(samples)
+    command, speed = np.empty(samples), np.empty(samples)
+    command[0] = 0.4 * wanted[0]
+    for k in range(samples):
+        speed[k] = 2.5 * command[k] + load[k]
+        if k + 1 < samples:
+            command[k + 1] = command[k] + 0.3 * (wanted[k] - speed[k])
+    return Run("loop", 15.0 * np.arange(samples), command, speed)
+
+
+def test_a_static_twin_knows_that_its_fan_is_in_a_loop() -> None:
+    assert train_twin([loop_of([100.0, 180.0, 140.0, 220.0, 120.0])], [], "static", name="x").card.closed_loop == (True,)
+
+
+def test_a_loop_at_one_set_point_has_no_static_twin() -> None:
+    run = loop_of([180.0])
+    with pytest.raises(TwinError, match="closed loop at one set-point"):
+        fit_static([run])
+    assert static_instead([run], [], None) is None
