@@ -25,6 +25,7 @@ from fantwin.pipeline.runtime.stage import Core
 from fantwin.pipeline.sources.push.source import PushSource
 from fantwin.pipeline.sources.source import (
     LinkUp,
+    Noted,
     Reading,
     ReadingBatch,
     ReadingLimits,
@@ -219,7 +220,9 @@ class AcquisitionCore(Core):
             self._counts["bytes"] += batch.byte_count
         for name, count in batch.device_counts.items():
             self._counts[f"device_{name}"] += count
-        self._quality.add_input(batch.received_t_ns)
+        is_note = len(batch.items) > 0 and all(isinstance(item, Noted) for item in batch.items)
+        if not is_note:  # several come with one reading, and would make a slow source seem fast
+            self._quality.add_input(batch.received_t_ns)
         self._now_ns = max(self._now_ns, batch.received_t_ns)
         for item in batch.items:
             reading = self._plausibility.plausible(item)

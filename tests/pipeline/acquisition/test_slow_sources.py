@@ -8,7 +8,7 @@ from fantwin.pipeline.acquisition.acquisition_core import AcquisitionCore
 from fantwin.pipeline.acquisition.sample_blocks import ReadingBlock
 from fantwin.pipeline.config.loading import parse_config
 from fantwin.pipeline.runtime.stage import Context
-from fantwin.pipeline.sources.source import LinkUp, Reading, ReadingBatch
+from fantwin.pipeline.sources.source import LinkUp, Noted, Reading, ReadingBatch
 from fantwin.schemas.units import NS_PER_S
 from fantwin.stages.acquisition import STAGE
 
@@ -47,3 +47,13 @@ def test_silence_is_measured_by_the_period_of_the_source() -> None:
     assert made.problem() == ""
     made.tick(START_NS + 39 * NS_PER_S)
     assert "nothing received for 37.5 s" in made.problem()
+
+
+def test_what_is_noted_beside_a_reading_makes_its_source_no_faster() -> None:
+    made = core()
+    for after_s in (15, 30, 45):
+        noted = ReadingBatch(START_NS + after_s * NS_PER_S, (Noted("unread_objects", "/Fans/3"),))
+        made.step(ReadingBlock((noted,) * 4))
+        assert take(made, after_s, 50.0) == 1
+    made.tick(START_NS + 59 * NS_PER_S)
+    assert made.problem() == ""
