@@ -137,7 +137,7 @@ class Server:
             data: Any = json.loads(answer)["data"]
             assert data["resultType"] == "matrix"
             return [(each["metric"], [_sample(*pair) for pair in each.get("values", ())]) for each in data["result"]]
-        except (ValueError, TypeError, LookupError, AttributeError, AssertionError) as error:
+        except (ValueError, TypeError, LookupError, AttributeError, AssertionError, RecursionError) as error:
             raise DeviceError("it answers, but not as a Prometheus does: correct source.url") from error
 
     def shown(self, names: Iterable[str]) -> list[tuple[Labels, Samples]]:

@@ -71,13 +71,15 @@ class RedfishClient:
             if f"{there.scheme}://{there.netloc}" != self._address:
                 raise DeviceError(f"{path}: sent to another host, so no Redfish service")
             status, headers, body = self._send("GET", there._replace(scheme="", netloc="").geturl())
-        if status in (http.client.UNAUTHORIZED, http.client.FORBIDDEN):
+        if status == http.client.UNAUTHORIZED:
             raise _refused_login()
+        if status == http.client.FORBIDDEN:  # of this object: others may be read
+            raise DeviceError(f"{path}: the user lacks rights (HTTP status 403)")
         if status >= http.client.MULTIPLE_CHOICES:
             raise DeviceError(f"{path}: refused with HTTP status {status}")
         try:
             found = json.loads(body)
-        except ValueError as error:
+        except (ValueError, RecursionError) as error:
             raise DeviceError(f"{path}: no JSON, so no Redfish service") from error
         if not isinstance(found, Mapping):
             raise DeviceError(f"{path}: no object")
@@ -137,4 +139,4 @@ def _lost(why: str = "") -> DeviceError:
 
 
 def _refused_login() -> DeviceError:
-    return DeviceError("user or password is refused, or lacks rights", is_lost=True)
+    return DeviceError("user or password is refused", is_lost=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import ssl
 from pathlib import Path
 from typing import Any
@@ -364,6 +365,24 @@ def test_a_fan_that_cannot_be_read_is_named_by_its_path_and_comes_back() -> None
         controller.documents[path] = kept
         assert reading(made) == Reading((40.0, 40.0), (4100.0, 4100.0))
         made.disconnect()
+
+
+DEEP = b'{"Fans": ' + 100_000 * b"["
+
+
+@pytest.mark.parametrize(
+    ("answer", "said"),
+    [(403, "the user lacks rights (HTTP status 403)"), (DEEP, "no JSON, so no Redfish service"), (404, "refused with")],
+)
+def test_a_chassis_that_may_not_or_cannot_be_read_costs_itself(answer: Any, said: str) -> None:
+    card = f"{ROOT}/Chassis/Card"
+    with redfish_server(Documents({card: answer} | thermal_and_subsystem())) as url:
+        made = connected(url, command="/Oem/Duty")
+        assert not math.isnan(reading(made).speed[0])
+        made.disconnect()
+        with pytest.raises(DeviceError, match=f"^{card}: {re.escape(said)}") as caught:
+            connected(f"{url}{card}")
+        assert not caught.value.is_lost
 
 
 def test_what_does_not_fit_the_controller_is_one_line() -> None:

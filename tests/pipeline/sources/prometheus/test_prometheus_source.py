@@ -134,6 +134,7 @@ def test_a_speed_that_comes_after_later_ones_is_counted() -> None:
         ({"status": 400}, "refused with HTTP status 400: a parse error; check source.url"),
         ({"status": 302}, "it sends to another address: write that in source.url"),
         ({"status": 403}, "user, password or token is refused, or lacks rights"),
+        ({"text": 100_000 * "["}, "it answers, but not as a Prometheus does: correct source.url"),
         ({"text": "<html>Grafana</html>"}, "it answers, but not as a Prometheus does: correct source.url"),
         (
             {"text": '{"data": {"resultType": "vector"}}'},
