@@ -11,6 +11,7 @@ import shutil
 import signal
 import subprocess
 import threading
+import time
 from contextlib import suppress
 from typing import IO
 
@@ -29,6 +30,7 @@ from fantwin.pipeline.timebase.receipt_times import ReceiptTimes
 
 END_LIMIT_S = 2.0
 """time that a program has to end after SIGTERM, before it is killed"""
+LOOK_S = 0.02
 LONGEST_QUOTE = 120
 """characters of what a program has printed, in a reason"""
 
@@ -163,9 +165,13 @@ class ExecSource(PollingSource):
 
 def _end(process: subprocess.Popen[bytes]) -> None:
     """End a program with all that it has started: politely, then by force."""
-    for sent in (signal.SIGTERM, signal.SIGKILL) if process.returncode is None else ():
-        with suppress(ProcessLookupError, PermissionError):
+    if process.returncode is not None:
+        return
+    with suppress(ProcessLookupError, PermissionError):  # there are none any more
+        for sent in (signal.SIGTERM, signal.SIGKILL):
             os.killpg(process.pid, sent)
-        with suppress(subprocess.TimeoutExpired):
-            process.wait(END_LIMIT_S)
-            return
+            until_s = time.monotonic() + END_LIMIT_S
+            while time.monotonic() < until_s:
+                process.poll()
+                os.killpg(process.pid, 0)
+                time.sleep(LOOK_S)

@@ -87,6 +87,18 @@ def test_one_that_does_not_end_when_it_is_asked_is_killed(run: Run, monkeypatch:
     assert process.poll() == -9
 
 
+def test_what_it_has_started_is_killed_though_the_program_itself_ends(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("fantwin.pipeline.sources.exec.source.END_LIMIT_S", 0.1)
+    helper = "(trap '' TERM; while :; do sleep 0.01; done) & echo $! > pid"
+    source, events = run(f"{helper}; echo '{SAMPLE}'; sleep 1000")
+    eventually(lambda: events.readings, "it runs")
+    source.stop()
+    pid = int((tmp_path / "pid").read_text())
+    eventually(lambda: not _runs(pid), "its helper has ended")
+
+
 def test_commands_are_lines_of_json_and_what_it_shows_confirms_them(run: Run) -> None:
     show = 'while read line; do echo "$line" >> heard; echo "$line" | sed s/}/,\\"speed\\":[1,2]}/; done'
     source, events = run(f"echo '{SAMPLE}'; {show}", commands=True)
