@@ -41,7 +41,7 @@ SLOWEST_S = 60.0
 MOST_FAILURES = 3
 """failures in a row after which the device is taken for lost"""
 RECONNECT_DELAY_S, RECONNECT_DELAY_MAX_S = 0.5, 10.0
-"""the first delay doubles with every attempt, up to the second"""
+"""the first delay doubles with every attempt, up to the second; a connection that lasted longer begins anew"""
 STOP_LIMIT_S = 5.0
 """a request that takes longer does not delay the end"""
 WRITE_WAIT_S = 0.05
@@ -189,9 +189,11 @@ class PollingSource(ABC):
                 reason = _reason(error)
                 self._disconnect()
             else:
-                delay_s, reported = RECONNECT_DELAY_S, ""
+                began_s, reported = time.monotonic(), ""
                 reason = self._poll_until_lost(first)
                 self._disconnect()
+                if time.monotonic() - began_s > RECONNECT_DELAY_MAX_S:
+                    delay_s = RECONNECT_DELAY_S
             if self._stopping:
                 return
             if reason != reported:

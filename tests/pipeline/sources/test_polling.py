@@ -163,3 +163,14 @@ def test_stop_does_not_wait_for_the_next_poll_and_delivers_nothing_afterwards() 
     source.stop()
     assert source._thread and not source._thread.is_alive() and source.disconnected == 1
     assert len(events) == 2
+
+
+def test_a_device_that_is_lost_soon_after_each_connection_is_tried_more_and_more_rarely() -> None:
+    began_s: list[float] = []
+
+    def once() -> float:
+        began_s.append(time.monotonic())
+        return 1.0
+
+    polled(Device(*[once, failing("gone", is_lost=True)] * 6), lambda found: len(found.readings) == 6)
+    assert began_s[5] - began_s[4] > 0.16, "delays of 10, 20, 40, 80 and 160 ms"
