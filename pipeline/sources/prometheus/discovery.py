@@ -42,7 +42,7 @@ class Metric(NamedTuple):
 
 METRICS = (
     Metric("node_hwmon_fan_rpm", ("sensor",), "node_hwmon_pwm", 255.0),
-    Metric("ipmi_fan_speed_rpm", ("name", "id"), "ipmi_fan_speed_ratio", 1.0),
+    Metric("ipmi_fan_speed_rpm", ("name", "id")),  # ipmi_fan_speed_ratio may be measured, and so no command
     Metric('idrac_sensors_fan_speed{units="rpm"}', ("name", "id")),
     Metric('redfish_chassis_fan_rpm{fan_unit="rpm"}', ("fan", "fan_id")),
     Metric('ipmi_sensor_value{unit="rpm"}', ("name", "entity_id", "status_code", "status_desc")),
