@@ -231,4 +231,5 @@ class AcquisitionCore(Core):
                 reading = self._plausibility.with_plausible_columns(reading)
                 if self._tray.command_from:
                     reading = with_stand_in(reading, self._tray.command_from, RAD_S_PER_UNIT[self._tray.speed_unit])
+                    self._plausibility.count_unknown(reading, f"command_from = {self._tray.command_from}")
                 yield ReceivedReading(reading, batch.received_t_ns)

@@ -85,6 +85,15 @@ class Plausibility:
             self.quality.add_valid()
         return replace(reading, speed=speeds)
 
+    def count_unknown(self, reading: Reading, stand_in: str) -> None:
+        """Count the fans for whose command nothing stands; where that is so of all, health says it."""
+        unknown = sum(map(math.isnan, reading.command))
+        if unknown < len(reading.command):
+            self.counts["fans_without_command"] += unknown
+            return
+        self.counts["unknown_command"] += 1
+        self.last_noted["unknown_command"] = f"{stand_in}: the source gives no such value of any fan; none is judged"
+
     def with_plausible_columns(self, reading: Reading) -> Reading:
         """The reading with NaN where a value beside command and speed cannot be true, or the source has left it out.
 

@@ -27,7 +27,7 @@ from fantwin.pipeline.errors import UsageError, UserError
 from fantwin.pipeline.sources.kinds import parse_source
 from fantwin.pipeline.sources.serial.config import MOST_FANS_ON_LINE
 from fantwin.pipeline.sources.source import MOST_FANS, SourceConfig, too_many_fans
-from fantwin.pipeline.sources.stand_in import STAND_INS
+from fantwin.pipeline.sources.stand_in import OTHERS, STAND_INS
 from fantwin.schemas.fan_names import LONGEST_NAME, FanNames, fan_label, is_fan_name, is_one_short_line
 from fantwin.schemas.tacho import INSTANTANEOUS, Tacho, Tachos, tacho_of_each_fan
 from fantwin.schemas.topics import RESERVED_TRAY_NAMES
@@ -360,6 +360,8 @@ class TrayConfig(Section):
         tacho_of_each_fan(self.tachos, self.fans)
         if self.fans > self.source.most_fans:
             raise ValueError(too_many_fans(self.source.kind, self.fans, self.source.most_fans))
+        if self.command_from == OTHERS and self.fans < 2:
+            raise ValueError('command_from = "others" compares the fans of a tray: it needs two or more')
         if self.command_min > self.command_max:
             raise ValueError(f"command_min = {self.command_min:g} is greater than command_max = {self.command_max:g}")
         return self

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
+
 from fantwin.pipeline.acquisition.acquisition_core import AcquisitionCore
 from fantwin.pipeline.acquisition.sample_blocks import ReadingBlock
-from fantwin.pipeline.config.loading import parse_config
+from fantwin.pipeline.config.loading import ConfigError, parse_config
 from fantwin.pipeline.runtime.stage import Context
 from fantwin.pipeline.sources.source import LinkUp, Noted, Reading, ReadingBatch
 from fantwin.schemas.units import NS_PER_S
@@ -24,8 +26,8 @@ source = { kind = "prometheus", url = "http://127.0.0.1:9", fan = [{ speed = "rp
 """
 
 
-def core() -> AcquisitionCore:
-    config = parse_config(CONFIGURATION, Path("fantwin.toml"), stages=("acquisition",))
+def core(more: str = "") -> AcquisitionCore:
+    config = parse_config(f"{CONFIGURATION}{more}", Path("fantwin.toml"), stages=("acquisition",))
     context = Context("site", config.trays, config.sections["acquisition"], Path(), Path("runs"), started_t_ns=START_NS)
     made = STAGE.build(context).core
     assert isinstance(made, AcquisitionCore)
@@ -57,3 +59,16 @@ def test_what_is_noted_beside_a_reading_makes_its_source_no_faster() -> None:
         assert take(made, after_s, 50.0) == 1
     made.tick(START_NS + 59 * NS_PER_S)
     assert made.problem() == ""
+
+
+def test_a_stand_in_that_the_source_does_not_have_is_said_and_others_are_two_fans_or_more() -> None:
+    made = core('command_from = "temperature"\n')
+    assert take(made, 1, 50.0) == 1, "its speeds are kept"
+    assert made.counters()["unknown_command"] == 1
+    said = "command_from = temperature: the source gives no such value of any fan; none is judged (unknown_command 1)"
+    assert said in made.notes()
+    made = core('command_from = "others"\n')
+    assert take(made, 1, 50.0) == 1 and made.counters()["fans_without_command"] == 0
+    alone = CONFIGURATION.replace("fans = 2", 'fans = 1\ncommand_from = "others"')
+    with pytest.raises(ConfigError, match="it needs two or more"):
+        parse_config(alone, Path("fantwin.toml"), stages=("acquisition",))
