@@ -72,7 +72,8 @@ def loop_of(set_points_rad_s: list[float]) -> Run:
 
 
 def test_a_static_twin_knows_that_its_fan_is_in_a_loop() -> None:
-    assert train_twin([loop_of([100.0, 180.0, 140.0, 220.0, 120.0])], [], "static", name="x").card.closed_loop == (True,)
+    run = loop_of([100.0, 180.0, 140.0, 220.0, 120.0])
+    assert train_twin([run], [], "static", name="x").card.closed_loop == (True,)
 
 
 def test_a_loop_at_one_set_point_has_no_static_twin() -> None:
