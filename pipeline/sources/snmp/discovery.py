@@ -49,8 +49,12 @@ def _discover(text: str, password_file: Path | None, folder: Path) -> Found:
         raise UserError(f"{text}: no fans in rpm in its ENTITY-SENSOR-MIB{why}; name objects by source.fan")
     rows: list[dict[str, Any]] = []
     for index in fans:
-        scale = 1000.0 ** (int(scales.get(index, UNITS)) - UNITS) / 10.0 ** int(precisions.get(index, 0))
         name = f"{VALUE}.{index}"
+        try:
+            scale = 1000.0 ** (int(scales.get(index, UNITS)) - UNITS) / 10.0 ** int(precisions.get(index, 0))
+        except (ValueError, ArithmeticError) as error:
+            why = f"scale {scales.get(index)!r}, precision {precisions.get(index)!r} of {names.get(index, index)} are none"
+            raise UserError(f"{text}: {why}: name objects by source.fan") from error
         rows.append({"speed": name if scale == 1.0 else {"name": name, "scale": scale}})
     called = [names.get(index, "") for index in fans]
     keys = keys_in_rpm(host, called, 100.0, {"kind": "snmp", **asked, "fan": rows})

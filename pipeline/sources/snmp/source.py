@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 TIMEOUT_S, RETRIES = 1.0, 1
 MOST_AT_ONCE = 24
 """objects in a request: an answer has to fit into a datagram"""
+MOST_ROWS = 10_000
+"""of a table that is walked"""
 _AUTHENTICATION = {
     "MD5": "usmHMACMD5AuthProtocol",
     "SHA": "usmHMACSHAAuthProtocol",
@@ -104,6 +106,8 @@ class SnmpSource(NamedValuesSource):
             async for failure, _, _, answer in snmp.bulk_walk_cmd(*asked, lookupMib=False, lexicographicMode=False):
                 if failure:
                     raise self._unanswered(failure)
+                if len(found) > MOST_ROWS:
+                    raise DeviceError(f"a table of more than {MOST_ROWS:,} rows: name objects by source.fan")
                 found |= {str(oid).removeprefix(f"{column}."): value.prettyPrint() for oid, value in answer}
             return found
 

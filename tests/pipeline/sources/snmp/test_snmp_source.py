@@ -116,6 +116,19 @@ def entity(index: int, value: int, name: str, *, kind: int = 10, scale: int = 9,
     return {**found, f"1.3.6.1.2.1.47.1.1.1.1.7.{index}": name}
 
 
+def test_init_says_of_a_table_without_end_or_of_a_scale_that_is_none_what_it_is(
+    agent: Agent, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    words = ("init", "--snmp", f"127.0.0.1:{agent.port}", "--password-file", "v2")
+    agent.objects = entity(1001, 5100, "Tray 1 fan", precision=-(2**31))
+    assert "scale '9', precision '-2147483648' of Tray 1 fan are none" in error_of(*words)
+    monkeypatch.setattr(module, "MOST_ROWS", 30)
+    for index in range(1, 101):
+        agent.objects |= entity(index, 5100, f"Fan {index}")
+    assert "a table of more than 30 rows: name objects by source.fan" in error_of(*words)
+
+
 def test_init_finds_the_sensors_in_rpm_with_their_scales_and_none_that_is_in_per_cent(
     agent: Agent, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
