@@ -70,6 +70,7 @@ def keys_in_rpm(name: str, called: Sequence[str], command_max: float, source: Ma
 
 def checked(model: type[Config], settings: Mapping[str, Any], option: str, url: str) -> Config:
     """The settings of a source. Raises UserError, which names the option with the URL."""
+    _require_no_password(option, url)
     try:
         return model.model_validate(settings)
     except ValidationError as error:
@@ -86,6 +87,7 @@ def found_at(
     Raises:
         UserError: the address or the range is none, or its only device cannot be asked, or has no fans.
     """
+    _require_no_password(option, url)
     try:
         urls = hosts_of(url)
     except ValueError as error:
@@ -101,6 +103,12 @@ def found_at(
 
     with ThreadPoolExecutor(AT_ONCE) as pool:
         return list(alike(list(pool.map(found, urls)), host_of))
+
+
+def _require_no_password(option: str, url: str) -> None:
+    """Raise UserError, which does not show it, if a URL has a password."""
+    if re.match(r"[^/@:]+:[^@]*@", url.partition("://")[2] or url):
+        raise UserError(f"{option}: an address is shown, so no password in it: give USER@HOST and --password-file")
 
 
 def alike(found: Sequence[Found], host_of: Callable[[Mapping[str, Any]], str]) -> Iterator[Found]:

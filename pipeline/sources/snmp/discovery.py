@@ -53,8 +53,8 @@ def _discover(text: str, password_file: Path | None, folder: Path) -> Found:
         try:
             scale = 1000.0 ** (int(scales.get(index, UNITS)) - UNITS) / 10.0 ** int(precisions.get(index, 0))
         except (ValueError, ArithmeticError) as error:
-            why = f"scale {scales.get(index)!r}, precision {precisions.get(index)!r} of {names.get(index, index)} are none"
-            raise UserError(f"{text}: {why}: name objects by source.fan") from error
+            why = f"scale {scales.get(index)!r}, precision {precisions.get(index)!r}"
+            raise UserError(f"{text}: {names.get(index, index)} has {why}: name objects by source.fan") from error
         rows.append({"speed": name if scale == 1.0 else {"name": name, "scale": scale}})
     called = [names.get(index, "") for index in fans]
     keys = keys_in_rpm(host, called, 100.0, {"kind": "snmp", **asked, "fan": rows})

@@ -179,3 +179,18 @@ def test_on_a_terminal_it_asks_and_elsewhere_it_says_what_it_takes_and_what_is_t
     assert done.stdout.splitlines()[-1] == "next: fantwin commission --sweep"
     asked = error_of("init", "--root", root, "-c", "none.toml", typed="n\nn\n\n\n\n")
     assert asked == "no fan to watch: nothing was chosen"
+
+
+@pytest.mark.parametrize(
+    ("option", "address"),
+    [
+        ("--redfish", "https://ann:swordfish@127.0.0.1:9"),
+        ("--redfish", "https://ann:sw/ord:fish@bmc[1-2]"),
+        ("--ipmi", "ipmi://ann:swordfish@bmc1"),
+        ("--prometheus", "http://ann:swordfish@127.0.0.1:9"),
+        ("--snmp", "ann:swordfish@switch7:161"),
+    ],
+)
+def test_a_password_in_an_address_is_refused_and_not_shown(option: str, address: str, tmp_path: Path) -> None:
+    said = error_of("init", option, address, "-c", tmp_path / "new.toml")
+    assert said == f"{option}: an address is shown, so no password in it: give USER@HOST and --password-file"

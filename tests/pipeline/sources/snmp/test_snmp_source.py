@@ -122,7 +122,7 @@ def test_init_says_of_a_table_without_end_or_of_a_scale_that_is_none_what_it_is(
     monkeypatch.chdir(tmp_path)
     words = ("init", "--snmp", f"127.0.0.1:{agent.port}", "--password-file", "v2")
     agent.objects = entity(1001, 5100, "Tray 1 fan", precision=-(2**31))
-    assert "scale '9', precision '-2147483648' of Tray 1 fan are none" in error_of(*words)
+    assert "Tray 1 fan has scale '9', precision '-2147483648': name objects" in error_of(*words)
     monkeypatch.setattr(module, "MOST_ROWS", 30)
     for index in range(1, 101):
         agent.objects |= entity(index, 5100, f"Fan {index}")
