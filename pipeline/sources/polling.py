@@ -58,11 +58,15 @@ Polled: TypeAlias = Reading | Rejected | Sequence[ReadingBatch]
 
 
 class DeviceError(UserError):
-    """A request that failed: one line that says why, and what to do. is_lost: there is no connection any more."""
+    """A request that failed: one line that says why, and what to do.
 
-    def __init__(self, reason: str, *, is_lost: bool = False) -> None:
+    is_lost: there is no connection any more. retry_s: time before the next attempt, at least.
+    """
+
+    def __init__(self, reason: str, *, is_lost: bool = False, retry_s: float = 0.0) -> None:
         super().__init__(reason)
         self.is_lost = is_lost
+        self.retry_s = retry_s
 
 
 class Doubt(NamedTuple):
@@ -182,11 +186,12 @@ class PollingSource(ABC):
     def _run(self) -> None:
         delay_s, reported = RECONNECT_DELAY_S, ""
         while not self._stopping:
+            least_s = 0.0
             try:
                 self.connect()
                 first = self._read()  # connected is what can be read
             except Exception as error:  # noqa: BLE001  a library may raise anything, and no thread may end silently
-                reason = _reason(error)
+                reason, least_s = _reason(error), getattr(error, "retry_s", 0.0)
                 self._disconnect()
             else:
                 began_s, reported = time.monotonic(), ""
@@ -200,7 +205,7 @@ class PollingSource(ABC):
                 self._deliver(LinkDown(reason))
                 reported = reason
             with self._wake:
-                self._wake.wait_for(lambda: self._stopping, delay_s)
+                self._wake.wait_for(lambda: self._stopping, max(delay_s, least_s))
             delay_s = min(2.0 * delay_s, RECONNECT_DELAY_MAX_S)
 
     def _disconnect(self) -> None:

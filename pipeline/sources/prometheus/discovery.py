@@ -125,6 +125,8 @@ def _trays(
         notes = [
             f"fan {number} is {fan}: {each[-1][1]:.0f} rpm" for number, (fan, (_, each)) in enumerate(fans.items())
         ]
+        if len(missing) < len(fans):
+            notes.append("commands are the pwms of the same number: check that each moves its fan, as boards differ")
         where = "name its series by command of source.fan, or write command_from"
         lacking = f"no command is known of {', '.join(missing)}: {where}"
         yield Found(

@@ -21,6 +21,7 @@ TIMEOUT_S = 5.0
 LARGEST_BYTES = 4 << 20
 """of an answer"""
 MOST_REDIRECTS = 3
+LOGIN_RETRY_S = 300.0
 
 
 class RedfishClient:
@@ -139,4 +140,5 @@ def _lost(why: str = "") -> DeviceError:
 
 
 def _refused_login() -> DeviceError:
-    return DeviceError("user or password is refused", is_lost=True)
+    why = f"user or password is refused; asked again every {LOGIN_RETRY_S / 60:g} min, as controllers lock users out"
+    return DeviceError(why, is_lost=True, retry_s=LOGIN_RETRY_S)

@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
@@ -52,9 +53,9 @@ class Device(PollingSource):
         self.disconnected += 1
 
 
-def failing(reason: str = "timeout", *, is_lost: bool = False) -> Callable[[], float]:
+def failing(reason: str = "timeout", **how: Any) -> Callable[[], float]:
     def fail() -> float:
-        raise DeviceError(reason, is_lost=is_lost)
+        raise DeviceError(reason, **how)
 
     return fail
 
@@ -127,6 +128,13 @@ def test_a_device_that_keeps_failing_is_lost_or_fails_unexpectedly_is_a_link_dow
         LinkDown("unexpected KeyError: 'Fans'; waiting for it"),
         LinkUp(),
     ]
+
+
+def test_a_device_is_not_asked_again_before_its_error_allows_it() -> None:
+    """Controllers lock users out whose password is refused again and again."""
+    device, began_s = Device(failing("refused", is_lost=True, retry_s=0.3), lambda: 1.0), time.monotonic()
+    polled(device, lambda found: len(found.readings) == 1)
+    assert time.monotonic() - began_s >= 0.3
 
 
 def test_polls_that_are_late_are_left_out_and_counted_as_lost() -> None:

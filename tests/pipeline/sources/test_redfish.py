@@ -448,7 +448,7 @@ def test_a_password_comes_from_a_file_of_its_owner_and_goes_over_a_verified_line
         file.write_text(f"{SECRET}-not\n")
         with pytest.raises(DeviceError, match="^user or password is refused") as caught:
             connected(url, **settings)
-        assert SECRET not in str(caught.value)
+        assert SECRET not in str(caught.value) and caught.value.retry_s == 300.0
         file.write_text(f"{SECRET}\n")
         controller.has_sessions = True
         made = connected(url, **settings)
