@@ -9,6 +9,7 @@ from functools import partial, reduce
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from fantwin.pipeline.learning.drops_found import static_words
 from fantwin.pipeline.learning.training_data import (
     Part,
     TrainingData,
@@ -56,7 +57,8 @@ def evaluated(
         of_grids: list[tuple[Grid, Evaluation]] = [
             (grid, of.evaluation()) for grid, of in zip(grids, on_grids, strict=True)
         ]
-        return as_json(summary, assess(summary), of_grids, about), about.damage
+        result = as_json(summary, assess(summary), of_grids, about)
+        return result | {"static": static_words(twin, about.speed_unit)}, about.damage
 
 
 def figures_in(figures: Figures, rad_s_per_unit: float) -> dict[str, float | int | None]:

@@ -63,8 +63,11 @@ class SampleGrid:
         gap is not published because its samples may still come."""
         self._fans = fans = len(tachos)
         is_slow, settles = timing.period_ns >= SLOW_NS, timing.period_ns >= SETTLED_NS
-        self._is_held = np.array([settles or (tacho.held_s > 0.0 and not is_slow) for tacho in tachos])
-        self._holds = bool(self._is_held.any())
+        shows = np.array([tacho.held_s > 0.0 for tacho in tachos])
+        self._is_held = settles | (shows & (not is_slow))
+        self._repeats = settles | shows
+        """fans whose newest reading is repeated where no sample has come since the grid time before"""
+        self._holds = bool(self._repeats.any())
         self._period_ns = timing.period_ns
         self._gap_limit_ns = timing.gap_limit_ns
         self._watermark_ns = timing.watermark_ns
@@ -303,6 +306,9 @@ class SampleGrid:
             self._in_gap = False
             auxiliary = interpolate_auxiliary(t_ns, at, samples) if self._auxiliary else samples.auxiliary
             is_late = t_ns - samples.t_ns.take(at) >= self._period_ns
+            if self._holds:
+                here = samples.speed_rad_s.take(at, axis=0)
+                speed = np.where(is_late[:, np.newaxis] & self._repeats & np.isfinite(here), here, speed)
             command = held_commands(t_ns, at, samples, self._period_ns)
             self._append(t_ns, command, speed, NO_SPEED, ~has.take(at, axis=0), is_late, auxiliary)
         return not waits
@@ -356,7 +362,7 @@ class SampleGrid:
             valid=valid,
             invalid_reason=invalid_reason,
             reading_missing=reading_missing,
-            reading_repeated=is_late[:, np.newaxis] & self._is_held if self._holds else np.zeros(0),
+            reading_repeated=is_late[:, np.newaxis] & self._repeats if self._holds else np.zeros(0),
             **columns,
         )
         self._pending.append(grid)

@@ -24,7 +24,6 @@ from fantwin.pipeline.cli.twins.data_options import (
 )
 from fantwin.pipeline.cli.twins.figures import sentence, shown
 from fantwin.pipeline.errors import UsageError
-from fantwin.pipeline.learning.drops_found import static_words
 from fantwin.pipeline.learning.evaluation import EXPECTED_COVERAGE, evaluated
 from fantwin.pipeline.learning.training_data import Part, twin_errors
 from fantwin.schemas.fan_names import fan_cell
@@ -61,7 +60,6 @@ def evaluate(
     pool = RecordingsInParallel(jobs, skip_bad)
     with interruptible("nothing was evaluated"), twin_errors(), pool:
         result, damage = evaluated(twin, recordings, part, pool.map, grids)
-        result["static"] = static_words(twin, result["speed_unit"])
     report_damage(damage)
     figures = sentence(result, result["speed_unit"])
     lines = (*filter(None, (result["headline"], result["static"], figures)), _fan_table(result))
