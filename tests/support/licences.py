@@ -57,8 +57,8 @@ def licence(name: str) -> str:
     """What an installed package declares: an SPDX expression, else classifiers, else the first line of its text."""
     declared = metadata(name)
     classifiers = (words.split(" :: ")[-1] for words in declared.get_all("Classifier", []) if "License ::" in words)
-    text = (declared["License"] or "").split("\n")[0]
-    return declared["License-Expression"] or ", ".join(classifiers) or text or UNDECLARED.get(name, "")
+    text = (declared.get("License") or "").split("\n")[0]
+    return declared.get("License-Expression") or ", ".join(classifiers) or text or UNDECLARED.get(name, "")
 
 
 def page() -> str:

@@ -78,11 +78,11 @@ def test_a_twin_is_refused_for_its_own_fans_in_another_order(raw: Path, tmp_path
     write_run(other, published_run(2, 20.0, fans=3), **{"fan_names.tray1": json.dumps(NAMES[::-1])})
     fantwin("train", raw, "--model", "physical", "-o", twin)
     said = "the fans GPU, CPU are in the places of CPU, GPU in the twin: use a twin of these fans in this order"
-    rate = ("--false-alarms-per-day", "1")
-    for words in (
-        ("evaluate", twin, other),
-        ("calibrate", twin, other, *rate),
-        ("replay", "--offline", other, "--twin", twin),
-    ):
-        assert said in error_of(*words), words[0]
+    of_command: dict[str, tuple[object, ...]] = {
+        "evaluate": (twin, other),
+        "calibrate": (twin, other, "--false-alarms-per-day", 1),
+        "replay": ("--offline", other, "--twin", twin),
+    }
+    for name, words in of_command.items():
+        assert said in error_of(name, *words), name
     assert fantwin("evaluate", twin, raw).exit_code == 0

@@ -68,7 +68,7 @@ def loop_of(set_points_rad_s: list[float]) -> Run:
         speed[k] = 2.5 * command[k] + load[k]
         if k + 1 < samples:
             command[k + 1] = command[k] + 0.3 * (wanted[k] - speed[k])
-    return Run("loop", 15.0 * np.arange(samples), command, speed)
+    return Run("loop", 15.0 * np.arange(samples, dtype=np.float64), command, speed)
 
 
 def test_a_static_twin_knows_that_its_fan_is_in_a_loop() -> None:
