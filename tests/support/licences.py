@@ -57,8 +57,8 @@ def licence(name: str) -> str:
     """What an installed package declares: an SPDX expression, else classifiers, else the first line of its text."""
     declared = metadata(name)
     classifiers = (words.split(" :: ")[-1] for words in declared.get_all("Classifier", []) if "License ::" in words)
-    text = (declared.get("License") or "").split("\n")[0]
-    return declared.get("License-Expression") or ", ".join(classifiers) or text or UNDECLARED.get(name, "")
+    text, expression = (declared[each] if each in declared else "" for each in ("License", "License-Expression"))
+    return expression or ", ".join(classifiers) or text.split("\n")[0] or UNDECLARED.get(name, "")
 
 
 def page() -> str:
