@@ -57,7 +57,7 @@ def licence(name: str) -> str:
     """What an installed package declares: an SPDX expression, else classifiers, else the first line of its text."""
     declared = metadata(name)
     classifiers = (words.split(" :: ")[-1] for words in declared.get_all("Classifier", []) if "License ::" in words)
-    text, expression = (declared[each] if each in declared else "" for each in ("License", "License-Expression"))
+    text, expression = ((declared.get_all(each) or [""])[0] for each in ("License", "License-Expression"))
     return expression or ", ".join(classifiers) or text.split("\n")[0] or UNDECLARED.get(name, "")
 
 
