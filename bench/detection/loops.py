@@ -64,7 +64,7 @@ class Predicted:
         self._core, self._row = stage("twin_integrator", twin), 0
 
     def take(self, command: Array, speed_rad_s: Array) -> Iterator[Prediction]:
-        """Of a block."""
+        """Return the predictions of a block."""
         t_ns = START_NS + PERIOD_NS * (self._row + np.arange(len(command)))
         self._row += len(command)
         valid = np.isfinite(speed_rad_s)

@@ -126,7 +126,7 @@ def tables_within(model: type[BaseModel], shown: dict[str, str] | None = None, o
 
 
 def _table_of_new(text: str, known: dict[str, str], kind: str) -> str:
-    """The table of a kind, where keys that are the same as those of former kinds are only named. known: kind by row."""
+    """The table of a kind, where keys that are the same as those of kinds above are only named. known: kind by row."""
     heads, rows = text.splitlines()[:2], text.splitlines()[2:]
     same: dict[str, list[str]] = {}
     for row in rows:

@@ -23,7 +23,7 @@ LOOKED_AT_NS = 1200 * NS_PER_S
 
 
 def closed_loops(card: TwinCard, healthy: Iterable[Path], tray: str | None) -> tuple[bool, ...]:
-    """For each fan of a twin, whether its command answers its speed: in training, or in one of the recordings.
+    """Find whether the command of each fan of a twin answers its speed: in training, or in one of the recordings.
 
     tray: of those of the recordings, all without it.
     """

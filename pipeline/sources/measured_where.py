@@ -47,14 +47,14 @@ def read_measured(file: ColumnFile, names: Sequence[str]) -> tuple[Mapping[str, 
     columns = dict(file.read(list(dict.fromkeys((*names, *(by for _, by, _ in rules))))))
     left_out: list[LeftOut] = []
     for name, by, bit in rules:
-        told, values = columns[by].values, columns[name].values
-        if len(told) != len(values):
+        shown, values = columns[by].values, columns[name].values
+        if len(shown) != len(values):
             continue
         if bit:
-            is_measured = (np.nan_to_num(told).astype(np.int64) >> int(bit)) & 1 == 1
+            is_measured = (np.nan_to_num(shown).astype(np.int64) >> int(bit)) & 1 == 1
             why = f"where the bit of the motor in {by} is not set"
         else:
-            is_measured = np.diff(told, prepend=0.0) != 0  # 0: not yet
+            is_measured = np.diff(shown, prepend=0.0) != 0  # 0: not yet
             why = "where readings are repeated, by their own timestamps"
         if is_measured.sum() > 1 and not is_measured.all():
             columns[name] = replace(columns[name], values=np.where(is_measured, values, np.nan))

@@ -41,7 +41,7 @@ SLOWEST_S = 60.0
 MOST_FAILURES = 3
 """failures in a row after which the device is taken for lost"""
 RECONNECT_DELAY_S, RECONNECT_DELAY_MAX_S = 0.5, 10.0
-"""the first delay doubles with every attempt, up to the second; a connection that lasted longer begins anew"""
+"""the first delay doubles with every attempt, up to the second, and starts again after a connection of that length"""
 STOP_LIMIT_S = 5.0
 """a request that takes longer does not delay the end"""
 WRITE_WAIT_S = 0.05

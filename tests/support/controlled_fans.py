@@ -69,7 +69,7 @@ class Controller:
         return self.wanted
 
     def duty(self, t_s: float, reading_rad_s: Array, speed_rad_s: Array) -> Array:
-        """From the reading, or what the speed does to the rest of the world."""
+        """The duty by the reading, or by what the speed does to the rest of the world."""
         return self.drawn(t_s, 0.25, 0.95)
 
 

@@ -30,7 +30,7 @@ SLOW = 1.1
 FAST = 0.1
 """sample periods in a time constant of the physical model below which the static one is not tried"""
 SHORTEST = 0.02
-"""shortest time constant, in sample periods: a shorter one cannot be told from it"""
+"""shortest time constant, in sample periods: a shorter one looks the same"""
 STARTS = ((SHORTEST, 1.0), (SHORTEST, 0.0), (0.2, 1.0), (0.5, 1.0), (1.0, 1.0), (1.0, 0.0), (2.0, 0.5))
 PART_SAMPLES, MOST_PARTS = 500, 12
 """samples of a part of the runs, and parts from which the time constant is found; speeds are from all"""
@@ -65,12 +65,12 @@ class StaticFit:
 
     @property
     def error_rad_s(self) -> float:
-        """Of all fans, without the samples right after changes."""
+        """Rms error of all fans, without the samples right after changes."""
         return float(np.sqrt(np.mean(self.sigma_rad_s**2)))
 
     @property
     def identification(self) -> Identification:
-        """What the card tells of the parameters: they have no interval."""
+        """What the card says of the parameters: they have no interval."""
         fans, count = self.parameters.shape
         return Identification(
             parameters=self.parameters,

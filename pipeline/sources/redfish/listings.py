@@ -139,7 +139,7 @@ class ChassisFans:
         return self._links[name]
 
     def pwm_outputs(self) -> dict[str, str]:
-        """By name of a tacho, the pwm that drives its fan, as the controllers of OpenBMC are set."""
+        """The pwm that drives the fan of each tacho, by name, as the controllers of OpenBMC are set."""
         found: dict[str, str] = {}
         for manager in listed(self.read(f"{ROOT}Managers"), "Members"):
             controllers = found_at(self.read(link(manager)), "/Oem/OpenBmc/Fan/FanControllers")

@@ -96,8 +96,8 @@ def used_fans(path: Path, chosen: FanColumns, values: Mapping[str, Array]) -> Fa
         UserError: none is left.
     """
     turned = [bool(np.any(np.nan_to_num(values[name]) != 0)) for name in chosen.speed]
-    told = [bool(np.any(np.isfinite(values[name]))) for name in chosen.command]
-    used = [k for k, both in enumerate(zip(turned, told, strict=True)) if all(both)]
+    commanded = [bool(np.any(np.isfinite(values[name]))) for name in chosen.command]
+    used = [k for k, both in enumerate(zip(turned, commanded, strict=True)) if all(both)]
     if not chosen.is_found or len(used) == len(turned):
         return chosen
     unused = [name for k, name in enumerate(chosen.speed) if k not in used]

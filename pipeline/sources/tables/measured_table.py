@@ -23,7 +23,7 @@ GAP_IN_MEDIAN_PERIODS = 5.0
 
 
 def _counted(text: str) -> int:
-    """A count of irregularities, and what people are told of it."""
+    """A count of irregularities, and its words."""
     return field(default=0, metadata={"text": text})
 
 

@@ -264,7 +264,7 @@ def test_several_files_and_patterns_become_one_recording_in_the_order_of_time(tm
 
 
 def test_commands_and_speeds_in_two_tables_are_joined_by_their_times(tmp_path: Path) -> None:
-    """As ulog2csv writes them, a topic a file; in every tenth sample the ESC was silent."""
+    """Tables as ulog2csv writes them, a topic a file; in every tenth sample the ESC was silent."""
     outputs, escs = tmp_path / "flight_actuator_outputs_0.csv", tmp_path / "flight_esc_status_0.csv"
     us = (10_000_000 + SECONDS * 100_000).tolist()
     rows = zip(us, COMMAND.tolist(), SPEED.tolist(), strict=True)
