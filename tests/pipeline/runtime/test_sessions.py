@@ -137,8 +137,7 @@ def test_row_07_a_shard_with_a_tray_that_another_one_has_is_refused_in_one_line(
         Runner(toy(), config, Shard(TRAY_B, (TRAY_B,), ("--trays", TRAY_B)), stopped).run()
 
 
-@pytest.mark.usefixtures("_found_before")
-def test_row_07_a_second_process_of_a_stage_is_refused_in_one_line_that_names_the_first(config, monkeypatch):
+def test_row_07_a_second_process_of_a_stage_is_refused_in_one_line_that_names_the_first(config, monkeypatch, request):
     aborted: list[bool] = []
 
     class Aborts(Passer):
@@ -146,6 +145,7 @@ def test_row_07_a_second_process_of_a_stage_is_refused_in_one_line_that_names_th
             aborted.append(True)
 
     bench = Bench(toy(), config)
+    request.getfixturevalue("_found_before")  # from now on: the first waits for others, too
     first = os.getpid()
     monkeypatch.setattr("fantwin.pipeline.runtime.sessions.os.getpid", lambda: first + 1)
     with pytest.raises(
