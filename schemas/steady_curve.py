@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 SLOWER = 2.0
-"""by which a fan may be slower at some speeds than its one time constant"""
+"""factor by which a fan may be slower at some speeds than its one time constant"""
 
 
 @dataclass(frozen=True, eq=False)

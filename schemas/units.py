@@ -20,5 +20,5 @@ def period_in_words(seconds: float) -> str:
 
 
 def short_number(value: float, digits: int = 3) -> str:
-    """A number to so many digits, and large ones whole: 0.25, 25.1, 2520."""
+    """A number to some digits, and large ones whole: 0.25, 25.1, 2520."""
     return f"{value:.0f}" if abs(value) >= 10 ** (digits - 1) else f"{value:.{digits}g}"

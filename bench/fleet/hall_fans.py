@@ -17,7 +17,7 @@ from fantwin.simulation.four_pin import RPM, VARYING_PARAMETERS, FourPinDamage, 
 from fantwin.simulation.plant import varied
 
 FANS = 2
-"""of a server"""
+"""fans of a server"""
 STEP_S, SHOWN_S = 0.05, 1.0
 STEP_RPM, FIRST_RPM = 10.0, 6_000.0
 FAN = FourPinParameters(

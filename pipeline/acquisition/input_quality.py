@@ -129,7 +129,7 @@ def _shortened(detail: str) -> str:
 WINDOW = 100
 """newest inputs from which the quality is computed"""
 SILENCE_S = 2.0
-"""a source without a valid sample for longer is a problem; and for so many of the steps between its inputs"""
+"""silence of a source that is a problem, at least; and SILENT_STEPS steps between its inputs, if that is longer"""
 SILENT_STEPS, LONGEST_STEP_NS = 2.5, 60 * NS_PER_S
 JUDGED_FROM = WINDOW // 5
 """inputs needed for a judgement"""
@@ -153,7 +153,7 @@ class InputQuality:
         self._steps_ns = deque([round(period_s * NS_PER_S)], maxlen=3)
         """newest steps between inputs"""
         self._has_input = False
-        """since the source is waited for"""
+        """whether there was one since the source is waited for"""
 
     def connection_changed(self) -> None:
         """The source was connected or disconnected: what came before says nothing about what follows."""

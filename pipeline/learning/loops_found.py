@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from fantwin.schemas.twin_card import TwinCard
 
 LOOKED_AT_NS = 1200 * NS_PER_S
-"""of each recording: a controller shows within minutes"""
+"""time of each recording that is looked at: a controller shows within minutes"""
 
 
 def closed_loops(card: TwinCard, healthy: Iterable[Path], tray: str | None) -> tuple[bool, ...]:

@@ -31,7 +31,7 @@ from fantwin.schemas.units import NS_PER_S, period_in_words
 
 _START = 4096
 _USUAL_POLES = 14
-"""of motors of which a preview does not know them"""
+"""poles of a motor that a preview does not know"""
 
 
 @contextmanager

@@ -29,11 +29,11 @@ _NO_READING = (-1, 65535, 4294967295)
 _NAMES_OF_SPEEDS = {"a", "c", "v", "s", "h", "min"}
 """units that are letters or words in a name, such as `speed_a` and `rpm_min`"""
 _FEWEST_ROWS = 8
-"""of a table whose newest row is the first"""
+"""rows of a table whose newest is the first"""
 _FAR_BEYOND = 3.0
 """times most other speeds, above which one of these is no reading"""
 _BEYOND_RPM = 100_000.0
-"""of any fan"""
+"""speed beyond that of any fan"""
 
 
 def chosen_fans(path: Path, file: ColumnFile, wanted: Wanted, profile: Profile | None) -> FanColumns:

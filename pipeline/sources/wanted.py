@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from fantwin.pipeline.errors import UsageError
 
 ORDERS = ("dmy", "mdy", "ymd")
-"""of the day, month and year of a date"""
+"""orders of the day, month and year of a date"""
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ SLOW_NS = NS_PER_S // 2
 """a grid of this period or a longer one is slow: a fan moves much within it, so that the phase of samples and grid must
 not show, which changes with a restart, and slips where a sample comes now before, now after a grid time"""
 SETTLED_NS = 3 * NS_PER_S // 2
-"""from this grid period on, commands and readings are held until the next: in between, a fan has reached its speed"""
+"""grid period from which on commands and readings are held until the next: in between, a fan reaches its speed"""
 _IS_LINEAR = np.array([each.interpolation == "linear" for each in CHANNELS])[:, np.newaxis]
 
 

@@ -23,7 +23,7 @@ PLAIN = FanParameters(coulomb_v=0.0, breakaway_v=0.0, duty_dead=0.0, duty_full=1
 """fans that the physical model describes: J, alpha and C_D over the supply voltage are what is to be identified"""
 LOAD_WANDER, LOAD_WANDER_S, SUPPLY_WANDER, SUPPLY_WANDER_S = 0.01, 3.0, 0.003, 20.0
 BETWEEN_RUNS, OVER_HOURS, HOURS_S = 0.01, 0.007, 6 * 3600.0
-"""of the drag, as bench.detection.plant has them"""
+"""wandering of the drag, as bench.detection.plant has them"""
 TOP_RAD_S = 900.0
 
 
@@ -172,9 +172,9 @@ def true_parameters(parameters: FanParameters) -> Array:
 
 
 SUBSTEP_S = 1e-2
-"""of the motion; the current is exact"""
+"""step of the motion; the current is exact"""
 SETTLES_S = 60.0
-"""of the loop, before the first sample"""
+"""time of the loop before the first sample"""
 
 
 def samples(
@@ -244,5 +244,5 @@ def run_with(loop: str, parameters: FanParameters, seconds: float, rate_hz: floa
 
 
 def tiled(parameters: FanParameters, times: int) -> FanParameters:
-    """The same fans so many times."""
+    """The same fans, repeated."""
     return FanParameters(**{name: np.tile(of, times) for name, of in vars(parameters).items()})

@@ -33,7 +33,7 @@ with. `make licences` writes this page from the locks.
 
 
 UNDECLARED = {"pysnmp": "BSD-2-Clause"}
-"""by the text of their licence alone"""
+"""licences that only the text of the package says"""
 
 
 def locked(lock: str) -> Iterator[tuple[str, str]]:

@@ -25,7 +25,7 @@ DEMO = Path(__file__).parents[2] / "pipeline" / "demo"
 SITE, TRAY, FANS = "demo", "tray1", 8
 STAGES = ("acquisition", "resampler", "twin_integrator", "scorer", "recorder")
 RATE_HZ, STEP_NS = 50, 20_000_000
-"""of the samples of a chain: half of the rate of the demo, and of its work"""
+"""rate of the samples of a chain: half of the rate of the demo, and of its work"""
 DEADLINE_S = 300.0  # only what hangs takes as long, also on a busy machine
 
 

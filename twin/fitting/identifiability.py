@@ -57,7 +57,7 @@ FEEDBACK_SHARE = 0.05
 LARGEST_MOVE = 5.0
 """in median changes; a larger change is a step of the set-point and is clipped to this"""
 RESTS = 0.1
-"""of the speed: the set-point of a loop whose speed keeps within this has not moved"""
+"""share of the speed: the set-point of a loop whose speed keeps within this has not moved"""
 
 MORE_OF = {
     ALPHA: "record longer, with steps at low speed, where friction outweighs drag",

@@ -211,7 +211,7 @@ class _FanFit:
         self._parts = [(model.hats(part.command[:, 0]), part.step_s, part.speed_rad_s[:, 0]) for part in parts]
         bends = _bends(model.knots)
         self._smooth = bends.T @ bends + 1e-9 * np.eye(len(model.knots))
-        """as of a sample at each inner knot that has the mean of its neighbours: for where there are none"""
+        """weight of one sample at each inner knot, with the mean of its neighbours, for knots without samples"""
         self._some = self._parts[:: -(-len(parts) // MOST_PARTS)]
 
     def best(self) -> Array:

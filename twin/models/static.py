@@ -86,7 +86,7 @@ class StaticModel:
             share = block.add("Div", [beyond, block.constant(f"width_{k}", high - low)], f"share_{k}")
             rise = block.add("Sub", [speeds[k + 1], speeds[k]], f"rise_{k}")
             steady = block.add("Add", [steady, block.add("Mul", [share, rise], f"gain_{k}")], f"steady_{k}")
-        present, former = block.slice(steady, 0, 1, TO_END, "present"), block.slice(steady, 0, 0, -1, "former")
+        present, past = block.slice(steady, 0, 1, TO_END, "present"), block.slice(steady, 0, 0, -1, "past")
         periods = block.add("Div", [block.add("Unsqueeze", ["step_s", axis], "steps"), time_constant], "periods")
         stays = block.add("Exp", [block.add("Neg", [periods], "minus_periods")], "stays")
         goes = block.add("Sub", [one, stays], "goes")
@@ -94,7 +94,7 @@ class StaticModel:
         missing = block.add("Sub", [one, block.add("Exp", [block.add("Neg", [some], "minus_some")], "left")], "missing")
         seen = block.add("Sub", [one, block.add("Div", [missing, some], "not_yet")], "seen")
         at_once = block.add("Mul", [unknown_time, seen], "at_once")
-        ahead = block.add("Mul", [at_once, block.add("Sub", [present, former], "change")], "ahead")
+        ahead = block.add("Mul", [at_once, block.add("Sub", [present, past], "change")], "ahead")
         parts = [block.add("Mul", [stays, ahead], "kept_ahead"), block.add("Mul", [goes, present], "reached")]
         forcing = block.add("Add", parts, "forcing")
         following = body.add("Add", [body.add("Mul", ["stays_k", "held_k"], "kept"), "forcing_k"], "held_next")

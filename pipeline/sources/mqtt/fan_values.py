@@ -20,7 +20,7 @@ class FanValues:
         """has_switch: whether it is said of each fan if it is on."""
         self._level: list[float | None] = [None] * fans
         self._is_on: list[bool | None] = [None if has_switch else True] * fans
-        """of both: None: nothing was heard"""
+        """None in either: nothing was heard"""
         self._speed: list[float | None] = [None] * fans
         """speeds of the reading that is not complete; None: no new one yet"""
 

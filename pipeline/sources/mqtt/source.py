@@ -254,7 +254,7 @@ _KIND = {"speed": "speed", "command": "number", "switch": "ON or OFF"}
 
 
 def _topics(config: MqttConfig, fans: int) -> dict[str, list[_Place]]:
-    """What each topic has, commands before speeds. Raises UserError where the topics are not those of so many fans."""
+    """What each topic has, commands before speeds. Raises UserError where the topics are not those of all fans."""
     found: dict[str, list[_Place]] = {}
     for what in ("switch", "command", "speed"):
         if what not in config.places:

@@ -15,7 +15,7 @@ from fantwin.pipeline.sources.secret_file import LogIn
 
 NAME = "__name__"
 Labels = Mapping[str, str]
-"""of a series, its name as one of them"""
+"""labels of a series, its name as one of them"""
 
 
 class PrometheusConfig(NamedFansConfig, LogIn, frozen=True):

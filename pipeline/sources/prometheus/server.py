@@ -61,7 +61,7 @@ class Server:
         self._headers: dict[str, str] = {}
         self._lock = threading.Lock()
         self._wanted: dict[tuple[str, ...], dict[Series, None]] = {}
-        """by the names of their labels"""
+        """series, by the names of their labels"""
         self._asked_in, self._answered_s = -1, time.monotonic()
         self._outcome: Answer | UserError = {}
 

@@ -19,7 +19,7 @@ ROOT = "/redfish/v1/"
 TIMEOUT_S = 5.0
 """longest wait for a connection, and for each part of an answer"""
 LARGEST_BYTES = 4 << 20
-"""of an answer"""
+"""size of an answer"""
 MOST_REDIRECTS = 3
 LOGIN_RETRY_S = 300.0
 

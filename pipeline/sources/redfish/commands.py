@@ -42,7 +42,7 @@ class FanCommands:
         self._stated = stated
         self._places: tuple[CommandPlace | None, ...] = ()
         self._were_read: tuple[bool, ...] = ()
-        """of each fan, whether it could be read when the places were looked for"""
+        """whether each fan could be read when the places were looked for"""
         self.pwms: tuple[str, ...] = ()
         """names of the pwms that are there"""
 

@@ -52,7 +52,7 @@ class SamePort:
     def __init__(self, port: str) -> None:
         self._port = port
         self._device: _Device | None = None
-        """of the port when it was opened last; None: not known"""
+        """device at the port when it was opened last; None: not known"""
 
     def path(self) -> str:
         """The port to open: the one that was named, unless the device is known and at another one."""

@@ -33,7 +33,7 @@ _MOSTLY = 0.5
 _ANNOTATION = "#"
 _FIELD, _VALUE, _TIME = "_field", "_value", "_time"
 _ENTITY, _STATE = "entity_id", "state"
-"""of Home Assistant"""
+"""columns of Home Assistant"""
 _NOT_TAGS = {"", "result", "table", "_start", "_stop", _TIME, _VALUE, _FIELD}
 _NUMBER_TYPES = ("long", "double", "unsignedLong")
 _LIKE_A_KEY = re.compile(

@@ -24,7 +24,7 @@ TIMEOUT_S, RETRIES = 1.0, 1
 MOST_AT_ONCE = 24
 """objects in a request: an answer has to fit into a datagram"""
 MOST_ROWS = 10_000
-"""of a table that is walked"""
+"""rows of a table that is walked"""
 _AUTHENTICATION = {
     "MD5": "usmHMACMD5AuthProtocol",
     "SHA": "usmHMACSHAAuthProtocol",

@@ -28,7 +28,7 @@ LONGEST_LINE = 1 << 20
 BLANKS = " "
 """as a delimiter: runs of blanks"""
 JSON = ":"
-"""as a delimiter: the file is no text in columns, but JSON"""
+"""delimiter of a file that is no text in columns, but JSON"""
 _DELIMITERS = {",": "','", ";": "';'", "\t": "tabs", "|": "'|'", BLANKS: "blanks"}
 """that are looked for"""
 _SAMPLE_BYTES = 1 << 18

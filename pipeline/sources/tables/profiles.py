@@ -95,7 +95,7 @@ class Profile:
 
 _UNIT = re.compile(r"\s*[\[(](?:RPM|rpm)[\])]$")
 _NUMBERED = re.compile(r"\[\d+\]")
-"""in the name of a fan that is called by its number"""
+"""number in the name of a fan that is called by it"""
 _DEBUG = (r"debug\[(?P<fan>\d+)\]",)
 _POLES = "electrical revolutions: add --poles with the magnetic poles of the motors"
 _BLACKBOX = Profile(
@@ -109,7 +109,7 @@ _BLACKBOX = Profile(
     note="no speeds in it: switch on bidirectional DShot, or debug_mode RPM_FILTER, before the flight",
 )
 _OF_TOPIC = r"(?:(?P<before>.*/)?{}\.)?"
-"""before the name of a field in a log, and not in a table of one topic"""
+"""topic before the name of a field in a log; a table of one topic has none"""
 _MOTORS, _OUTPUTS, _ESCS = map(_OF_TOPIC.format, ("actuator_motors", "actuator_outputs", "esc_status"))
 PROFILES = (
     Profile(

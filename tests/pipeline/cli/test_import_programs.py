@@ -73,7 +73,7 @@ STATES = [
     *(("number.pwm", c, t - 0.125) for t, c in enumerate(COMMAND.tolist()) if not t % 20),
     *(("sensor.rpm", s, t) for t, s in enumerate(SPEED.tolist())),
 ]
-"""of Home Assistant: of its commands the changes alone"""
+"""rows of Home Assistant: of commands the changes alone"""
 
 
 def iso(t: float) -> str:

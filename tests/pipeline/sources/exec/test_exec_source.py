@@ -1,4 +1,4 @@
-"""Samples that a program prints: what it is told, what it says, when it is ended."""
+"""Samples that a program prints: what it reads, what it prints, when it is ended."""
 
 from __future__ import annotations
 
